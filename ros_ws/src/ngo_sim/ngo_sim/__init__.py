@@ -1,0 +1,1 @@
+"""Simulated maze worlds with exact ground truth, and the drivers that explore them. Nothing here needs ROS."""
