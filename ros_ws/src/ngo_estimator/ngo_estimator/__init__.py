@@ -1,0 +1,1 @@
+"""Learned pose estimation: local odometry and the Neural Graph Optimizer."""

@@ -1,0 +1,45 @@
+"""Installs the estimators, their nodes and their trained weights."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "ngo_estimator"
+
+
+def files_below(folder: str) -> list[tuple[str, list[str]]]:
+    """Pairs of install folder and files for every file below `folder`, if there are any."""
+    by_parent: dict[Path, list[str]] = {}
+    for path in sorted(Path(folder).rglob("*")):
+        hidden = any(part.startswith((".", "__pycache__")) for part in path.parts)
+        if path.is_file() and not hidden:
+            by_parent.setdefault(path.parent, []).append(str(path))
+    return [(str(Path("share") / NAME / parent), paths) for parent, paths in by_parent.items()]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *files_below("launch"),
+        *files_below("config"),
+        *files_below("weights"),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="NGO maintainers",
+    maintainer_email="maintainers@ngo.invalid",
+    description="Local odometry and the Neural Graph Optimizer, and the nodes that run them.",
+    license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
+    entry_points={
+        "console_scripts": [
+            "local_node = ngo_estimator.nodes.local_node:main",
+            "ngo_node = ngo_estimator.nodes.ngo_node:main",
+        ],
+    },
+)

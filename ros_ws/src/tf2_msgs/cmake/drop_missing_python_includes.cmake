@@ -1,0 +1,25 @@
+# The rosidl targets of the ROS 2 wheels name include folders of the interpreter that built the wheels
+# (below /opt/python/), which exist on no other machine, and CMake refuses a target whose include folder is missing.
+# Removes exactly those: on any other ROS 2 there are none, and this does nothing.
+function(_drop_missing_python_includes)
+  get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
+  foreach(target IN LISTS targets)
+    get_target_property(folders "${target}" INTERFACE_INCLUDE_DIRECTORIES)
+    if(NOT folders)
+      continue()
+    endif()
+    set(kept "")
+    foreach(folder IN LISTS folders)
+      if(folder MATCHES "^/opt/python/" AND NOT EXISTS "${folder}")
+        continue()
+      endif()
+      list(APPEND kept "${folder}")
+    endforeach()
+    if(NOT "${kept}" STREQUAL "${folders}")
+      set_target_properties("${target}" PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "${kept}")
+    endif()
+  endforeach()
+endfunction()
+
+# Deferred to the end of the directory: ament_package() imports the last of the targets.
+cmake_language(DEFER CALL _drop_missing_python_includes)
