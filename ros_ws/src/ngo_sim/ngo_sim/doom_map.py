@@ -1,0 +1,165 @@
+"""Mazes as Doom maps: UDMF ``TEXTMAP`` lumps, many maps in one PWAD, written without any Doom software.
+
+The engine builds the BSP nodes of a UDMF map by itself when it loads the map, so a map here is text alone. The map's axes
+are the maze's axes (x right, y up, angles counter-clockwise from x), scaled by :data:`UNITS_PER_M`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ngo_sim.mazes import Maze
+
+UNITS_PER_M = 32.0
+"""Doom map units in one metre: the one place where the scale of the 3D world is stated."""
+
+WALL_HEIGHT_UNITS = 128
+"""Floor to ceiling; the height of every texture below, so that each shows once and upright."""
+
+PLAYER_RADIUS_UNITS = 16
+"""Half the side of the box with which Doom's player collides."""
+
+# Opaque, 128 units high, static in freedoom2.wad (no member of an ANIMATED sequence, no switch), and told apart by colour or
+# pattern even at 80x60 pixels.
+WALL_TEXTURES: tuple[str, ...] = (
+    "A-BROCK2", "A-CAMO1", "A-CAMO3", "A-CAMO4", "A-CONCTE", "A-DBRI28", "A-MOSRK2", "A-MOSROK",
+    "A-TILE", "AQBRIK02", "AQBRIK03", "AQCONC06", "AQCONC13", "AQPANL03", "AQRUST06", "AQSECT04",
+    "AQSECT10", "AQTILE02", "AQTRIM01", "AQTRIM07", "AROCK2", "BIGBRIK3", "BRONZE4", "BROWN1",
+    "BSTONE3", "CARLLF2", "CEMENT7", "COMPOHSO", "COMPUTE1", "CRATE3", "ESPIG2", "GRAYTAN9",
+    "LITE2", "LITEMET", "MARBGRAY", "MODWALL3", "PANBLUE", "PANBOOK", "PIPE8", "PIPES",
+    "REDWALL", "SHAWN01", "SILVER2", "SPACEW2", "SPACEW4", "SP_ROCK1", "STARG2", "STARTAN2",
+    "STONE7", "STONEW5", "STWALL", "TEKGREN3", "WOODMET2", "ZZWOLF9",
+)  # fmt: skip
+
+# Floors and ceilings, static for the same reason (no liquid, no RROCK05 to 08).
+FLATS: tuple[str, ...] = (
+    "AQF025", "AQF027", "AQF047", "AQF057", "CEIL3_2", "FLAT1_1", "FLAT5", "FLAT5_4",
+    "FLAT8", "FLOOR0_1", "FLOOR0_7", "FLOOR4_6", "FLOOR5_2", "GRASS1", "MFLR8_3", "RROCK11",
+    "RROCK16", "SLIME16",
+)  # fmt: skip
+
+_LUMP_NAME = re.compile(r"[A-Z0-9_\-\[\]\\]{1,8}")
+
+
+@dataclass(frozen=True)
+class MapStyle:
+    """What a maze looks like.
+
+    Attributes:
+        wall_textures: (faces,) texture names, one for each face in the order of :func:`wall_faces`.
+        floor: Flat of the floor.
+        ceiling: Flat of the ceiling.
+        light_level: Sector light, 0 (black) to 255 (full).
+    """
+
+    wall_textures: tuple[str, ...]
+    floor: str
+    ceiling: str
+    light_level: int = 208
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.light_level <= 255:
+            raise ValueError(f"light_level is {self.light_level}; allowed: 0 to 255")
+
+
+def wall_faces(walls: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the faces between free and wall blocks as directed grid edges, free block on the right of each.
+
+    Args:
+        walls: (height, width) True where a block is wall; the border must be wall.
+
+    Returns:
+        (faces, 4) grid corners x0, y0, x1, y1 in blocks, ordered by side (south, west, north, east of the free
+        block), then row-major.
+
+    Raises:
+        ValueError: If an outer block is free: the map would leak into the void.
+    """
+    if walls.ndim != 2 or min(walls.shape) < 3:
+        raise ValueError(f"walls has shape {walls.shape}; expected (height, width), both at least 3")
+    if not (walls[0].all() and walls[-1].all() and walls[:, 0].all() and walls[:, -1].all()):
+        raise ValueError("walls has a free block on the border; expected a closed border")
+    # Neighbour (row, col) offset, then the edge's corners relative to the free block's lower left corner. A one-sided
+    # line shows its front, which is on its right.
+    sides = (
+        ((-1, 0), (1, 0, 0, 0)),
+        ((0, -1), (0, 0, 0, 1)),
+        ((1, 0), (0, 1, 1, 1)),
+        ((0, 1), (1, 1, 1, 0)),
+    )
+    faces = []
+    for (d_row, d_col), corners in sides:
+        row, col = np.nonzero(~walls & np.roll(walls, (-d_row, -d_col), axis=(0, 1)))
+        faces.append(np.stack([col, row, col, row], axis=1) + np.array(corners))
+    return np.concatenate(faces)
+
+
+def random_style(face_count: int, rng: np.random.Generator, light_level: int = 208) -> MapStyle:
+    """Draw a wall texture for each of ``face_count`` faces, one floor and one ceiling."""
+    textures = rng.integers(len(WALL_TEXTURES), size=face_count)
+    floor, ceiling = rng.choice(len(FLATS), size=2, replace=False)
+    return MapStyle(tuple(WALL_TEXTURES[i] for i in textures), FLATS[floor], FLATS[ceiling], light_level)
+
+
+def textmap(maze: Maze, style: MapStyle, start_xy: tuple[float, float], start_heading_deg: int) -> str:
+    """Return the UDMF text of a maze: one sector, one line a wall face, the player and nothing else.
+
+    Args:
+        maze: The maze; a block is ``maze.block_m * UNITS_PER_M`` units wide.
+        style: Textures, one for each face of ``wall_faces(maze.walls)``.
+        start_xy: Where the player starts, m, in the maze's frame.
+        start_heading_deg: Its heading in whole degrees (the format has no finer), counter-clockwise from x.
+
+    Raises:
+        ValueError: If the number of textures differs from the number of faces, or the start is inside a wall.
+    """
+    faces = wall_faces(maze.walls)
+    if len(style.wall_textures) != len(faces):
+        raise ValueError(f"style has {len(style.wall_textures)} wall textures; the maze has {len(faces)} faces")
+    if maze.walls[maze.block_at(*start_xy)]:
+        raise ValueError(f"start_xy is {start_xy}, inside a wall; expected a free block")
+    corners, ends = np.unique(faces.reshape(-1, 2), axis=0, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    block_units = maze.block_m * UNITS_PER_M
+    x, y = (value * UNITS_PER_M for value in start_xy)
+    parts = [
+        'namespace="zdoom";\n',
+        f"thing{{type=1;x={x:.4f};y={y:.4f};angle={int(start_heading_deg) % 360};"
+        "skill1=true;skill2=true;skill3=true;skill4=true;skill5=true;single=true;coop=true;dm=true;}\n",
+        f'sector{{heightfloor=0;heightceiling={WALL_HEIGHT_UNITS};texturefloor="{style.floor}";'
+        f'textureceiling="{style.ceiling}";lightlevel={style.light_level};}}\n',
+    ]
+    parts += [f"vertex{{x={cx * block_units:.4f};y={cy * block_units:.4f};}}\n" for cx, cy in corners]
+    parts += [f'sidedef{{sector=0;texturemiddle="{texture}";}}\n' for texture in style.wall_textures]
+    parts += [
+        f"linedef{{v1={v1};v2={v2};sidefront={side};blocking=true;}}\n" for side, (v1, v2) in enumerate(ends)
+    ]
+    return "".join(parts)
+
+
+def write_pwad(path: Path, maps: Iterable[tuple[str, str]]) -> None:
+    """Write (map name, UDMF text) pairs as one PWAD.
+
+    Raises:
+        ValueError: If a name is no lump name (1 to 8 of ``A-Z 0-9 _ - [ ] \\``) or occurs twice.
+    """
+    lumps: list[tuple[str, bytes]] = []
+    names: set[str] = set()
+    for name, text in maps:
+        if not _LUMP_NAME.fullmatch(name) or name in names:
+            raise ValueError(f"map name is {name!r}; allowed: 1 to 8 of A-Z 0-9 _ - [ ] \\, each name once")
+        names.add(name)
+        lumps += [(name, b""), ("TEXTMAP", text.encode("ascii")), ("ENDMAP", b"")]
+    body, directory, offset = [], [], 12
+    for name, data in lumps:
+        directory.append(struct.pack("<ii8s", offset, len(data), name.encode("ascii")))
+        body.append(data)
+        offset += len(data)
+    path.write_bytes(b"".join([struct.pack("<4sii", b"PWAD", len(lumps), offset), *body, *directory]))
