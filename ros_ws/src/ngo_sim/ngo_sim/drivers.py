@@ -20,6 +20,13 @@ class Action(IntEnum):
     TURN_RIGHT = 2
 
 
+DRIVER_NAMES = ("corners", "random_goals", "random")
+"""What make_driver knows."""
+
+_ACTIONS = tuple(Action)
+_PATIENCE_STEPS = 40  # a half turn on the spot takes about 25
+
+
 class Driver(Protocol):
     """Chooses an action for every frame."""
 
@@ -171,11 +178,9 @@ class PathDriver:
             yield blocks[int(self._rng.integers(len(blocks)))]
 
 
-_ACTIONS = tuple(Action)
-_PATIENCE_STEPS = 40  # a half turn on the spot takes about 25
-
-
-DRIVER_NAMES = ("corners", "random_goals", "random")
+def driver_generator(seed: int) -> np.random.Generator:
+    """The random generator of the driver in the episode of this seed, independent of those of the world."""
+    return np.random.default_rng((seed, 3))
 
 
 def make_driver(name: str, maze: Maze, rng: np.random.Generator) -> Driver:

@@ -82,6 +82,10 @@ class Maze:
             raise ValueError(f"the point ({x}, {y}) m is outside the maze of {width_m} x {height_m} m")
         return int(y // self.block_m), int(x // self.block_m)
 
+    def wall_faces(self) -> npt.NDArray[np.float64]:
+        """(n, 2, 2) the x, y of both ends, in metres, of every straight stretch of wall face that looks onto free blocks."""
+        return np.concatenate([_faces_along_x(self.walls), _faces_along_x(self.walls.T)[..., ::-1]]) * self.block_m
+
     def shortest_path(self, start_block: Iterable[int], goal_block: Iterable[int]) -> npt.NDArray[np.int64]:
         """(n, 2) the (row, col) blocks from start to goal, both included, by Dijkstra's algorithm.
 
@@ -160,6 +164,17 @@ def draw_maze(axes: Axes, maze: Maze, colors: npt.ArrayLike | None = None) -> No
     axes.imshow(np.where(maze.walls[..., None], wall, 1.0), origin="lower", extent=(0.0, width_m, 0.0, height_m),
                 interpolation="nearest", zorder=0)
     axes.set(aspect="equal", xlim=(0.0, width_m), ylim=(0.0, height_m), xlabel="x [m]", ylabel="y [m]")
+
+
+def _faces_along_x(walls: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    """(n, 2, 2) the ends (x, y), in blocks, of the longest stretches of face along x that look the same way."""
+    looks = np.diff(walls.astype(np.int8), axis=0)  # -1 up, +1 down, between row i and row i + 1; 0 at both ends
+    line, end = np.nonzero(np.diff(looks, axis=1))
+    face = looks[line, end] != 0
+    first = looks[line, end + 1] != 0
+    starts = np.stack((end[first] + 1, line[first] + 1), axis=-1)
+    ends = np.stack((end[face] + 1, line[face] + 1), axis=-1)
+    return np.stack((starts, ends), axis=1).astype(np.float64)
 
 
 def _neighbours(cell: Cell, rows: int, cols: int) -> list[Cell]:
