@@ -1,0 +1,58 @@
+"""Node `maze3d`: the 3D world as colour pictures of a pinhole camera."""
+
+from __future__ import annotations
+
+import array
+import sys
+
+from builtin_interfaces.msg import Time
+from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from ngo_sim.nodes.simulator_node import SimulatorNode, run_simulator
+from ngo_sim.simulation import Frame, World
+from sensor_msgs.msg import CameraInfo, Image
+
+
+class Maze3DNode(SimulatorNode):
+    """Publishes `image` (rgb8) and `camera_info`: a pinhole at the middle of the robot, without distortion.
+
+    The two focal lengths differ: Doom's pixels are higher than wide.
+    """
+
+    world_config_type = Maze3DConfig
+    defaults = {"rate": 17.5, "camera_frame": "camera_optical_frame"}
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.image_publisher = self.create_publisher(Image, "image", self.qos)
+        self._camera_info = self.create_publisher(CameraInfo, "camera_info", self.qos)
+        config: Maze3DConfig = self.world_config
+        focal_x, focal_y = config.focal_lengths_px
+        # The middle of the picture, where the centre of pixel 0 is 0.
+        center_x, center_y = (config.width - 1) / 2, (config.height - 1) / 2
+        self._camera = CameraInfo(
+            width=config.width, height=config.height, distortion_model="plumb_bob", d=[0.0] * 5,
+            k=[focal_x, 0.0, center_x, 0.0, focal_y, center_y, 0.0, 0.0, 1.0],
+            r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            p=[focal_x, 0.0, center_x, 0.0, 0.0, focal_y, center_y, 0.0, 0.0, 0.0, 1.0, 0.0])
+
+    def make_world(self) -> World:
+        """The world of the parameters."""
+        return Maze3D(self.world_config)
+
+    def publish_sensors(self, frame: Frame, stamp: Time) -> None:
+        """Publish the camera's description and the picture of a frame."""
+        self._camera.header.stamp, self._camera.header.frame_id = stamp, self.config.camera_frame
+        self._camera_info.publish(self._camera)
+        height, width, channels = frame.observation.shape
+        image = Image(header=self._camera.header, height=height, width=width, encoding="rgb8", step=width * channels)
+        image.data = array.array("B", frame.observation.tobytes())
+        self.image_publisher.publish(image)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns the exit code."""
+    return run_simulator(Maze3DNode, "maze3d", args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

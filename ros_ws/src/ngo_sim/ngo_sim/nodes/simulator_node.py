@@ -1,0 +1,166 @@
+"""The node that both worlds share: paces a simulation, takes actions from outside, publishes each frame."""
+
+from __future__ import annotations
+
+import sys
+import time
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import rclpy
+import rclpy.signals
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from ngo_msgs.msg import DiscreteAction
+from ngo_sim.flow_control import FlowControl, Pacer
+from ngo_sim.nodes.consumers import Consumers
+from ngo_sim.nodes.parameters import BadParameter, ConfigParameters, changed
+from ngo_sim.simulation import Frame, Simulation, World, yaw_quaternion_zw
+from ngo_sim.simulator_config import SimulatorConfig
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+_LOOK_AT_GRAPH_S = 0.1
+_IDLE_S = 0.05
+
+
+class SimulatorNode(Node):
+    """Publishes the frames of one world. A subclass names the configs, makes the world and publishes what the robot sees."""
+
+    world_config_type: ClassVar[type]
+    defaults: ClassVar[dict[str, Any]] = {}
+    image_publisher: Publisher  # its subscribers are those that wait_for_subscribers counts
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        parameters = ConfigParameters(self)
+        self.config = parameters.declare(SimulatorConfig, **self.defaults)
+        self.world_config: Any = parameters.declare(self.world_config_type)
+        parameters.finish()
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
+        # Deep enough that a reliable reader may be late with its acknowledgement by far more than what is in flight.
+        self.qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
+        self._truth = self.create_publisher(Odometry, "ground_truth", self.qos)
+        self._action = self.create_publisher(DiscreteAction, "action", self.qos)
+        self._clock_out = self.create_publisher(Clock, "/clock", self.qos) if self.config.publish_clock else None
+        self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
+        self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
+        # The engine of a world may have installed signal handlers of its own: ours go on top again, and call them.
+        rclpy.signals.uninstall_signal_handlers()
+        rclpy.signals.install_signal_handlers()
+        self._pacer = Pacer()
+        self._published = 0
+        self._looked_s = 0.0
+        self._stamp = Time()
+
+    @abstractmethod
+    def make_world(self) -> World:
+        """The world of world_config; the seed comes with its reset. Raises ValueError for a config that cannot be."""
+
+    @abstractmethod
+    def publish_sensors(self, frame: Frame, stamp: Time) -> None:
+        """Publish what the robot sees."""
+
+    def run(self) -> None:
+        """Publish frames until there are enough of them and all are taken. Raises ExternalShutdownException when told to end."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        while True:
+            now_s = time.monotonic()
+            if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
+                self._looked_s = now_s
+                self._consumers.look()
+            if 0 < self.config.frames <= self._published:
+                if self._consumers.drained(now_s, self.config.stall_timeout_s):
+                    break
+                idle_s = _IDLE_S
+            elif (idle_s := self._idle_s(now_s)) == 0.0:
+                self._publish_next(now_s)
+            executor.spin_once(timeout_sec=idle_s)
+        self.image_publisher.wait_for_all_acked(Duration(seconds=5))
+        self.get_logger().info(f"published all {self._published} frames")
+
+    def _idle_s(self, now_s: float) -> float:
+        """How long nothing is to be done before the next frame, 0 where it is due; messages end the wait earlier."""
+        config = self.config
+        if self._published == 0:
+            awaited = self.image_publisher.get_subscription_count() < config.wait_for_subscribers or (
+                config.wait_for_flow_control and not self._consumers.complete())
+            return _IDLE_S if awaited else 0.0
+        if not self.simulation.ready(now_s, config.action_timeout_s, hold=config.rate > 0):
+            return _IDLE_S
+        if config.rate > 0:
+            return min(_IDLE_S, self._pacer.remaining_s(now_s))
+        return 0.0 if self._consumers.may_publish(now_s, config.stall_timeout_s) else _IDLE_S
+
+    def _publish_next(self, now_s: float) -> None:
+        config, simulation = self.config, self.simulation
+        if self._published > 0:
+            action = simulation.choose_action(now_s, config.action_timeout_s, hold=config.rate > 0)
+            assert action is not None  # ready() said so
+            message = DiscreteAction(action=int(action))
+            message.header.stamp, message.header.frame_id = self._stamp, config.base_frame
+            self._action.publish(message)
+            simulation.advance(action)
+        frame = simulation.frame
+        simulated_ns = config.stamp_ns(frame.index, simulation.world.period_s)
+        stamp_ns = time.time_ns() if config.use_wall_stamps else simulated_ns
+        self._stamp = Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        if self._clock_out is not None:
+            self._clock_out.publish(Clock(clock=self._stamp))
+        self._publish_truth(frame)
+        self.publish_sensors(frame, self._stamp)
+        self._published += 1
+        self._consumers.published(stamp_ns, now_s)
+        self._pacer.taken(now_s, config.rate)
+
+    def _publish_truth(self, frame: Frame) -> None:
+        message = Odometry(child_frame_id=self.config.base_frame)
+        message.header.stamp, message.header.frame_id = self._stamp, self.config.ground_truth_frame
+        x, y, yaw = frame.pose_xyyaw.tolist()
+        pose, twist = message.pose.pose, message.twist.twist
+        pose.position.x, pose.position.y = x, y
+        pose.orientation.z, pose.orientation.w = yaw_quaternion_zw(yaw)
+        twist.linear.x, twist.linear.y, twist.angular.z = frame.twist_xyyaw.tolist()
+        self._truth.publish(message)
+
+    def _on_command(self, message: DiscreteAction) -> None:
+        try:
+            self.simulation.external.command(message.action, time.monotonic())
+        except ValueError as error:
+            self.get_logger().warning(f"action_command dropped: {error}", throttle_duration_sec=5.0)
+
+    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        self.config, result = changed(self.config, parameters)
+        return result
+
+
+def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | None = None) -> int:
+    """Run a simulator node until it has published its frames or is told to end; return the exit code."""
+    node = None
+    try:
+        rclpy.init(args=args)
+        node = node_type(name)
+        node.run()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except BadParameter as error:
+        print(f"{name}: bad parameter: {error}", file=sys.stderr)
+        return 2
+    except Exception:
+        # A signal invalidates the context at once, and whatever ROS call comes next fails for that reason alone.
+        if node is None or rclpy.ok():
+            raise
+    finally:
+        if node is not None:
+            node.simulation.world.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,103 @@
+"""One run of a world under a driver or under actions from outside: what a simulator node publishes, without ROS."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ngo_sim.drivers import Action, Driver, driver_generator, make_driver
+from ngo_sim.external_actions import ExternalActions
+from ngo_sim.mazes import Maze
+
+
+class World(Protocol):
+    """What Maze2D and Maze3D have in common."""
+
+    maze: Maze
+    period_s: float
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin anew."""
+        ...
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take one action."""
+        ...
+
+    def close(self) -> None:
+        """Free what the world holds."""
+        ...
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the robot sees at one moment and where it then is.
+
+    index: number of the frame, from 0. observation: of the world's shape and type. pose_xyyaw: float64 (3,) in the maze's
+    frame. twist_xyyaw: float64 (3,), the constant velocity in the robot's own frame (m/s, m/s, rad/s) that leads from the
+    previous frame to this one; zero in frame 0, where the robot rests.
+    """
+
+    index: int
+    observation: npt.NDArray[Any]
+    pose_xyyaw: npt.NDArray[np.float64]
+    twist_xyyaw: npt.NDArray[np.float64]
+
+
+class Simulation:
+    """Frame after frame of one seed. driver is a name for make_driver, or "none": then only actions from outside move it."""
+
+    def __init__(self, world: World, seed: int, driver: str) -> None:
+        self.world = world
+        self.external = ExternalActions()
+        observation, info = world.reset(seed=seed)
+        self._driver: Driver | None = None if driver == "none" else make_driver(driver, world.maze, driver_generator(seed))
+        self.frame = Frame(0, observation, info["pose_xyyaw"], np.zeros(3))
+
+    def choose_action(self, now_s: float, timeout_s: float, hold: bool) -> Action | None:
+        """The action at this frame, to be asked for once a frame; None where it has to come from outside and has not.
+
+        See ExternalActions for now_s (any steady clock), timeout_s and hold.
+        """
+        # The driver sees every frame, also those it does not decide: it keeps track of where it is on its path.
+        own = None if self._driver is None else self._driver.action(self.frame.pose_xyyaw)
+        return self.external.next_action(hold) if self.external.in_charge(now_s, timeout_s, hold) else own
+
+    def ready(self, now_s: float, timeout_s: float, hold: bool) -> bool:
+        """Whether choose_action would give an action."""
+        if self.external.in_charge(now_s, timeout_s, hold):
+            return self.external.pending()
+        return self._driver is not None
+
+    def advance(self, action: Action) -> Frame:
+        """Take the action; return the next frame, which also becomes `frame`."""
+        observation, _, _, _, info = self.world.step(int(action))
+        pose = info["pose_xyyaw"]
+        twist = body_twist(self.frame.pose_xyyaw, pose, self.world.period_s)
+        self.frame = Frame(self.frame.index + 1, observation, pose, twist)
+        return self.frame
+
+
+def body_twist(from_xyyaw: npt.NDArray[np.float64], to_xyyaw: npt.NDArray[np.float64],
+               period_s: float) -> npt.NDArray[np.float64]:
+    """float64 (3,): the constant velocity in the moving frame (m/s, m/s, rad/s) that leads from one pose to the other.
+
+    The logarithm of the relative pose over the time; the turn must be below half a revolution.
+    """
+    turn = math.remainder(to_xyyaw[2] - from_xyyaw[2], math.tau)
+    cos, sin = math.cos(from_xyyaw[2]), math.sin(from_xyyaw[2])
+    dx, dy = to_xyyaw[0] - from_xyyaw[0], to_xyyaw[1] - from_xyyaw[1]
+    forward, left = cos * dx + sin * dy, cos * dy - sin * dx
+    # half / tan(half) tends to 1 - half^2 / 3 where the quotient itself is 0 / 0.
+    half = turn / 2
+    stretch = half / math.tan(half) if abs(half) > 1e-6 else 1.0 - half * half / 3
+    return np.array([stretch * forward + half * left, stretch * left - half * forward, turn]) / period_s
+
+
+def yaw_quaternion_zw(yaw: float) -> tuple[float, float]:
+    """The z and w of the quaternion of a turn about +z; its x and y are 0."""
+    return math.sin(yaw / 2), math.cos(yaw / 2)
