@@ -1,4 +1,4 @@
-"""Drivers: what the robot does next, given where it is. They are part of the data, so they read the ground truth."""
+"""Drivers: what the robot does next, given its true pose. They make the data; no estimate enters."""
 
 from __future__ import annotations
 
@@ -49,22 +49,28 @@ class RandomDriver:
 class PathDriver:
     """Follows shortest paths from goal to goal, for ever.
 
-    It steers towards a point a little ahead on the path, seen from where the robot's momentum will carry it. Off the path it
-    plans again from the block it is in; without progress it first returns to that block's centre, which nothing can obstruct.
+    It steers towards a point a little ahead on the path, as seen from where the robot's momentum will carry
+    it. Off the path it plans again from the block it is in; without progress it first returns to that block's
+    centre, which nothing can obstruct.
 
-    goals: "corners" visits the four corner cells in a random order, then in another one, ...; "random" visits random free
-    blocks. random_action_probability: share of the actions replaced by a random one. turn_per_action_rad: how far one turn
-    action turns the robot until it rests again. turn_coast_steps, travel_coast_steps: rotation and travel expected still to
-    come without further acceleration, in multiples of the last step's. lookahead_blocks: how far on the path it aims.
+    goals: "corners" visits the four corner cells in a random order, then in another one, ...; "random" visits
+    random free blocks. goals_reached lists the (row, col) of those visited so far.
+    random_action_probability: share of the actions replaced by a random one.
+    turn_per_action_rad: how far one turn action turns the robot until it rests again.
+    turn_coast_steps, travel_coast_steps: rotation and travel expected still to come without further
+    acceleration, in multiples of the last step's.
+    lookahead_blocks: how far ahead on the path it aims.
 
-    The defaults serve both worlds: both turn 9 degrees an action, and they keep to three quarters of the momentum of the 2D
-    world (1.5 and 4 steps) and less of the 3D world's (3 and 4.6), because overrating it makes the robot turn to and fro
-    while underrating it a little only rounds the bends.
+    The defaults serve both worlds. Both turn about 9 degrees an action; the expected coasting is below that
+    of the 2D world (1.5 and 4 steps) and of the 3D world (3 and 4.6 steps), because to overrate it makes the
+    robot turn to and fro (twice the turns and half the way in 2D), while to underrate it only widens the
+    bends a little.
     """
 
     def __init__(self, maze: Maze, rng: np.random.Generator, goals: str = "corners", *,
                  random_action_probability: float = 0.05, turn_per_action_rad: float = math.radians(9.0),
-                 turn_coast_steps: float = 1.2, travel_coast_steps: float = 3.0, lookahead_blocks: float = 0.9) -> None:
+                 turn_coast_steps: float = 1.2, travel_coast_steps: float = 3.0,
+                 lookahead_blocks: float = 0.9) -> None:
         if goals not in ("corners", "random"):
             raise ValueError(f"goals is {goals!r}; it must be 'corners' or 'random'")
         for name, value, low, high in (("random_action_probability", random_action_probability, 0.0, 1.0),
@@ -78,7 +84,7 @@ class PathDriver:
         self._maze = maze
         self._rng = rng
         self._random_action_probability = random_action_probability
-        self._turn_deadband_rad = 0.5 * turn_per_action_rad  # one more turn must leave a smaller error than none
+        self._deadband_rad = 0.5 * turn_per_action_rad  # within it, a turn leaves a larger error than none
         self._turn_coast_steps = turn_coast_steps
         self._travel_coast_steps = travel_coast_steps
         self._lookahead = lookahead_blocks
@@ -110,7 +116,7 @@ class PathDriver:
             target_x, target_y = self._target(x * unit, y * unit, ahead_x, ahead_y, block)
         yaw_at_rest = yaw + self._turn_coast_steps * _wrap(yaw - last_yaw)
         error = _wrap(math.atan2(target_y - ahead_y, target_x - ahead_x) - yaw_at_rest)
-        if abs(error) <= self._turn_deadband_rad:
+        if abs(error) <= self._deadband_rad:
             return Action.FORWARD
         return Action.TURN_LEFT if error > 0 else Action.TURN_RIGHT
 
@@ -126,7 +132,7 @@ class PathDriver:
             self._path_index = {on_path: index for index, on_path in enumerate(self._path)}
 
     def _watch_progress(self, x: float, y: float, block: tuple[int, int]) -> None:
-        """Return to the block's centre after _PATIENCE_STEPS within a fifth of a block, until there or as long again."""
+        """Return to the block's centre after _PATIENCE_STEPS within a fifth of a block, at most as long."""
         near = 0.2 * self._maze.block_m
         if math.hypot(x - self._progress_pose[0], y - self._progress_pose[1]) > near:
             self._progress_pose, self._steps_without_progress = (x, y), 0
@@ -137,11 +143,12 @@ class PathDriver:
         if self._returning and math.hypot(x - center_x, y - center_y) < near:
             self._returning = False
 
-    def _target(self, x: float, y: float, ahead_x: float, ahead_y: float, block: tuple[int, int]) -> tuple[float, float]:
+    def _target(self, x: float, y: float, ahead_x: float, ahead_y: float,
+                block: tuple[int, int]) -> tuple[float, float]:
         """The point to steer for, in blocks: on the path, beyond where the robot coasts to."""
         index = self._path_index[block]
         along = float(index) + self._offset_along(x, y, index)
-        # Coasting beyond a bend does not follow the path, yet its length says how far ahead the bend must be begun.
+        # Coasting does not follow a bend, yet its length says how far ahead the bend must be begun.
         along += math.hypot(ahead_x - x, ahead_y - y) + self._lookahead
         along = min(max(along, 0.0), len(self._path) - 1.0)
         start = min(int(along), len(self._path) - 2)
@@ -150,7 +157,7 @@ class PathDriver:
         return col_a + 0.5 + share * (col_b - col_a), row_a + 0.5 + share * (row_b - row_a)
 
     def _offset_along(self, x: float, y: float, index: int) -> float:
-        """Progress in blocks from the centre of path block `index`, along whichever of its two legs is nearer."""
+        """Progress in blocks beyond (or, negative, before) the centre of path block `index`."""
         row, col = self._path[index]
         off_x, off_y = x - col - 0.5, y - row - 0.5
         forward = backward = 0.0

@@ -17,8 +17,9 @@ from ngo_sim.mazes import Maze
 class Episode:
     """One recorded episode; frame k is seen at pose k and action k is taken between frame k and frame k + 1.
 
-    observations: (frames, ...) of the world's shape and type. actions: uint8 (frames - 1,). poses_xyyaw: float64
-    (frames, 3) in the maze's frame, m, m, rad. period_s: time between two frames. maze: where it was recorded.
+    observations: (frames, ...) of the world's shape and type. actions: uint8 (frames - 1,).
+    poses_xyyaw: float64 (frames, 3) in the maze's frame, m, m, rad. period_s: time between two frames.
+    maze: where it was recorded.
     """
 
     observations: npt.NDArray[Any]
@@ -29,7 +30,7 @@ class Episode:
 
 
 def record_episode(env: gymnasium.Env[Any, Any], driver_name: str, frames: int, seed: int) -> Episode:
-    """Record frames (at least 1) of a Maze2D or Maze3D; the world, the noise and the driver are functions of seed."""
+    """Record `frames` (at least 1) of a Maze2D or Maze3D; world, noise and driver are functions of seed."""
     if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 1:
         raise ValueError(f"frames is {frames!r}; it must be an integer of at least 1")
     world: Any = env.unwrapped

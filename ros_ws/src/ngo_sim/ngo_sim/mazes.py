@@ -1,8 +1,8 @@
 """Random block mazes: Prim and Kruskal spanning trees, optional cycles, shortest paths and a picture.
 
-A maze of `rows` x `cols` cells is drawn on (2 rows + 1) x (2 cols + 1) square blocks: cells stand at odd (row, col),
-the block between two cells is free where they are connected, everything else is wall. Corridors are one block wide and
-no 2 x 2 square is ever free, so the free blocks have exactly the cycles of the cells.
+A maze of `rows` x `cols` cells is drawn on (2 rows + 1) x (2 cols + 1) square blocks: cells stand at odd
+(row, col), the block between two cells is free where they are connected, everything else is wall. Corridors
+are one block wide and no 2 x 2 square is ever free, so the free blocks have exactly the cycles of the cells.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ Edge = tuple[Cell, Cell]
 
 @dataclass(frozen=True, eq=False)
 class Maze:
-    """A closed maze of square blocks in its own frame: origin at the corner of block (0, 0), x along columns, y along rows.
+    """A closed maze of square blocks. Its frame has its origin at the outer corner of block (0, 0), x along
+    the columns and y along the rows.
 
     walls: bool (height, width), True where a block is wall; row 0 spans y in [0, block_m].
     block_m: side of a block and width of a corridor, in metres.
@@ -58,8 +59,9 @@ class Maze:
         graph = nx.Graph()
         graph.add_nodes_from(map(tuple, np.argwhere(free).tolist()))
         for step in ((0, 1), (1, 0)):
-            first = np.argwhere(free[: free.shape[0] - step[0], : free.shape[1] - step[1]] & free[step[0]:, step[1]:])
-            graph.add_edges_from(zip(map(tuple, first.tolist()), map(tuple, (first + step).tolist())))
+            height, width = free.shape[0] - step[0], free.shape[1] - step[1]
+            pairs = np.argwhere(free[:height, :width] & free[step[0]:, step[1]:])
+            graph.add_edges_from(((row, col), (row + step[0], col + step[1])) for row, col in pairs.tolist())
         return graph
 
     def free_blocks(self) -> npt.NDArray[np.int64]:
@@ -82,9 +84,10 @@ class Maze:
             raise ValueError(f"the point ({x}, {y}) m is outside the maze of {width_m} x {height_m} m")
         return int(y // self.block_m), int(x // self.block_m)
 
-    def wall_faces(self) -> npt.NDArray[np.float64]:
-        """(n, 2, 2) the x, y of both ends, in metres, of every straight stretch of wall face that looks onto free blocks."""
-        return np.concatenate([_faces_along_x(self.walls), _faces_along_x(self.walls.T)[..., ::-1]]) * self.block_m
+    def wall_segments(self) -> npt.NDArray[np.float64]:
+        """(n, 2, 2) both ends x, y, in metres, of every straight stretch of wall that bounds free blocks."""
+        along_x, along_y = _segments_along_x(self.walls), _segments_along_x(self.walls.T)[..., ::-1]
+        return np.concatenate((along_x, along_y)) * self.block_m
 
     def shortest_path(self, start_block: Iterable[int], goal_block: Iterable[int]) -> npt.NDArray[np.int64]:
         """(n, 2) the (row, col) blocks from start to goal, both included, by Dijkstra's algorithm.
@@ -106,15 +109,16 @@ def check_maze_size(rows: int, cols: int, extra_openings: int) -> None:
     for name, value in (("rows", rows), ("cols", cols)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 2:
             raise ValueError(f"{name} is {value!r}; it must be an integer of at least 2")
-    # The grid of cells has rows (cols - 1) + cols (rows - 1) edges and a spanning tree uses rows cols - 1 of them.
+    # Cells have rows (cols - 1) + cols (rows - 1) walls between them and a spanning tree opens rows cols - 1.
     most = (rows - 1) * (cols - 1)
-    if isinstance(extra_openings, bool) or not isinstance(extra_openings, (int, np.integer)) \
-            or not 0 <= extra_openings <= most:
+    integer = isinstance(extra_openings, (int, np.integer)) and not isinstance(extra_openings, bool)
+    if not (integer and 0 <= extra_openings <= most):
         raise ValueError(f"extra_openings is {extra_openings!r}; it must be an integer from 0 to {most} "
                          f"in a maze of {rows} x {cols} cells")
 
 
-def prim_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: int = 0, block_m: float = 1.0) -> Maze:
+def prim_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: int = 0,
+              block_m: float = 1.0) -> Maze:
     """A random maze grown by Prim's algorithm with random weights: many short dead ends.
 
     extra_openings walls are opened on top of the spanning tree; each adds exactly one cycle.
@@ -125,7 +129,7 @@ def prim_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: in
     tree: list[Edge] = []
     frontier: list[Edge] = [(start, cell) for cell in _neighbours(start, rows, cols)]
     while frontier:
-        # Drawing the frontier's edge at random equals independent weights; swapping with the last keeps the pop O(1).
+        # An edge of the frontier at random equals independent weights; the swap keeps the pop O(1).
         pick = int(rng.integers(len(frontier)))
         frontier[pick], frontier[-1] = frontier[-1], frontier[pick]
         near, far = frontier.pop()
@@ -156,24 +160,27 @@ def kruskal_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings:
 
 
 def draw_maze(axes: Axes, maze: Maze, colors: npt.ArrayLike | None = None) -> None:
-    """Draw the maze on matplotlib axes in metres, y up, as one image; walls dark, or colors (height, width, 3) in [0, 1]."""
+    """Draw the maze on matplotlib axes as one image, in metres, y up.
+
+    Walls are dark grey, or of colors (height, width, 3) in [0, 1], one a block.
+    """
     wall = np.full((*maze.walls.shape, 3), 0.25) if colors is None else np.asarray(colors, dtype=np.float64)
     if wall.shape != (*maze.walls.shape, 3):
         raise ValueError(f"colors has shape {wall.shape}; it must be {(*maze.walls.shape, 3)}")
     width_m, height_m = maze.size_m
-    axes.imshow(np.where(maze.walls[..., None], wall, 1.0), origin="lower", extent=(0.0, width_m, 0.0, height_m),
-                interpolation="nearest", zorder=0)
+    axes.imshow(np.where(maze.walls[..., None], wall, 1.0), origin="lower", interpolation="nearest", zorder=0,
+                extent=(0.0, width_m, 0.0, height_m))
     axes.set(aspect="equal", xlim=(0.0, width_m), ylim=(0.0, height_m), xlabel="x [m]", ylabel="y [m]")
 
 
-def _faces_along_x(walls: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
-    """(n, 2, 2) the ends (x, y), in blocks, of the longest stretches of face along x that look the same way."""
-    looks = np.diff(walls.astype(np.int8), axis=0)  # -1 up, +1 down, between row i and row i + 1; 0 at both ends
-    line, end = np.nonzero(np.diff(looks, axis=1))
-    face = looks[line, end] != 0
-    first = looks[line, end + 1] != 0
-    starts = np.stack((end[first] + 1, line[first] + 1), axis=-1)
-    ends = np.stack((end[face] + 1, line[face] + 1), axis=-1)
+def _segments_along_x(walls: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    """(n, 2, 2) the ends x, y, in blocks, of the longest straight walls along x with one free side."""
+    # Between row i and row i + 1: which of them alone is free, +1 the first, -1 the second, 0 both or none.
+    free_side = np.diff(walls.astype(np.int8), axis=0)
+    line, last = np.nonzero(np.diff(free_side, axis=1))
+    begins, ends_here = free_side[line, last + 1] != 0, free_side[line, last] != 0
+    starts = np.stack((last[begins] + 1, line[begins] + 1), axis=-1)
+    ends = np.stack((last[ends_here] + 1, line[ends_here] + 1), axis=-1)
     return np.stack((starts, ends), axis=1).astype(np.float64)
 
 

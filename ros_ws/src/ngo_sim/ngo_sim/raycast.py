@@ -13,10 +13,11 @@ def cast_rays(walls: npt.NDArray[np.bool_], block_m: float, x: float, y: float, 
               colors: npt.NDArray[np.float32], scan: npt.NDArray[np.float32]) -> None:
     """Write r, g, b and depth in metres of the first wall along every ray into scan (rays, 4).
 
-    walls: bool (height, width), its outer ring all wall. x, y, yaw: the eye in the maze's frame, inside the maze.
-    ray_cos, ray_sin: (rays,) of each ray's angle in the robot's frame. colors: float32 (height, width, 3), a colour a block.
-    Depth is measured along the ray. The grid is traversed exactly, face by face (Amanatides and Woo, 1987), so the result
-    has no step size and the only error is rounding.
+    walls: bool (height, width), its outer ring all wall. x, y, yaw: the eye in the maze's frame, m, m, rad.
+    ray_cos, ray_sin: (rays,) of each ray's angle in the robot's frame. colors: float32 (height, width, 3),
+    one a block. Depth is measured along the ray. The grid is traversed exactly, face by face (Amanatides and
+    Woo, 1987), so there is no step size and the only error is rounding. Raises ValueError for an eye outside
+    the outer ring.
     """
     eye_x, eye_y = x / block_m, y / block_m
     eye_col, eye_row = int(np.floor(eye_x)), int(np.floor(eye_y))
@@ -27,7 +28,7 @@ def cast_rays(walls: npt.NDArray[np.bool_], block_m: float, x: float, y: float, 
         along_x = cos_yaw * ray_cos[ray] - sin_yaw * ray_sin[ray]
         along_y = sin_yaw * ray_cos[ray] + cos_yaw * ray_sin[ray]
         col, row = eye_col, eye_row
-        # next_*: distance along the ray to the next grid line of that axis; per_*: from one such line to the next.
+        # next_*: how far along the ray the next grid line of an axis is; per_*: from one line to the next.
         step_col = 1 if along_x > 0 else -1
         step_row = 1 if along_y > 0 else -1
         per_col = 1.0 / abs(along_x) if along_x != 0.0 else np.inf
