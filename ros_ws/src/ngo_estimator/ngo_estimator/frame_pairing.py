@@ -1,0 +1,112 @@
+"""Pairs each frame with the action that led to it, when the two arrive on separate ways in any order (no ROS here)."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.local_odometry import RESTART_AFTER_NS, DuplicateFrame, LateFrame
+
+_ACTIONS_KEPT = 4096
+
+
+@dataclass(frozen=True)
+class PairedFrame:
+    """A frame, and the action between the frame before it and this one (None for the first, or where none is needed)."""
+
+    stamp_ns: int
+    image: np.ndarray
+    action: int | None
+
+
+class FramePairing:
+    """Holds frames back until the action that led to them is known.
+
+    An action carries the stamp of the frame at which it was taken. A frame is ready when the action of the last frame
+    handed out is here; if that one is known to be lost, the first action between the two frames takes its place. Both
+    streams are in order by themselves, so an action from the frame's own time or later says that no action between can
+    come any more: the frame is dropped. It is also dropped once newer frames are ``timeout_ns`` ahead, or more than
+    ``capacity`` frames wait. Nothing is made up for a lost action: the next frame spans the gap.
+    """
+
+    def __init__(self, needs_action: bool, timeout_ns: int, capacity: int) -> None:
+        if timeout_ns <= 0 or capacity < 1:
+            raise ValueError(f"timeout is {timeout_ns} ns and capacity {capacity}; expected more than 0 and at least 1")
+        self._needs_action = needs_action
+        self._timeout_ns = timeout_ns
+        self._capacity = capacity
+        self.dropped = 0
+        """Frames given up because their action did not come."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames and actions; ``dropped`` goes on."""
+        self._waiting: deque[tuple[int, np.ndarray]] = deque()
+        self._actions: deque[tuple[int, int]] = deque(maxlen=_ACTIONS_KEPT)
+        self._last_ns: int | None = None
+
+    @property
+    def waiting(self) -> int:
+        """How many frames wait for their action."""
+        return len(self._waiting)
+
+    def add_action(self, stamp_ns: int, action: int) -> None:
+        """Take an action; one that is not newer than the last is ignored, unless its source restarted."""
+        if self._actions and stamp_ns <= self._actions[-1][0]:
+            if stamp_ns > self._actions[-1][0] - RESTART_AFTER_NS:
+                return
+            self._actions.clear()
+        self._actions.append((stamp_ns, action))
+
+    def add_frame(self, stamp_ns: int, image: np.ndarray) -> None:
+        """Take a frame.
+
+        Raises:
+            DuplicateFrame, LateFrame: it is not newer than the last one, but not as old as after a restart.
+        """
+        newest = self._waiting[-1][0] if self._waiting else self._last_ns
+        if newest is not None and stamp_ns <= newest:
+            if stamp_ns == newest:
+                raise DuplicateFrame(f"frame at {stamp_ns} ns came twice")
+            if stamp_ns > newest - RESTART_AFTER_NS:
+                raise LateFrame(f"frame at {stamp_ns} ns is {(newest - stamp_ns) / 1e9:.3f} s older than the last one")
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+            self._last_ns = None
+            # Actions of the new run may be here already; those of the old one are further ahead.
+            of_new_run = [entry for entry in self._actions if entry[0] < stamp_ns + RESTART_AFTER_NS]
+            self._actions = deque(of_new_run, maxlen=_ACTIONS_KEPT)
+        self._waiting.append((stamp_ns, image))
+
+    def ready(self) -> Iterator[PairedFrame]:
+        """Hand out, in order, every frame whose action is known by now."""
+        while self._waiting:
+            stamp_ns, image = self._waiting[0]
+            action = None
+            if self._needs_action and self._last_ns is not None:
+                action = self._action_between(self._last_ns, stamp_ns)
+                if action is None:
+                    if not self._is_lost(stamp_ns):
+                        return
+                    self._waiting.popleft()
+                    self.dropped += 1
+                    continue
+            self._waiting.popleft()
+            self._last_ns = stamp_ns
+            yield PairedFrame(stamp_ns, image, action)
+
+    def _action_between(self, from_ns: int, to_ns: int) -> int | None:
+        """The first action in ``[from_ns, to_ns)``; older ones are of no use any more and are forgotten."""
+        if self._actions and self._actions[-1][0] <= from_ns - RESTART_AFTER_NS:
+            return None  # of a restarted source, whose first frame is still on its way
+        while self._actions and self._actions[0][0] < from_ns:
+            self._actions.popleft()
+        if self._actions and self._actions[0][0] < to_ns:
+            return self._actions[0][1]
+        return None
+
+    def _is_lost(self, stamp_ns: int) -> bool:
+        overtaken = bool(self._actions) and self._actions[-1][0] >= stamp_ns
+        timed_out = self._waiting[-1][0] - stamp_ns >= self._timeout_ns
+        return overtaken or timed_out or len(self._waiting) > self._capacity

@@ -1,0 +1,180 @@
+"""Between ROS messages and the arrays of the cores."""
+
+import sys
+from array import array
+from typing import TYPE_CHECKING
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Twist,
+    Vector3,
+)
+from nav_msgs.msg import Odometry
+from ngo_msgs.msg import RelativePose, Trajectory
+from sensor_msgs.msg import Image
+from std_msgs.msg import ColorRGBA, Header
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ngo_estimator.planar_covariance import to_spatial
+
+if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
+    from ngo_estimator.local_odometry import LocalEstimate
+    from ngo_estimator.online_trajectory import RelativeStep, TrajectoryUpdate
+
+_NS = 1_000_000_000
+_ENCODINGS = {"uint8": "rgb8", "float32": "32FC4"}
+_LOOP_WIDTH_M = 0.03
+
+
+def to_ns(time: Time) -> int:
+    """A stamp in nanoseconds."""
+    return int(time.sec) * _NS + int(time.nanosec)
+
+
+def to_time(stamp_ns: int) -> Time:
+    """A stamp from nanoseconds."""
+    return Time(sec=stamp_ns // _NS, nanosec=stamp_ns % _NS)
+
+
+def image_array(message: Image, shape: tuple[int, int, int], dtype: str) -> np.ndarray:
+    """The pixels of ``message`` as ``(height, width, channels)`` of ``dtype``.
+
+    Raises ``ValueError`` unless the image has this size and its encoding (``rgb8`` for uint8, ``32FC4`` for float32),
+    its data is as long as it says, and all its values are finite.
+    """
+    height, width, channels = shape
+    encoding = _ENCODINGS[dtype]
+    if message.encoding != encoding:
+        raise ValueError(f"image has the encoding '{message.encoding}'; expected '{encoding}'")
+    if (message.height, message.width) != (height, width):
+        raise ValueError(f"image is {message.width} x {message.height} pixels; expected {width} x {height}")
+    row = width * channels * np.dtype(dtype).itemsize
+    if message.step < row or len(message.data) != message.step * height:
+        raise ValueError(
+            f"image has {len(message.data)} bytes in {height} rows of {message.step}; expected rows of {row} bytes"
+        )
+    pixels = np.frombuffer(message.data, np.uint8).reshape(height, message.step)[:, :row]
+    image = np.ascontiguousarray(pixels).view(dtype).reshape(shape)
+    if bool(message.is_bigendian) != (sys.byteorder == "big"):
+        image = image.byteswap() if dtype == "float32" else image
+    if dtype == "float32" and not np.isfinite(image).all():
+        raise ValueError(f"image has {int((~np.isfinite(image)).sum())} values that are not finite")
+    return image
+
+
+def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> RelativePose:
+    """One step of the local odometry, stamped with its newer frame."""
+    x, y, yaw = estimate.relative_xyyaw.tolist()
+    odom_x, odom_y, odom_yaw = estimate.odom_xyyaw.tolist()
+    return RelativePose(
+        header=Header(stamp=to_time(estimate.stamp_ns), frame_id=base_frame),
+        from_stamp=to_time(estimate.from_stamp_ns),
+        x=x,
+        y=y,
+        yaw=yaw,
+        covariance=estimate.covariance.ravel(),
+        odom_x=odom_x,
+        odom_y=odom_y,
+        odom_yaw=odom_yaw,
+        motion_feature=array("f", estimate.motion_feature.tobytes()),
+        place_code=array("f", estimate.place_code.tobytes()),
+    )
+
+
+def relative_step(message: RelativePose) -> "RelativeStep":
+    """What ``OnlineTrajectory`` takes, from a message."""
+    from ngo_estimator.online_trajectory import RelativeStep
+
+    return RelativeStep(
+        stamp_ns=to_ns(message.header.stamp),
+        from_stamp_ns=to_ns(message.from_stamp),
+        relative_xyyaw=np.array([message.x, message.y, message.yaw]),
+        covariance=np.array(message.covariance).reshape(3, 3),
+        odom_xyyaw=np.array([message.odom_x, message.odom_y, message.odom_yaw]),
+        motion_feature=np.array(message.motion_feature, np.float32),
+        place_code=np.array(message.place_code, np.float32),
+    )
+
+
+def odometry_message(
+    estimate: "LocalEstimate", covariance: np.ndarray, odom_frame: str, base_frame: str
+) -> Odometry:
+    """The pose in ``odom_frame`` with its covariance ``(3, 3)``, and the mean velocity since the last frame."""
+    message = Odometry(
+        header=Header(stamp=to_time(estimate.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame
+    )
+    message.pose.pose = planar_pose(estimate.odom_xyyaw)
+    message.pose.covariance = to_spatial(covariance)
+    seconds = (estimate.stamp_ns - estimate.from_stamp_ns) / _NS
+    x, y, yaw = (estimate.relative_xyyaw / seconds).tolist()
+    message.twist.twist = Twist(linear=Vector3(x=x, y=y), angular=Vector3(z=yaw))
+    message.twist.covariance = to_spatial(estimate.covariance / seconds**2)
+    return message
+
+
+def pose_message(
+    stamp_ns: int, frame: str, pose_xyyaw: np.ndarray, covariance: np.ndarray
+) -> PoseWithCovarianceStamped:
+    """A pose ``(3,)`` in ``frame`` with its covariance ``(3, 3)``."""
+    message = PoseWithCovarianceStamped(header=Header(stamp=to_time(stamp_ns), frame_id=frame))
+    message.pose.pose = planar_pose(pose_xyyaw)
+    message.pose.covariance = to_spatial(covariance)
+    return message
+
+
+def transform_message(stamp_ns: int, parent: str, child: str, parent_from_child: np.ndarray) -> TFMessage:
+    """One transform ``(3,)`` for /tf."""
+    pose = planar_pose(parent_from_child)
+    transform = Transform(
+        translation=Vector3(x=pose.position.x, y=pose.position.y), rotation=pose.orientation
+    )
+    header = Header(stamp=to_time(stamp_ns), frame_id=parent)
+    return TFMessage(transforms=[TransformStamped(header=header, child_frame_id=child, transform=transform)])
+
+
+def planar_pose(pose_xyyaw: np.ndarray) -> Pose:
+    """A pose ``(3,)`` as position and quaternion."""
+    x, y, yaw = pose_xyyaw.tolist()
+    return Pose(
+        position=Point(x=x, y=y), orientation=Quaternion(z=float(np.sin(0.5 * yaw)), w=float(np.cos(0.5 * yaw)))
+    )
+
+
+def trajectory_message(update: "TrajectoryUpdate", frame: str) -> Trajectory:
+    """The whole trajectory in flat arrays, poses in ``frame``."""
+    return Trajectory(
+        header=Header(stamp=to_time(int(update.stamps_ns[-1])), frame_id=frame),
+        stamps_ns=array("q", update.stamps_ns.astype(np.int64).tobytes()),
+        x=_doubles(update.poses_xyyaw[:, 0]),
+        y=_doubles(update.poses_xyyaw[:, 1]),
+        yaw=_doubles(update.poses_xyyaw[:, 2]),
+        moved=_doubles(update.moved_m),
+    )
+
+
+def _doubles(values: np.ndarray) -> "array[float]":
+    return array("d", values.astype(np.float64).tobytes())
+
+
+def loop_markers(update: "TrajectoryUpdate", frame: str) -> MarkerArray:
+    """One line for each loop edge between the poses it connects, opaque as its weight; none deletes the last ones."""
+    header = Header(stamp=to_time(int(update.stamps_ns[-1])), frame_id=frame)
+    marker = Marker(header=header, ns="loops", type=Marker.LINE_LIST, action=Marker.ADD)
+    if len(update.loops) == 0:
+        marker.action = Marker.DELETE
+        return MarkerArray(markers=[marker])
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = _LOOP_WIDTH_M
+    ends = update.poses_xyyaw[update.loops.reshape(-1), :2].tolist()
+    marker.points = [Point(x=x, y=y) for x, y in ends]
+    opacities = np.repeat(np.clip(update.loop_weights, 0.0, 1.0), 2).tolist()
+    marker.colors = [ColorRGBA(r=0.1, g=0.5, b=0.9, a=opacity) for opacity in opacities]
+    return MarkerArray(markers=[marker])

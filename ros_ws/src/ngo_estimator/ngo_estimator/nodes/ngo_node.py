@@ -1,0 +1,144 @@
+"""Node that re-optimises the whole trajectory with every relative pose, and publishes it corrected."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from ngo_msgs.msg import RelativePose
+from ngo_msgs.srv import Reset, SaveTrajectory
+from rclpy.node import Node
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.parameters import BadParameter, declare_settings, frame, setting, topic
+from ngo_estimator.nodes.process import run_node
+from ngo_estimator.nodes.status import NodeStatus
+from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
+from ngo_estimator.nodes.weights import EstimatorSettings, load_core
+from ngo_estimator.trajectory_file import write_tum
+
+if TYPE_CHECKING:
+    from ngo_estimator.online_trajectory import TrajectoryUpdate
+
+NAME = "ngo_node"
+_DEPTH = 100
+
+
+@dataclass(frozen=True)
+class NgoNodeSettings(EstimatorSettings):
+    """Parameters of ``ngo_node``."""
+
+    window_frames: int = setting(2000, "Frames of the trajectory that are kept and corrected.", minimum=2, maximum=100_000)
+    map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump; its origin is the first frame.")
+    path_topic: str = topic("ngo/path", "Corrected trajectory.")
+    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, for every relative pose.")
+    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory in flat arrays, and how far each pose moved.")
+    loops_topic: str = topic("ngo/loops", "Lines between poses that the optimizer takes for the same place.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.map_frame == self.odom_frame:
+            raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
+        if self.relative_pose_depth < self.window_frames:
+            raise BadParameter(
+                f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; allowed: at least window_frames, "
+                f"which is {self.window_frames}"
+            )
+
+
+class NgoNode(Node):
+    """Subscribes relative poses; publishes the corrected trajectory in several forms, and map -> odom."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        self._settings = settings = declare_settings(self, NgoNodeSettings)
+        # Imported here because torch takes seconds: a bad parameter is said at once.
+        from ngo_estimator.online_trajectory import OnlineTrajectory
+
+        self._core = load_core(
+            lambda folder, world: OnlineTrajectory.load(folder, world, settings.window_frames), settings
+        )
+        self._latest: TrajectoryUpdate | None = None
+        self._status = NodeStatus(self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, settings.pose_topic, _DEPTH)
+        self._whole = TrajectoryPublishers(
+            self, settings.map_frame, settings.path_topic, settings.trajectory_topic, settings.loops_topic
+        )
+        if settings.publish_tf:
+            self._tf = self.create_publisher(TFMessage, settings.tf_topic, _DEPTH)
+        self.create_service(SaveTrajectory, "~/save_trajectory", self._on_save)
+        self.create_service(Reset, "~/reset", self._on_reset)
+        self.create_subscription(
+            RelativePose, settings.relative_pose_topic, self._on_relative_pose, settings.relative_pose_depth
+        )
+        self.get_logger().info(f"ready: {settings.world}, the last {settings.window_frames} frames")
+
+    def _on_relative_pose(self, message: RelativePose) -> None:
+        try:
+            step = messages.relative_step(message)
+            with self._status.timed():
+                update = self._core.update(step)
+        except ValueError as error:
+            self._status.dropped("relative pose", error)
+            return
+        self._status.received(step.stamp_ns)
+        if update.restarted:
+            self.get_logger().info("the stamps jumped back: their source restarted, so the trajectory starts anew")
+        self._latest = update
+        self._publish(update)
+
+    def _publish(self, update: "TrajectoryUpdate") -> None:
+        settings, stamp_ns = self._settings, int(update.stamps_ns[-1])
+        if settings.publish_tf:
+            stamped = (stamp_ns, settings.map_frame, settings.odom_frame, update.map_from_odom_xyyaw)
+            self._tf.publish(messages.transform_message(*stamped))
+        self._whole.publish(update)
+        self._pose.publish(
+            messages.pose_message(stamp_ns, settings.map_frame, update.poses_xyyaw[-1], update.covariance)
+        )
+
+    def _on_save(self, request: SaveTrajectory.Request, response: SaveTrajectory.Response) -> SaveTrajectory.Response:
+        path = Path(request.path).expanduser().absolute()
+        stamps_ns, poses_xyyaw = np.zeros(0, np.int64), np.zeros((0, 3))
+        if self._latest is not None:
+            stamps_ns, poses_xyyaw = self._latest.stamps_ns, self._latest.poses_xyyaw
+        try:
+            write_tum(path, stamps_ns, poses_xyyaw)
+        except (ValueError, OSError) as error:
+            response.success, response.message = False, str(error)
+        else:
+            response.success, response.message = True, f"wrote {len(stamps_ns)} poses to {path}"
+        return response
+
+    def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
+        frames = 0 if self._latest is None else len(self._latest.stamps_ns)
+        self._core.reset()
+        self._latest = None
+        self._whole.publish(None)
+        response.success, response.message = True, f"forgot {frames} poses"
+        return response
+
+    def _details(self) -> dict[str, str]:
+        if self._latest is None:
+            return {}
+        update, window = self._latest, self._settings.window_frames
+        x, y, yaw = update.map_from_odom_xyyaw.tolist()
+        return {
+            "frames": str(len(update.stamps_ns)),
+            "window fill": f"{len(update.stamps_ns) / window:.3f}",
+            "loops": str(len(update.loops)),
+            "largest move in the last update (m)": f"{update.moved_m.max():.3f}",
+            "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",
+        }
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node(NAME, NgoNode))
+
+
+if __name__ == "__main__":
+    main()

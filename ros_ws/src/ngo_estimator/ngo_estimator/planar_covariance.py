@@ -1,0 +1,31 @@
+"""Covariances of planar poses (x, y, yaw; m, m, rad), and the 6x6 form in which ROS messages carry them."""
+
+import numpy as np
+
+_PLANAR = np.array([0, 1, 5])  # x, y and yaw among x, y, z, roll, pitch, yaw
+
+
+def propagate(
+    covariance: np.ndarray, pose_xyyaw: np.ndarray, relative_xyyaw: np.ndarray, relative_covariance: np.ndarray
+) -> np.ndarray:
+    """Covariance ``(3, 3)`` of a pose after one more step, to first order.
+
+    Args:
+        covariance: ``(3, 3)`` of the pose before the step, in the frame that the pose is given in.
+        pose_xyyaw: ``(3,)`` the pose after the step.
+        relative_xyyaw: ``(3,)`` the step, seen from the pose before it.
+        relative_covariance: ``(3, 3)`` of the step, in the frame of the pose before it.
+    """
+    yaw_before = pose_xyyaw[2] - relative_xyyaw[2]
+    cos, sin = np.cos(yaw_before), np.sin(yaw_before)
+    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    shift_x, shift_y = rotation[:2, :2] @ relative_xyyaw[:2]
+    lever = np.array([[1.0, 0.0, -shift_y], [0.0, 1.0, shift_x], [0.0, 0.0, 1.0]])
+    return np.asarray(lever @ covariance @ lever.T + rotation @ relative_covariance @ rotation.T)
+
+
+def to_spatial(covariance: np.ndarray) -> np.ndarray:
+    """Row-major ``(36,)`` covariance of x, y, z, roll, pitch, yaw; the planar world's z, roll and pitch are exactly 0."""
+    spatial = np.zeros((6, 6))
+    spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
+    return spatial.ravel()
