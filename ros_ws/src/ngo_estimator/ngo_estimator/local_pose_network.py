@@ -1,0 +1,92 @@
+"""The Local Pose Estimation network (paper, section "Local Pose Estimation Network")."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from ngo_estimator.flownet import FlowNetConvolutions
+from ngo_estimator.images import ImageFormat, to_network
+
+
+@dataclass(frozen=True)
+class LocalPoseConfig:
+    """What a local pose network is made of.
+
+    ``relative_mean`` and ``relative_std`` (m, m, rad) normalise the output: the network works on poses of mean 0 and
+    deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of
+    discrete actions, 0 for a network that sees images alone; ``period_s`` is the time between frames in training.
+    """
+
+    image: ImageFormat
+    width: float
+    actions: int
+    period_s: float
+    feature_size: int = 64
+    hidden_size: int = 256
+    relative_mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    relative_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.width <= 2.0:
+            raise ValueError(f"width is {self.width}; expected over 0 and at most 2 (1 is FlowNetS)")
+        if self.actions < 0 or self.feature_size < 1 or self.hidden_size < 1:
+            raise ValueError(
+                f"actions, feature_size, hidden_size are {self.actions}, {self.feature_size}, {self.hidden_size}; "
+                "expected at least 0, 1, 1"
+            )
+        if not self.period_s > 0.0:
+            raise ValueError(f"period_s is {self.period_s}; expected a positive time")
+        if min(self.relative_std) <= 0.0:
+            raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
+
+
+class LocalPoseNetwork(nn.Module):
+    """Relative pose of a frame with respect to the one before, from the two frames and the action between them.
+
+    Two frames are stacked and passed through the convolutions of FlowNetS; one fully connected layer takes these and
+    the action; a translational and a rotational head read it. Beyond the paper each head also gives the logarithm
+    of its standard deviation, and the input of the heads is the motion feature that the pose aggregation reads.
+    """
+
+    def __init__(self, config: LocalPoseConfig) -> None:
+        super().__init__()
+        self.config = config
+        image = config.image
+        self.convolutions = FlowNetConvolutions(2 * image.channels, (image.height, image.width), config.width)
+        self.hidden = nn.Linear(self.convolutions.output_size + config.actions, config.hidden_size)
+        self.feature = nn.Linear(config.hidden_size, config.feature_size)
+        self.translation = nn.Linear(config.feature_size + config.actions, 4)
+        self.rotation = nn.Linear(config.feature_size + config.actions, 2)
+        self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
+        self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
+        self.relative_mean: Tensor
+        self.relative_std: Tensor
+
+    def forward(self, earlier: Tensor, later: Tensor, actions: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Estimate relative poses.
+
+        Args:
+            earlier, later: observations ``(batch, height, width, channels)`` as the sensor gives them.
+            actions: ``(batch,)`` int64, the action between the two, or None for a network without actions.
+
+        Returns:
+            Relative pose ``(batch, 3)`` of the later frame in the earlier one (m, m, rad), the logarithm of its
+            standard deviations ``(batch, 3)``, and the motion feature ``(batch, feature_size)``.
+        """
+        if (actions is None) != (self.config.actions == 0):
+            given = "no actions were given" if actions is None else "actions were given"
+            raise ValueError(f"{given} to a network trained with {self.config.actions} actions")
+        frames = torch.cat((to_network(earlier), to_network(later)), dim=1)
+        inputs = [self.convolutions(frames)]
+        action_codes = []
+        if actions is not None:
+            action_codes = [one_hot(actions, self.config.actions).to(frames.dtype)]
+        hidden = torch.relu(self.hidden(torch.cat(inputs + action_codes, dim=1)))
+        feature = torch.relu(self.feature(hidden)).float()
+        heads_input = torch.cat([feature, *action_codes], dim=1)
+        translation, rotation = self.translation(heads_input).float(), self.rotation(heads_input).float()
+        mean = torch.cat((translation[:, :2], rotation[:, :1]), dim=1) * self.relative_std + self.relative_mean
+        log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1).clamp(-7.0, 3.0) + self.relative_std.log()
+        return mean, log_std, feature
