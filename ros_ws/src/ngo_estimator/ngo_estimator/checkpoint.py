@@ -1,0 +1,174 @@
+"""Weights on disk: a safetensors file and a JSON description beside it."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import types
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import safetensors
+from safetensors.torch import load, save
+from torch import nn
+
+from ngo_estimator.images import ImageFormat
+from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.place_encoder import PairHead, PlaceConfig, PlaceEncoder
+from ngo_estimator.pose_aggregation import PoseAggregationConfig
+
+FORMAT = 1
+LOCAL, PLACE, OPTIMIZER = "local_pose_network", "place_encoder", "neural_graph_optimizer"
+WORLD_IMAGES = {
+    "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
+    "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
+}
+
+Network = TypeVar("Network", bound=nn.Module)
+Config = TypeVar("Config")
+
+
+class CheckpointError(ValueError):
+    """A checkpoint is missing, damaged, or not the one that was asked for."""
+
+
+class PlaceNetworks(nn.Module):
+    """The place encoder and its pair head, which are trained, stored and loaded together."""
+
+    def __init__(self, config: PlaceConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = PlaceEncoder(config)
+        self.pair_head = PairHead(config)
+
+
+def config_from_dict(kind: type[Config], values: Any) -> Config:
+    """Build a (nested) configuration dataclass from JSON values; unknown and missing keys are errors."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{kind.__name__} is {values!r}; expected an object")
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if unknown := sorted(set(values) - set(fields)):
+        raise ValueError(f"{kind.__name__} has unknown keys {unknown}; expected among {sorted(fields)}")
+    hints = typing.get_type_hints(kind)
+    arguments = {name: _from_json(hints[name], value) for name, value in values.items()}
+    try:
+        return kind(**arguments)
+    except TypeError as error:
+        raise ValueError(f"{kind.__name__}: {error}") from error
+
+
+def _from_json(hint: Any, value: Any) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return config_from_dict(typing.cast("type[Any]", hint), value)
+    if isinstance(hint, types.GenericAlias) and hint.__origin__ is tuple:
+        return tuple(value)
+    return value
+
+
+def save_checkpoint(path: Path, network: nn.Module, kind: str, world: str, details: dict[str, Any]) -> None:
+    """Write ``path`` (``.safetensors``) and its ``.json``, each at once or not at all.
+
+    ``details`` goes into the JSON beside the configuration: the training command, seed, revision and metrics.
+    """
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    weights = save(tensors)
+    description = {
+        "format": FORMAT,
+        "network": kind,
+        "world": world,
+        "sha256": hashlib.sha256(weights).hexdigest(),
+        "config": dataclasses.asdict(network.config),  # type: ignore[call-overload]
+        **details,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_at_once(path, weights)
+    _write_at_once(path.with_suffix(".json"), (json.dumps(description, indent=2) + "\n").encode())
+
+
+def _write_at_once(path: Path, content: bytes) -> None:
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_bytes(content)
+    os.replace(temporary, path)
+
+
+def load_description(path: Path, kind: str, world: str | None = None) -> dict[str, Any]:
+    """The JSON beside ``path``, checked to describe a network of ``kind``, trained for ``world`` if one is given."""
+    beside = path.with_suffix(".json")
+    try:
+        description = json.loads(beside.read_text())
+    except OSError as error:
+        raise CheckpointError(f"{beside}: cannot be read ({error.strerror}); expected the description of a {kind}") from error
+    except ValueError as error:
+        raise CheckpointError(f"{beside}: is not JSON ({error})") from error
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
+        raise CheckpointError(f"{beside}: is not a checkpoint description of format {FORMAT}")
+    if description.get("network") != kind:
+        raise CheckpointError(f"{beside}: describes a {description.get('network')!r}; expected a {kind!r}")
+    if world is not None and description.get("world") != world:
+        raise CheckpointError(f"{beside}: was trained for the world {description.get('world')!r}; expected {world!r}")
+    return description
+
+
+def load_network(
+    path: Path, kind: str, build: Callable[[Any], Network], config: type[Any], world: str | None = None
+) -> tuple[Network, dict[str, Any]]:
+    """Load one network in evaluation mode, and its description.
+
+    Raises:
+        CheckpointError: naming the file, what is wrong with it and what was expected.
+    """
+    description = load_description(path, kind, world)
+    try:
+        network = build(config_from_dict(config, description.get("config")))
+    except ValueError as error:
+        raise CheckpointError(f"{path.with_suffix('.json')}: {error}") from error
+    try:
+        content = path.read_bytes()
+        tensors = load(content)
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
+    except safetensors.SafetensorError as error:
+        raise CheckpointError(f"{path}: is damaged or no safetensors file ({error})") from error
+    if hashlib.sha256(content).hexdigest() != description.get("sha256"):
+        raise CheckpointError(f"{path}: is not the file that {path.with_suffix('.json').name} describes (sha256 differs)")
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise CheckpointError(f"{path}: does not fit its configuration ({' '.join(str(error).split())})") from error
+    return network.eval().requires_grad_(False), description
+
+
+def load_local(weights: Path, world: str | None = None) -> tuple[LocalPoseNetwork, dict[str, Any]]:
+    """The local pose network in the folder ``weights``."""
+    return load_network(weights / f"{LOCAL}.safetensors", LOCAL, LocalPoseNetwork, LocalPoseConfig, world)
+
+
+def load_place(weights: Path, world: str | None = None) -> tuple[PlaceNetworks, dict[str, Any]]:
+    """The place encoder and pair head in the folder ``weights``."""
+    return load_network(weights / f"{PLACE}.safetensors", PLACE, PlaceNetworks, PlaceConfig, world)
+
+
+def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraphOptimizer, dict[str, Any]]:
+    """The Neural Graph Optimizer in the folder ``weights``."""
+    path = weights / f"{OPTIMIZER}.safetensors"
+    return load_network(path, OPTIMIZER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig, world)
+
+
+def write_untrained(weights: Path, world: str) -> None:
+    """Write freshly initialised networks for ``world`` into a folder: what training starts from, and tests use."""
+    if world not in WORLD_IMAGES:
+        raise ValueError(f"world is {world!r}; expected one of {sorted(WORLD_IMAGES)}")
+    image = WORLD_IMAGES[world]
+    std = (0.1, 0.02, 0.05)
+    details = {"training": "none: freshly initialised"}
+    local = LocalPoseNetwork(
+        LocalPoseConfig(image=image, width=0.125, actions=3, period_s=0.1 if world == "maze2d" else 2 / 35, relative_std=std)
+    )
+    place = PlaceNetworks(PlaceConfig(image=image, width=0.125, offset_scale_m=0.5))
+    aggregation = PoseAggregationConfig(motion_feature_size=local.config.feature_size, relative_std=std)
+    optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig(aggregation=aggregation))
+    for kind, network in ((LOCAL, local), (PLACE, place), (OPTIMIZER, optimizer)):
+        save_checkpoint(weights / f"{kind}.safetensors", network, kind, world, details)

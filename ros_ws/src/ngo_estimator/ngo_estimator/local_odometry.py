@@ -1,0 +1,160 @@
+"""Local odometry: frames in, relative poses out (no ROS here)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local, load_place
+from ngo_estimator.local_pose_network import LocalPoseNetwork
+
+RESTART_AFTER_NS = 1_000_000_000
+"""A stamp this far in the past means that the source restarted; anything less is a late frame."""
+
+
+class RejectedFrame(ValueError):
+    """A frame that cannot be used; the odometry is as it was before."""
+
+
+class DuplicateFrame(RejectedFrame):
+    """A frame with the stamp of the last one."""
+
+
+class LateFrame(RejectedFrame):
+    """A frame that is a little older than the last one."""
+
+
+class UnusableImage(RejectedFrame):
+    """An image of the wrong size or type, or with values that are not finite, or an unknown action."""
+
+
+@dataclass(frozen=True)
+class LocalEstimate:
+    """Motion between two consecutive frames.
+
+    ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
+    ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
+    ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``missed_frames`` counts the frames
+    missing between the two.
+    """
+
+    stamp_ns: int
+    from_stamp_ns: int
+    relative_xyyaw: np.ndarray
+    covariance: np.ndarray
+    origin_stamp_ns: int
+    odom_xyyaw: np.ndarray
+    motion_feature: np.ndarray
+    place_code: np.ndarray
+    missed_frames: int
+
+
+class LocalOdometry:
+    """Turns consecutive frames into relative poses, motion features and place codes."""
+
+    def __init__(self, network: LocalPoseNetwork, place: PlaceNetworks, world: str) -> None:
+        self._network = network.eval()
+        self._encoder = place.encoder.eval()
+        self.world = world
+        self.restarts = 0
+        self.reset()
+
+    @classmethod
+    def load(cls, weights: Path, world: str | None = None) -> "LocalOdometry":
+        """Load the networks in the folder ``weights``; raises ``CheckpointError`` (a ``ValueError``) with one clear line."""
+        network, description = load_local(weights, world)
+        place, place_description = load_place(weights, description["world"])
+        if place.config.image != network.config.image:
+            raise CheckpointError(
+                f"{weights}: the place encoder takes images {place.config.image.shape}, the local pose network "
+                f"{network.config.image.shape}; expected the same"
+            )
+        return cls(network, place, place_description["world"])
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """``(height, width, channels)`` of the frames that the networks were trained on."""
+        return self._network.config.image.shape
+
+    @property
+    def image_dtype(self) -> str:
+        """``uint8`` or ``float32``."""
+        return self._network.config.image.dtype
+
+    @property
+    def uses_action(self) -> bool:
+        """Whether each frame after the first needs the action that led to it."""
+        return self._network.config.actions > 0
+
+    @property
+    def period_s(self) -> float:
+        """Time between frames in training."""
+        return self._network.config.period_s
+
+    def reset(self) -> None:
+        """Forget all frames: the next one is the new origin of ``odom``."""
+        self._last_stamp_ns: int | None = None
+        self._origin_stamp_ns = 0
+        self._last_image = torch.empty(0)
+        self._odom = torch.zeros(3, dtype=torch.float64)
+
+    def update(self, stamp_ns: int, image: np.ndarray, action: int | None) -> LocalEstimate | None:
+        """Take the next frame.
+
+        Args:
+            stamp_ns: time of the frame.
+            image: ``image_shape`` of ``image_dtype``.
+            action: the action between the last frame and this one; of no account for the first frame.
+
+        Returns:
+            The motion since the last frame, or None for the first one, and after the source restarted (a stamp that
+            lies ``RESTART_AFTER_NS`` or more in the past).
+
+        Raises:
+            RejectedFrame: a frame that cannot be used; the state is as before.
+        """
+        try:
+            self._network.config.image.check(image)
+        except ValueError as error:
+            raise UnusableImage(str(error)) from error
+        frame = torch.from_numpy(np.array(image)).unsqueeze(0)
+        last = self._last_stamp_ns
+        if last is None or stamp_ns <= last - RESTART_AFTER_NS:
+            if last is not None:
+                self.reset()
+                self.restarts += 1
+            self._origin_stamp_ns = stamp_ns
+            self._last_stamp_ns, self._last_image = stamp_ns, frame
+            return None
+        if stamp_ns == last:
+            raise DuplicateFrame(f"frame at {stamp_ns} ns came twice")
+        if stamp_ns < last:
+            raise LateFrame(f"frame at {stamp_ns} ns is {(last - stamp_ns) / 1e9:.3f} s older than the last one")
+        actions = None
+        if self.uses_action:
+            if action is None or not 0 <= action < self._network.config.actions:
+                raise UnusableImage(f"action is {action}; expected 0 to {self._network.config.actions - 1}")
+            actions = torch.tensor([action])
+        with torch.inference_mode():
+            relative, log_std, feature = self._network(self._last_image, frame, actions)
+            code = self._encoder(frame)
+        missed = max(0, round((stamp_ns - last) * 1e-9 / self.period_s) - 1)
+        variance = torch.exp(2.0 * log_std[0].double())
+        # A pair further apart than in training: the network's own belief holds no longer, so a typical step for every
+        # missing frame is added to it.
+        variance = variance + (missed * self._network.relative_std.double()) ** 2
+        self._odom = se2.compose(self._odom, relative[0].double())
+        self._last_stamp_ns, self._last_image = stamp_ns, frame
+        return LocalEstimate(
+            stamp_ns=stamp_ns,
+            from_stamp_ns=last,
+            relative_xyyaw=relative[0].double().numpy(),
+            covariance=torch.diag(variance).numpy(),
+            origin_stamp_ns=self._origin_stamp_ns,
+            odom_xyyaw=self._odom.numpy().copy(),
+            motion_feature=feature[0].numpy(),
+            place_code=code[0].numpy(),
+            missed_frames=missed,
+        )
