@@ -1,0 +1,1 @@
+"""Offline training: data from the simulators, one script a network, evaluation."""

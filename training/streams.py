@@ -1,0 +1,189 @@
+"""Endless training data: worker processes simulate beside the training, and each datapoint is used once.
+
+An epoch of a stream is a function of its number alone (through its maze seeds), so a resumed training meets exactly
+the data that an unbroken one would have met.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from ngo_estimator import se2
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from ngo_sim.drivers import Action
+from ngo_sim.episodes import Episode, record_episode
+from training.worlds import World
+
+Batch = dict[str, Tensor]
+
+_GROUP = 8
+"""Episodes simulated in mazes of one size before another size is drawn, and shuffled together."""
+
+
+def simulate(world: World, seeds: list[int], frames: int) -> Iterator[Episode]:
+    """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one random size (a function of the first seed)."""
+    env = world.make_random(np.random.default_rng(seeds[0]))
+    try:
+        if hasattr(env, "preload"):
+            env.preload(seeds)
+        for seed in seeds:
+            yield record_episode(env, world.driver, frames, seed)
+    finally:
+        env.close()
+
+
+def images_of(world: World, episode: Episode) -> Tensor:
+    """An episode's observations as ``(frames, height, width, channels)``."""
+    return torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
+
+
+def relative_poses(poses_xyyaw: np.ndarray) -> Tensor:
+    """Relative poses ``(frames - 1, 3)``, float32, of ``(frames, 3)`` global poses."""
+    poses = torch.from_numpy(poses_xyyaw)
+    return se2.between(poses[:-1], poses[1:]).float()
+
+
+def mirrored(batch: Batch) -> Batch:
+    """The batch seen in a mirror: pictures flipped left to right, left and right actions and motions exchanged."""
+    flip = torch.tensor([1.0, -1.0, -1.0])
+    turned = torch.tensor([Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT])
+    result = dict(batch)
+    for name, value in batch.items():
+        if name in ("earlier", "later", "a", "b"):
+            result[name] = value.flip(-2)
+        elif name in ("relative", "poses"):
+            result[name] = value * flip
+        elif name == "action":
+            result[name] = turned[value]
+    return result
+
+
+class _Stream(IterableDataset[Batch]):
+    """The maze seeds of one epoch, dealt out to the workers in groups."""
+
+    def __init__(self, world: World, seeds: range, epoch: int, groups: int, frames: int) -> None:
+        self.world, self.frames = world, frames
+        first = epoch * groups * _GROUP
+        if first + groups * _GROUP > len(seeds):
+            raise ValueError(f"epoch {epoch} asks for more than the {len(seeds)} maze seeds")
+        self.groups = [list(seeds[i : i + _GROUP]) for i in range(first, first + groups * _GROUP, _GROUP)]
+
+    def __iter__(self) -> Iterator[Batch]:
+        torch.set_num_threads(1)
+        worker = get_worker_info()
+        mine = self.groups if worker is None else self.groups[worker.id :: worker.num_workers]
+        for seeds in mine:
+            rng = np.random.default_rng([seeds[0], 1])
+            yield from self.batches(list(simulate(self.world, seeds, self.frames)), rng)
+
+    def __len__(self) -> int:
+        return len(self.groups) * self.batches_a_group
+
+    @property
+    def batches_a_group(self) -> int:
+        """Batches that ``batches`` makes of a group of episodes."""
+        raise NotImplementedError
+
+    def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
+        """Batches of one group of episodes."""
+        raise NotImplementedError
+
+
+class PairStream(_Stream):
+    """Batches of consecutive frames, shuffled over a group of mazes; every second batch is mirrored.
+
+    A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``, ``action`` ``(batch,)`` and ``relative``
+    ``(batch, 3)``.
+    """
+
+    FRAMES = 401
+
+    def __init__(self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int) -> None:
+        super().__init__(world, seeds, epoch, max(1, round(datapoints / (_GROUP * (self.FRAMES - 1)))), self.FRAMES)
+        self.batch_size = batch_size
+
+    @property
+    def batches_a_group(self) -> int:
+        return _GROUP * (self.FRAMES - 1) // self.batch_size
+
+    def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
+        images = torch.stack([images_of(self.world, episode) for episode in episodes])
+        actions = torch.stack([torch.from_numpy(episode.actions).long() for episode in episodes]).flatten()
+        relative = torch.stack([relative_poses(episode.poses_xyyaw) for episode in episodes]).flatten(0, 1)
+        steps = self.frames - 1
+        order = torch.from_numpy(rng.permutation(len(actions)))
+        for count, chosen in enumerate(order.split(self.batch_size)):
+            if count == self.batches_a_group:
+                break
+            episode, step = chosen // steps, chosen % steps
+            batch = {
+                "earlier": images[episode, step],
+                "later": images[episode, step + 1],
+                "action": actions[chosen],
+                "relative": relative[chosen],
+            }
+            yield mirrored(batch) if count % 2 else batch
+
+
+class PlaceStream(_Stream):
+    """Batches of pairs of frames that show one place, from several mazes and well apart in time.
+
+    A batch holds ``a``, ``b`` ``(batch, height, width, channels)``, their ``poses`` ``(batch, 2, 3)`` and the number of
+    their ``maze`` ``(batch,)``.
+    """
+
+    MIN_STEPS_APART = 50
+    FRAMES = 1000
+
+    def __init__(self, world: World, seeds: range, epoch: int, batches: int, pairs_a_maze: int) -> None:
+        super().__init__(world, seeds, epoch, max(1, round(batches / self.batches_a_group)), self.FRAMES)
+        self.pairs_a_maze = pairs_a_maze
+
+    @property
+    def batches_a_group(self) -> int:
+        return 16
+
+    def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
+        pairs = [(episode, revisits(episode.poses_xyyaw, self.world, self.MIN_STEPS_APART)) for episode in episodes]
+        usable = [(episode, found) for episode, found in pairs if len(found)]
+        if not usable:
+            return
+        images = [images_of(self.world, episode) for episode, _ in usable]
+        for count in range(self.batches_a_group):
+            parts: list[Batch] = []
+            for maze, (episode, found) in enumerate(usable):
+                chosen = found[rng.choice(len(found), self.pairs_a_maze)]
+                swap = rng.random(len(chosen)) < 0.5
+                chosen[swap] = chosen[swap, ::-1]
+                index = torch.from_numpy(chosen)
+                poses = torch.from_numpy(episode.poses_xyyaw[chosen])
+                parts.append(
+                    {
+                        "a": images[maze][index[:, 0]],
+                        "b": images[maze][index[:, 1]],
+                        "poses": poses.float(),
+                        "maze": torch.full((len(chosen),), maze),
+                    }
+                )
+            batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+            yield mirrored(batch) if count % 2 else batch
+
+
+def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.ndarray:
+    """Pairs of frames ``(pairs, 2)``, earlier first, of one place: near in position and heading, well apart in time.
+
+    A frame later than another by ``min_steps_apart`` forms a pair with it within the world's place radius and heading limit.
+    """
+    xy, yaw = poses_xyyaw[:, :2], poses_xyyaw[:, 2]
+    distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
+    turn = np.abs(np.remainder(yaw[:, None] - yaw[None] + np.pi, 2 * np.pi) - np.pi)
+    index = np.arange(len(xy))
+    apart = index[None] - index[:, None] >= min_steps_apart
+    return np.argwhere(apart & (distance < world.place_radius_m) & (turn <= world.heading_limit_rad))
+
+
+def loader(stream: _Stream, workers: int) -> DataLoader[Batch]:
+    """The stream, made by ``workers`` processes beside the training (0: within it)."""
+    return DataLoader(stream, batch_size=None, num_workers=workers, prefetch_factor=8 if workers else None)

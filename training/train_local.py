@@ -1,0 +1,199 @@
+"""Train the local pose network of a world on pairs of frames that worker processes simulate.
+
+    python -m training.train_local --world maze2d
+
+Run again, it goes on where it was stopped. It ends with the network's output calibrated on mazes that it has not seen (one
+bias and scale a component, folded into its normalisation) and its weights written into the estimator's package.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+import tyro
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import LOCAL, save_checkpoint
+from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
+from torch.utils.data import DataLoader
+
+from training import runs
+from training.streams import Batch, PairStream, images_of, loader, relative_poses, simulate
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of a training of the local pose network."""
+
+    world: str
+    """maze2d or maze3d."""
+    width: float = 0.25
+    """Channels of the convolutions, as a fraction of FlowNetS's."""
+    epochs: int = 12
+    """Passes of new data."""
+    datapoints: int = 200_000
+    """Frame pairs in an epoch."""
+    batch_size: int = 256
+    """Frame pairs in a step of the optimiser."""
+    learning_rate: float = 2e-3
+    """Highest learning rate of the one-cycle schedule."""
+    validation_mazes: int = 8
+    """Mazes of the validation split that each epoch is measured on."""
+    workers: int = 1
+    """Processes that simulate."""
+    seed: int = 0
+    """Seed of the initial weights."""
+    out: Path = runs.WEIGHTS
+    """Folder that gets WORLD/local_pose_network.safetensors."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of checkpoints and logs."""
+
+
+class LocalTraining(lightning.LightningModule):
+    """Smooth-L1 on normalised relative poses, heading weighted, and the likelihood of what the network says of its errors."""
+
+    HEADING_WEIGHT = 3.0
+    LIKELIHOOD_WEIGHT = 0.1
+
+    def __init__(self, arguments: Arguments, world: World, network: LocalPoseNetwork) -> None:
+        super().__init__()
+        self.arguments, self.world, self.network = arguments, world, network
+        self.validation: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
+        std = self.network.relative_std
+        error = (mean - batch["relative"]) / std
+        weight = error.new_tensor([1.0, 1.0, self.HEADING_WEIGHT])
+        pose_loss = (smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.1) * weight).mean()
+        log_scale = log_std - std.log()
+        # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
+        likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
+        self.log_dict({"pose_loss": pose_loss, "likelihood": likelihood}, on_step=False, on_epoch=True, prog_bar=True)
+        return pose_loss + self.LIKELIHOOD_WEIGHT * likelihood
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
+        self.validation.append((mean.float(), log_std.float(), batch["relative"]))
+
+    def on_validation_epoch_end(self) -> None:
+        mean, log_std, truth = (torch.cat(parts) for parts in zip(*self.validation, strict=True))
+        self.validation.clear()
+        self.log_dict({f"validation_{k}": v for k, v in step_metrics(mean, log_std, truth).items()}, prog_bar=True)
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-4)
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, self.arguments.learning_rate, total_steps=steps, pct_start=0.1, div_factor=10, final_div_factor=100
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class _Data(lightning.LightningDataModule):
+    def __init__(self, arguments: Arguments, world: World) -> None:
+        super().__init__()
+        self.arguments, self.world = arguments, world
+        self.fixed: list[Batch] = []
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        assert self.trainer is not None
+        a = self.arguments
+        return loader(
+            PairStream(self.world, TRAIN_SEEDS, self.trainer.current_epoch, a.datapoints, a.batch_size), a.workers
+        )
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        if not self.fixed:
+            self.fixed = episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
+        return DataLoader(self.fixed, batch_size=None)  # type: ignore[arg-type]
+
+
+def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
+    """All consecutive frames of an episode in each of the mazes ``seeds``."""
+    result = []
+    for episode in simulate(world, seeds, 1000):
+        images = images_of(world, episode)
+        result.append(
+            {
+                "earlier": images[:-1],
+                "later": images[1:],
+                "action": torch.from_numpy(episode.actions).long(),
+                "relative": relative_poses(episode.poses_xyyaw),
+            }
+        )
+    return result
+
+
+def step_metrics(mean: Tensor, log_std: Tensor, truth: Tensor) -> dict[str, float]:
+    """Errors a step: RMSE (m, deg), constant bias (m, deg) and how many predicted deviations the errors have."""
+    error = mean - truth
+    error = torch.cat((error[:, :2], se2.wrap(error[:, 2:])), dim=1).double()
+    return {
+        "rmse_m": float(error[:, :2].square().sum(1).mean().sqrt()),
+        "rmse_deg": float(error[:, 2].square().mean().sqrt().rad2deg()),
+        "bias_forward_m": float(error[:, 0].mean()),
+        "bias_deg": float(error[:, 2].mean().rad2deg()),
+        "normalized_error": float((error / log_std.exp()).square().mean().sqrt()),
+    }
+
+
+@torch.no_grad()
+def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig:
+    """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares)."""
+    network = network.eval()
+    estimates = torch.cat([network(p["earlier"], p["later"], p["action"])[0] for p in pairs]).double()
+    truth = torch.cat([p["relative"] for p in pairs]).double()
+    mean, std = list(network.config.relative_mean), list(network.config.relative_std)
+    for i in range(3):
+        scale, bias = np.polyfit(estimates[:, i].numpy(), truth[:, i].numpy(), 1)
+        mean[i], std[i] = float(scale * mean[i] + bias), float(scale * std[i])
+    return dataclasses.replace(
+        network.config, relative_mean=(mean[0], mean[1], mean[2]), relative_std=(std[0], std[1], std[2])
+    )
+
+
+def main(arguments: Arguments) -> dict[str, float]:
+    """Train, calibrate, write the weights, and return the validation metrics."""
+    world = world_named(arguments.world)
+    run = arguments.runs / world.name / "local"
+    trainer = runs.make_trainer(run, arguments.epochs, arguments.seed, "bf16-mixed")
+    some = torch.cat([p["relative"] for p in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
+    config = LocalPoseConfig(
+        image=world.image,
+        width=arguments.width,
+        actions=world.actions,
+        period_s=world.period_s,
+        relative_mean=(float(some[:, 0].mean()), 0.0, 0.0),
+        relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
+    )
+    training = LocalTraining(arguments, world, LocalPoseNetwork(config))
+    data = _Data(arguments, world)
+    trainer.fit(training, datamodule=data, ckpt_path=runs.resume_from(run))
+
+    unseen = episode_pairs(world, list(OPTIMIZER_TRAIN_SEEDS[-32:]))
+    final = LocalPoseNetwork(calibrated(training.network, unseen)).eval()
+    final.load_state_dict(training.network.state_dict())
+    metrics = measure(final, data.fixed)
+    details = {"training": runs.record(arguments), "metrics": {"validation": metrics}}
+    save_checkpoint(arguments.out / world.name / f"{LOCAL}.safetensors", final, LOCAL, world.name, details)
+    print("validation", {name: round(value, 5) for name, value in metrics.items()})
+    return metrics
+
+
+@torch.no_grad()
+def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
+    """``step_metrics`` of a network over episodes."""
+    parts = [network(p["earlier"], p["later"], p["action"])[:2] for p in pairs]
+    truth = torch.cat([p["relative"] for p in pairs])
+    return step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
