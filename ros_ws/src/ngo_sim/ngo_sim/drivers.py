@@ -54,7 +54,7 @@ class PathDriver:
     centre, which nothing can obstruct.
 
     goals: "corners" visits the four corner cells in a random order, then in another one, ...; "random" visits
-    random free blocks. goals_reached lists the (row, col) of those visited so far.
+    random free blocks. goal is the (row, col) it is on the way to, goals_reached lists those before.
     random_action_probability: share of the actions replaced by a random one.
     turn_per_action_rad: how far one turn action turns the robot until it rests again.
     turn_coast_steps, travel_coast_steps: rotation and travel expected still to come without further
@@ -81,7 +81,7 @@ class PathDriver:
             if not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
         self.goals_reached: list[tuple[int, int]] = []
-        self._maze = maze
+        self.maze = maze
         self._rng = rng
         self._random_action_probability = random_action_probability
         self._deadband_rad = 0.5 * turn_per_action_rad  # within it, a turn leaves a larger error than none
@@ -89,7 +89,7 @@ class PathDriver:
         self._travel_coast_steps = travel_coast_steps
         self._lookahead = lookahead_blocks
         self._goals = self._corner_goals() if goals == "corners" else self._random_goals()
-        self._goal: tuple[int, int] | None = None
+        self.goal: tuple[int, int] | None = None
         self._path: list[tuple[int, int]] = []
         self._path_index: dict[tuple[int, int], int] = {}
         self._last_pose: tuple[float, float, float] | None = None
@@ -102,12 +102,12 @@ class PathDriver:
         x, y, yaw = pose_xyyaw.tolist()
         last_x, last_y, last_yaw = self._last_pose or (x, y, yaw)
         self._last_pose = (x, y, yaw)
-        block = self._maze.block_at(x, y)
+        block = self.maze.block_at(x, y)
         self._follow(block)
         self._watch_progress(x, y, block)
         if self._rng.random() < self._random_action_probability:
             return _ACTIONS[int(self._rng.integers(3))]
-        unit = 1.0 / self._maze.block_m
+        unit = 1.0 / self.maze.block_m
         coast = self._travel_coast_steps
         ahead_x, ahead_y = (x + coast * (x - last_x)) * unit, (y + coast * (y - last_y)) * unit
         if self._returning:
@@ -122,24 +122,24 @@ class PathDriver:
 
     def _follow(self, block: tuple[int, int]) -> None:
         """Take the next goal where this one is reached, and plan where block is not on the path."""
-        while self._goal is None or block == self._goal:
-            if self._goal is not None:
-                self.goals_reached.append(self._goal)
-            self._goal = next(self._goals)
+        while self.goal is None or block == self.goal:
+            if self.goal is not None:
+                self.goals_reached.append(self.goal)
+            self.goal = next(self._goals)
             self._path_index = {}
         if block not in self._path_index:
-            self._path = [(int(row), int(col)) for row, col in self._maze.shortest_path(block, self._goal)]
+            self._path = [(int(row), int(col)) for row, col in self.maze.shortest_path(block, self.goal)]
             self._path_index = {on_path: index for index, on_path in enumerate(self._path)}
 
     def _watch_progress(self, x: float, y: float, block: tuple[int, int]) -> None:
         """Return to the block's centre after _PATIENCE_STEPS within a fifth of a block, at most as long."""
-        near = 0.2 * self._maze.block_m
+        near = 0.2 * self.maze.block_m
         if math.hypot(x - self._progress_pose[0], y - self._progress_pose[1]) > near:
             self._progress_pose, self._steps_without_progress = (x, y), 0
         self._steps_without_progress += 1
         if self._steps_without_progress > _PATIENCE_STEPS:
             self._returning, self._steps_without_progress = not self._returning, 0
-        center_x, center_y = (block[1] + 0.5) * self._maze.block_m, (block[0] + 0.5) * self._maze.block_m
+        center_x, center_y = (block[1] + 0.5) * self.maze.block_m, (block[0] + 0.5) * self.maze.block_m
         if self._returning and math.hypot(x - center_x, y - center_y) < near:
             self._returning = False
 
@@ -170,7 +170,7 @@ class PathDriver:
         return forward if forward >= backward else -backward
 
     def _corner_goals(self) -> Iterator[tuple[int, int]]:
-        corners = [(int(row), int(col)) for row, col in self._maze.corners()]
+        corners = [(int(row), int(col)) for row, col in self.maze.corners()]
         last = -1
         while True:
             order = self._rng.permutation(4).tolist()
@@ -180,7 +180,7 @@ class PathDriver:
             yield from (corners[index] for index in order)
 
     def _random_goals(self) -> Iterator[tuple[int, int]]:
-        blocks = [(int(row), int(col)) for row, col in self._maze.free_blocks()]
+        blocks = [(int(row), int(col)) for row, col in self.maze.free_blocks()]
         while True:
             yield blocks[int(self._rng.integers(len(blocks)))]
 

@@ -19,6 +19,7 @@ _THRUST: dict[int, float] = {Action.FORWARD: 1.0, Action.TURN_LEFT: 0.0, Action.
 _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TURN_RIGHT: -1.0}
 # The solver sees a collision once the body is inside the wall: a substep enters by this many radii at most.
 _SUBSTEP_RADII = 0.25
+_SETTLING_SUBSTEPS = 20  # at most, after a collision
 _COLLISION_SLOP_M = 1e-6  # overlap that the solver leaves alone
 _PIXELS_A_BLOCK = 24
 
@@ -163,17 +164,19 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         speed = math.hypot(velocity_x, velocity_y)
         substeps = max(1, math.ceil(speed / (_SUBSTEP_RADII * config.radius_m)))
         substep_s = config.period_s / substeps
-        velocity = (velocity_x / config.period_s, velocity_y / config.period_s)
-        body.velocity = velocity
+        body.velocity = (velocity_x / config.period_s, velocity_y / config.period_s)
         body.angular_velocity = self._turn_rate_rad / config.period_s
         for _ in range(substeps):
             space.step(substep_s)
         left = body.velocity
-        if left == velocity:
-            return velocity_x, velocity_y
-        # The last substep found how far the body is inside a wall; one more, at rest, takes it out.
-        body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
-        space.step(substep_s)
+        # A substep that finds the body inside a wall leaves it to the next one to take it out. So let it rest
+        # until nothing moves it any more; between walls that face each other this takes several substeps.
+        for _ in range(_SETTLING_SUBSTEPS):
+            position = body.position
+            body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
+            space.step(substep_s)
+            if body.position == position:
+                break
         return left.x * config.period_s, left.y * config.period_s
 
     def _scan(self) -> npt.NDArray[np.float32]:
