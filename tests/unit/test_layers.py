@@ -1,0 +1,167 @@
+"""The layers of the design hold: a test reads every import and fails on a crossing."""
+
+import ast
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = {
+    "ngo_sim": ROOT / "ros_ws/src/ngo_sim/ngo_sim",
+    "ngo_estimator": ROOT / "ros_ws/src/ngo_estimator/ngo_estimator",
+}
+OUTSIDE = {name: ROOT / name for name in ("training", "benchmarks", "demo", "tests")}
+ROS = ("rclpy", "builtin_interfaces", "ament_index_python", "rosidl_runtime_py", "launch", "launch_ros")
+
+# A module may import, directly or through others, none of a later layer of its package.
+LAYERS = {
+    "ngo_sim": [{"mazes"}, {"drivers", "maze2d", "maze3d"}, {"episodes"}],
+    "ngo_estimator": [
+        {"se2"},
+        {"local_pose_network", "place_encoder", "pose_aggregation", "neural_graph_optimizer"},
+        {"checkpoint"},
+        {"local_odometry", "online_trajectory"},
+    ],
+}
+
+
+def imported_names(source: str, module: str, is_package: bool = False) -> set[str]:
+    """Absolute dotted names that a module's source imports, anywhere in it.
+
+    `from a import b` gives both `a` and `a.b`, for `b` may be a module.
+    """
+    names: set[str] = set()
+    package = module if is_package else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = package.split(".")[: len(package.split(".")) - (node.level - 1)]
+                base = ".".join([*above, *([base] if base else [])])
+            names.add(base)
+            names.update(f"{base}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            function = node.func
+            called = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+            if called in ("import_module", "__import__") and isinstance(node.args[0].value, str):
+                names.add(node.args[0].value)
+    return names
+
+
+def read_imports() -> dict[str, set[str]]:
+    """What every module of the project imports, by the module's dotted name."""
+    imports: dict[str, set[str]] = {}
+    for name, folder in {**PACKAGES, **OUTSIDE}.items():
+        for path in sorted(folder.rglob("*.py")):
+            is_package = path.stem == "__init__"
+            parts = path.relative_to(folder).with_suffix("").parts
+            module = ".".join([name, *(parts[:-1] if is_package else parts)])
+            imports[module] = imported_names(path.read_text(encoding="utf-8"), module, is_package)
+    return imports
+
+
+def is_below(name: str, folder: str) -> bool:
+    return name == folder or name.startswith(folder + ".")
+
+
+def crossings(imports: Mapping[str, set[str]]) -> Iterator[str]:
+    """One line for each import that crosses a layer."""
+    for module, names in imports.items():
+        top = module.partition(".")[0]
+        in_node = is_below(module, f"{top}.nodes")
+        for name in sorted(names):
+            target = name.partition(".")[0]
+            if top in PACKAGES:
+                if not in_node and (target in ROS or target.endswith("_msgs")):
+                    yield f"{module} imports {name}: only nodes know of ROS"
+                if target in PACKAGES and target != top:
+                    yield f"{module} imports {name}: the packages meet in training, in tests, or through messages"
+                if target in OUTSIDE:
+                    yield f"{module} imports {name}: a package imports nothing that is not installed with it"
+            if target == "vizdoom" and module != "ngo_sim.maze3d" and top != "tests":
+                yield f"{module} imports {name}: only ngo_sim.maze3d does"
+            for package in PACKAGES:
+                own = is_below(module, f"{package}.nodes")
+                if is_below(name, f"{package}.nodes") and not own and top != "tests":
+                    yield f"{module} imports {name}: nothing imports a node"
+    yield from upward_imports(imports)
+
+
+def upward_imports(imports: Mapping[str, set[str]]) -> Iterator[str]:
+    """One line for each module that reaches, over whatever path, one of a later layer of its package."""
+    for package, layers in LAYERS.items():
+        level = {f"{package}.{name}": index for index, names in enumerate(layers) for name in names}
+        for module in sorted(level):
+            reached: set[str] = set()
+            todo = [module]
+            while todo:
+                for name in imports.get(todo.pop(), set()) & imports.keys() - reached:
+                    reached.add(name)
+                    todo.append(name)
+            for name in sorted(reached):
+                if level.get(name, -1) > level[module]:
+                    yield f"{module} reaches {name}: it is of a later layer"
+                elif name == module:
+                    yield f"{module} imports itself in a circle"
+
+
+def test_no_import_crosses_a_layer() -> None:
+    imports = read_imports()
+    assert {"ngo_sim.mazes", "ngo_estimator.se2"} <= imports.keys(), "the packages were not found"
+    assert list(crossings(imports)) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint"),
+    [
+        ("ngo_sim.mazes", "import rclpy", "only nodes know of ROS"),
+        ("ngo_sim.mazes", "def late():\n    from nav_msgs.msg import Path", "only nodes know of ROS"),
+        ("ngo_sim.maze2d", "import vizdoom as vzd", "only ngo_sim.maze3d does"),
+        ("training.data", "import vizdoom", "only ngo_sim.maze3d does"),
+        ("ngo_sim.nodes.maze2d_node", "from ngo_estimator import se2", "the packages meet"),
+        ("ngo_estimator.se2", "import importlib\nimportlib.import_module('ngo_sim.mazes')", "the packages meet"),
+        ("ngo_estimator.se2", "from training import losses", "not installed with it"),
+        ("training.evaluate", "from ngo_estimator.nodes import ngo_node", "nothing imports a node"),
+        ("ngo_estimator.local_odometry", "from .nodes.local_node import LocalNode", "nothing imports a node"),
+        ("ngo_sim.mazes", "from .episodes import Episode", "later layer"),
+    ],
+)
+def test_a_planted_crossing_is_caught(module: str, source: str, complaint: str) -> None:
+    imports = {**dict.fromkeys(["ngo_sim.episodes"], set()), module: imported_names(source, module)}
+    found = list(crossings(imports))
+    assert found, f"nothing was found in: {source}"
+    assert all(complaint in line for line in found)
+
+
+def test_a_crossing_through_other_modules_is_caught() -> None:
+    imports = {
+        "ngo_estimator.se2": {"ngo_estimator.helpers"},
+        "ngo_estimator.helpers": {"ngo_estimator.online_trajectory"},
+        "ngo_estimator.online_trajectory": set[str](),
+    }
+    assert list(crossings(imports)) == [
+        "ngo_estimator.se2 reaches ngo_estimator.online_trajectory: it is of a later layer"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("ngo_sim.maze3d", "import vizdoom"),
+        ("ngo_sim.nodes.maze2d_node", "import rclpy\nfrom ngo_sim.maze2d import Maze2D\nfrom . import parameters"),
+        ("training.data", "from ngo_sim import episodes\nfrom ngo_estimator import se2"),
+        ("tests.ros.test_path", "from ngo_estimator.nodes import path_message"),
+        ("ngo_estimator.local_odometry", "from ngo_estimator.checkpoint import load_checkpoint"),
+    ],
+)
+def test_an_allowed_import_is_not_reported(module: str, source: str) -> None:
+    assert list(crossings({module: imported_names(source, module)})) == []
+
+
+def test_relative_imports_are_resolved() -> None:
+    source = "from . import a\nfrom .b import c\nfrom .. import d"
+    assert imported_names(source, "p.q.r") == {"p.q", "p.q.a", "p.q.b", "p.q.b.c", "p", "p.d"}
+    assert imported_names("from . import a", "p.q", is_package=True) == {"p.q", "p.q.a"}
