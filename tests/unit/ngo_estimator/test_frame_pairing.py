@@ -1,7 +1,8 @@
-"""Frames and actions in any order of arrival: each frame gets the action that led to it, or is dropped and counted."""
+"""Frames and actions in any order of arrival: each frame gets its action, or is dropped and counted."""
 
 import numpy as np
 import pytest
+
 from ngo_estimator.frame_pairing import FramePairing
 from ngo_estimator.local_odometry import DuplicateFrame, LateFrame
 
@@ -14,7 +15,7 @@ def make(needs_action: bool = True, timeout_ns: int = 10 * STEP_NS, capacity: in
 
 
 def play(pairing: FramePairing, *events: str) -> list[tuple[int, int | None]]:
-    """Feed `f3` (frame of step 3) and `a3` (the action taken at it, whose value is 3); return (step, action) handed out."""
+    """Feed `f3` (frame of step 3) and `a3` (its action, of value 3); return the (step, action) handed out."""
     result = []
     for event in events:
         step = int(event[1:])
@@ -50,7 +51,12 @@ def test_after_a_lost_frame_the_action_of_the_older_frame_counts() -> None:
 
 def test_a_lost_action_drops_its_frame_and_nothing_else() -> None:
     pairing = make()
-    assert play(pairing, "f0", "a0", "f1", "f2", "a2", "f3", "a3", "f4") == [(0, None), (1, 0), (3, 2), (4, 3)]
+    assert play(pairing, "f0", "a0", "f1", "f2", "a2", "f3", "a3", "f4") == [
+        (0, None),
+        (1, 0),
+        (3, 2),
+        (4, 3),
+    ]
     assert pairing.dropped == 1
 
 

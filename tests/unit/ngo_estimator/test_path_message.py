@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from nav_msgs.msg import Path
-from ngo_estimator.nodes.path_message import PathWriter, plain_path
 from rclpy.serialization import deserialize_message
+
+from ngo_estimator.nodes.path_message import PathWriter, plain_path
 
 
 def trajectory(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

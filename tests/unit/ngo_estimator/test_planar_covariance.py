@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+
 from ngo_estimator import se2
 from ngo_estimator.planar_covariance import propagate, to_spatial
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evo.tools import file_interface
+
 from ngo_estimator.trajectory_file import write_tum
 
 STAMPS_NS = np.array([0, 1_700_000_000_057_142_857, 1_700_000_000_114_285_714], dtype=np.int64)

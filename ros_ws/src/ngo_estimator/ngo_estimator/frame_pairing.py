@@ -1,4 +1,4 @@
-"""Pairs each frame with the action that led to it, when the two arrive on separate ways in any order (no ROS here)."""
+"""Pairs each frame with the action that led to it, when both arrive in any order (no ROS here)."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ _ACTIONS_KEPT = 4096
 
 @dataclass(frozen=True)
 class PairedFrame:
-    """A frame, and the action between the frame before it and this one (None for the first, or where none is needed)."""
+    """A frame, and the action between the one before it and this one (None: not needed)."""
 
     stamp_ns: int
     image: np.ndarray
@@ -23,16 +23,17 @@ class PairedFrame:
 class FramePairing:
     """Holds frames back until the action that led to them is known.
 
-    An action carries the stamp of the frame at which it was taken. A frame is ready when the action of the last frame
-    handed out is here; if that one is known to be lost, the first action between the two frames takes its place. Both
-    streams are in order by themselves, so an action from the frame's own time or later says that no action between can
-    come any more: the frame is dropped. It is also dropped once newer frames are ``timeout_ns`` ahead, or more than
-    ``capacity`` frames wait. Nothing is made up for a lost action: the next frame spans the gap.
+    An action carries the stamp of the frame at which it was taken. A frame is ready when the action of the
+    last frame handed out is here; if that one is known to be lost, the first action between the two frames
+    takes its place. Both streams are in order by themselves, so an action from the frame's own time or later
+    says that no action between can come any more: the frame is dropped. It is also dropped once newer frames
+    are ``timeout_ns`` ahead, or more than ``capacity`` frames wait. Nothing is made up for a lost action: the
+    next frame spans the gap.
     """
 
     def __init__(self, needs_action: bool, timeout_ns: int, capacity: int) -> None:
         if timeout_ns <= 0 or capacity < 1:
-            raise ValueError(f"timeout is {timeout_ns} ns and capacity {capacity}; expected more than 0 and at least 1")
+            raise ValueError(f"timeout is {timeout_ns} ns, capacity {capacity}; expected more than 0, at least 1")
         self._needs_action = needs_action
         self._timeout_ns = timeout_ns
         self._capacity = capacity
@@ -70,7 +71,7 @@ class FramePairing:
             if stamp_ns == newest:
                 raise DuplicateFrame(f"frame at {stamp_ns} ns came twice")
             if stamp_ns > newest - RESTART_AFTER_NS:
-                raise LateFrame(f"frame at {stamp_ns} ns is {(newest - stamp_ns) / 1e9:.3f} s older than the last one")
+                raise LateFrame(f"frame at {stamp_ns} ns is {(newest - stamp_ns) / 1e9:.3f} s older than the last")
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._last_ns = None

@@ -6,7 +6,10 @@ _PLANAR = np.array([0, 1, 5])  # x, y and yaw among x, y, z, roll, pitch, yaw
 
 
 def propagate(
-    covariance: np.ndarray, pose_xyyaw: np.ndarray, relative_xyyaw: np.ndarray, relative_covariance: np.ndarray
+    covariance: np.ndarray,
+    pose_xyyaw: np.ndarray,
+    relative_xyyaw: np.ndarray,
+    relative_covariance: np.ndarray,
 ) -> np.ndarray:
     """Covariance ``(3, 3)`` of a pose after one more step, to first order.
 
@@ -25,7 +28,7 @@ def propagate(
 
 
 def to_spatial(covariance: np.ndarray) -> np.ndarray:
-    """Row-major ``(36,)`` covariance of x, y, z, roll, pitch, yaw; the planar world's z, roll and pitch are exactly 0."""
+    """Row-major ``(36,)`` covariance of x, y, z, roll, pitch, yaw; z, roll and pitch are exactly 0."""
     spatial = np.zeros((6, 6))
     spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
     return spatial.ravel()

@@ -11,7 +11,7 @@ _NS = 1_000_000_000
 
 
 def write_tum(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> None:
-    """Write one line a pose, ``timestamp tx ty tz qx qy qz qw`` (s, m), replacing the file at once or not at all.
+    """Write one line a pose, ``timestamp tx ty tz qx qy qz qw`` (s, m), all at once or not at all.
 
     Args:
         path: a file ending in one of ``ENDINGS``, in a folder that exists.
@@ -29,10 +29,11 @@ def write_tum(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Non
     half_yaw = 0.5 * poses_xyyaw[:, 2]
     zero = np.zeros_like(half_yaw)
     values = np.column_stack((poses_xyyaw[:, :2], zero, zero, zero, np.sin(half_yaw), np.cos(half_yaw)))
-    # Stamps of today have 19 digits in ns, more than a float64 holds: seconds and nanoseconds are written as integers.
+    # Stamps of today have 19 digits in ns, more than a float64 holds: seconds and nanoseconds are written as
+    # integers.
     lines = [
         f"{stamp // _NS}.{stamp % _NS:09d} " + " ".join(f"{value:.9g}" for value in row)
-        for stamp, row in zip(stamps_ns.tolist(), values.tolist())
+        for stamp, row in zip(stamps_ns.tolist(), values.tolist(), strict=True)
     ]
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

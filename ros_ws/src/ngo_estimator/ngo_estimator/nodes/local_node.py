@@ -1,7 +1,6 @@
-"""Node that turns images and actions into relative poses, odometry and the transform from odom to base_link."""
+"""Node that turns images and actions into relative poses, odometry and odom -> base_link."""
 
 import sys
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,10 +12,11 @@ from sensor_msgs.msg import Image
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
-from ngo_estimator.nodes.parameters import BadParameter, declare_settings, frame, setting, topic
+from ngo_estimator.nodes.parameters import declare_settings
 from ngo_estimator.nodes.process import run_node
+from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
-from ngo_estimator.nodes.weights import EstimatorSettings, load_core
+from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.planar_covariance import propagate
 
 if TYPE_CHECKING:
@@ -25,32 +25,6 @@ if TYPE_CHECKING:
 NAME = "local_node"
 _ACTIONS = (DiscreteAction.FORWARD, DiscreteAction.TURN_LEFT, DiscreteAction.TURN_RIGHT)
 _DEPTH = 100
-
-
-@dataclass(frozen=True)
-class LocalNodeSettings(EstimatorSettings):
-    """Parameters of ``local_node``."""
-
-    image_topic: str = topic("image", "Images to estimate motion from.")
-    image_reliability: str = setting(
-        "best_effort", "Whether lost images are sent again.", choices=("best_effort", "reliable")
-    )
-    image_depth: int = setting(5, "Queue of image_topic.", minimum=1, maximum=10_000)
-    action_topic: str = topic("action", "Actions, stamped with the image at which they were taken.")
-    action_timeout_s: float = setting(
-        1.0, "How far newer images run ahead before one whose action is missing is dropped.", minimum=0.001, maximum=60.0
-    )
-    action_capacity: int = setting(
-        64, "How many images may wait for their actions before the oldest is dropped.", minimum=1, maximum=10_000
-    )
-    base_frame: str = frame("base_link", "Frame of the robot.")
-    odometry_topic: str = topic("odom", "Pose in odom_frame with covariance, and velocity.")
-    publish_odometry: bool = setting(True, "Whether to publish odometry_topic.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.base_frame == self.odom_frame:
-            raise BadParameter(f"parameter 'base_frame' is {self.base_frame!r}; allowed: another name than odom_frame's")
 
 
 class LocalNode(Node):
@@ -118,7 +92,9 @@ class LocalNode(Node):
             reason = f"the action on '{self._settings.action_topic}' that led to it did not come"
             self._status.dropped("image without action", reason, self._pairing.dropped - dropped)
         if self._core.restarts > restarts:
-            self.get_logger().info("the images' stamps jumped back: their source restarted, so the odometry starts anew")
+            self.get_logger().info(
+                "the images' stamps jumped back: their source restarted, so the odometry starts anew"
+            )
 
     def _publish(self, estimate: "LocalEstimate") -> None:
         settings = self._settings
@@ -135,7 +111,10 @@ class LocalNode(Node):
             self._tf.publish(messages.transform_message(*stamped))
 
     def _details(self) -> dict[str, str]:
-        return {"images waiting for actions": str(self._pairing.waiting), "restarts": str(self._core.restarts)}
+        return {
+            "images waiting for actions": str(self._pairing.waiting),
+            "restarts": str(self._core.restarts),
+        }
 
 
 def main() -> None:

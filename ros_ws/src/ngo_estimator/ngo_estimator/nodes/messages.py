@@ -47,8 +47,8 @@ def to_time(stamp_ns: int) -> Time:
 def image_array(message: Image, shape: tuple[int, int, int], dtype: str) -> np.ndarray:
     """The pixels of ``message`` as ``(height, width, channels)`` of ``dtype``.
 
-    Raises ``ValueError`` unless the image has this size and its encoding (``rgb8`` for uint8, ``32FC4`` for float32),
-    its data is as long as it says, and all its values are finite.
+    Raises ``ValueError`` unless the image has this size and its encoding (``rgb8`` for uint8, ``32FC4`` for
+    float32), its data is as long as it says, and all its values are finite.
     """
     height, width, channels = shape
     encoding = _ENCODINGS[dtype]
@@ -59,7 +59,7 @@ def image_array(message: Image, shape: tuple[int, int, int], dtype: str) -> np.n
     row = width * channels * np.dtype(dtype).itemsize
     if message.step < row or len(message.data) != message.step * height:
         raise ValueError(
-            f"image has {len(message.data)} bytes in {height} rows of {message.step}; expected rows of {row} bytes"
+            f"image has {len(message.data)} bytes in {height} rows of {message.step}; expected {row} a row"
         )
     pixels = np.frombuffer(message.data, np.uint8).reshape(height, message.step)[:, :row]
     image = np.ascontiguousarray(pixels).view(dtype).reshape(shape)
@@ -81,6 +81,7 @@ def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> Relativ
         y=y,
         yaw=yaw,
         covariance=estimate.covariance.ravel(),
+        origin_stamp=to_time(estimate.origin_stamp_ns),
         odom_x=odom_x,
         odom_y=odom_y,
         odom_yaw=odom_yaw,
@@ -98,19 +99,16 @@ def relative_step(message: RelativePose) -> "RelativeStep":
         from_stamp_ns=to_ns(message.from_stamp),
         relative_xyyaw=np.array([message.x, message.y, message.yaw]),
         covariance=np.array(message.covariance).reshape(3, 3),
+        origin_stamp_ns=to_ns(message.origin_stamp),
         odom_xyyaw=np.array([message.odom_x, message.odom_y, message.odom_yaw]),
         motion_feature=np.array(message.motion_feature, np.float32),
         place_code=np.array(message.place_code, np.float32),
     )
 
 
-def odometry_message(
-    estimate: "LocalEstimate", covariance: np.ndarray, odom_frame: str, base_frame: str
-) -> Odometry:
-    """The pose in ``odom_frame`` with its covariance ``(3, 3)``, and the mean velocity since the last frame."""
-    message = Odometry(
-        header=Header(stamp=to_time(estimate.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame
-    )
+def odometry_message(estimate: "LocalEstimate", covariance: np.ndarray, odom_frame: str, base_frame: str) -> Odometry:
+    """The pose in ``odom_frame`` with its covariance ``(3, 3)``, and the mean velocity of the last step."""
+    message = Odometry(header=Header(stamp=to_time(estimate.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame)
     message.pose.pose = planar_pose(estimate.odom_xyyaw)
     message.pose.covariance = to_spatial(covariance)
     seconds = (estimate.stamp_ns - estimate.from_stamp_ns) / _NS
@@ -133,9 +131,7 @@ def pose_message(
 def transform_message(stamp_ns: int, parent: str, child: str, parent_from_child: np.ndarray) -> TFMessage:
     """One transform ``(3,)`` for /tf."""
     pose = planar_pose(parent_from_child)
-    transform = Transform(
-        translation=Vector3(x=pose.position.x, y=pose.position.y), rotation=pose.orientation
-    )
+    transform = Transform(translation=Vector3(x=pose.position.x, y=pose.position.y), rotation=pose.orientation)
     header = Header(stamp=to_time(stamp_ns), frame_id=parent)
     return TFMessage(transforms=[TransformStamped(header=header, child_frame_id=child, transform=transform)])
 
@@ -144,7 +140,8 @@ def planar_pose(pose_xyyaw: np.ndarray) -> Pose:
     """A pose ``(3,)`` as position and quaternion."""
     x, y, yaw = pose_xyyaw.tolist()
     return Pose(
-        position=Point(x=x, y=y), orientation=Quaternion(z=float(np.sin(0.5 * yaw)), w=float(np.cos(0.5 * yaw)))
+        position=Point(x=x, y=y),
+        orientation=Quaternion(z=float(np.sin(0.5 * yaw)), w=float(np.cos(0.5 * yaw))),
     )
 
 
@@ -165,7 +162,7 @@ def _doubles(values: np.ndarray) -> "array[float]":
 
 
 def loop_markers(update: "TrajectoryUpdate", frame: str) -> MarkerArray:
-    """One line for each loop edge between the poses it connects, opaque as its weight; none deletes the last ones."""
+    """One line for each loop edge, opaque as its weight; if there is none, what deletes those shown."""
     header = Header(stamp=to_time(int(update.stamps_ns[-1])), frame_id=frame)
     marker = Marker(header=header, ns="loops", type=Marker.LINE_LIST, action=Marker.ADD)
     if len(update.loops) == 0:

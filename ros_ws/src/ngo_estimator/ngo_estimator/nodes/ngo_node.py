@@ -1,7 +1,6 @@
 """Node that re-optimises the whole trajectory with every relative pose, and publishes it corrected."""
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +12,12 @@ from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
-from ngo_estimator.nodes.parameters import BadParameter, declare_settings, frame, setting, topic
+from ngo_estimator.nodes.parameters import declare_settings
 from ngo_estimator.nodes.process import run_node
+from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
-from ngo_estimator.nodes.weights import EstimatorSettings, load_core
+from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.trajectory_file import write_tum
 
 if TYPE_CHECKING:
@@ -25,28 +25,6 @@ if TYPE_CHECKING:
 
 NAME = "ngo_node"
 _DEPTH = 100
-
-
-@dataclass(frozen=True)
-class NgoNodeSettings(EstimatorSettings):
-    """Parameters of ``ngo_node``."""
-
-    window_frames: int = setting(2000, "Frames of the trajectory that are kept and corrected.", minimum=2, maximum=100_000)
-    map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump; its origin is the first frame.")
-    path_topic: str = topic("ngo/path", "Corrected trajectory.")
-    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, for every relative pose.")
-    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory in flat arrays, and how far each pose moved.")
-    loops_topic: str = topic("ngo/loops", "Lines between poses that the optimizer takes for the same place.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.map_frame == self.odom_frame:
-            raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
-        if self.relative_pose_depth < self.window_frames:
-            raise BadParameter(
-                f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; allowed: at least window_frames, "
-                f"which is {self.window_frames}"
-            )
 
 
 class NgoNode(Node):
@@ -59,9 +37,10 @@ class NgoNode(Node):
         from ngo_estimator.online_trajectory import OnlineTrajectory
 
         self._core = load_core(
-            lambda folder, world: OnlineTrajectory.load(folder, world, settings.window_frames), settings
+            lambda folder, world: OnlineTrajectory.load(folder, settings.window_frames, world), settings
         )
         self._latest: TrajectoryUpdate | None = None
+        self._gaps = 0
         self._status = NodeStatus(self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, settings.pose_topic, _DEPTH)
         self._whole = TrajectoryPublishers(
@@ -86,7 +65,10 @@ class NgoNode(Node):
             return
         self._status.received(step.stamp_ns)
         if update.restarted:
-            self.get_logger().info("the stamps jumped back: their source restarted, so the trajectory starts anew")
+            self.get_logger().info(
+                "the relative poses have a new origin: their source restarted, so the map starts anew"
+            )
+        self._gaps += update.gap
         self._latest = update
         self._publish(update)
 
@@ -128,7 +110,8 @@ class NgoNode(Node):
         x, y, yaw = update.map_from_odom_xyyaw.tolist()
         return {
             "frames": str(len(update.stamps_ns)),
-            "window fill": f"{len(update.stamps_ns) / window:.3f}",
+            "window fill": f"{min(1.0, len(update.stamps_ns) / window):.3f}",
+            "gaps": str(self._gaps),
             "loops": str(len(update.loops)),
             "largest move in the last update (m)": f"{update.moved_m.max():.3f}",
             "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",

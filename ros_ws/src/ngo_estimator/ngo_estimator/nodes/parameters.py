@@ -27,8 +27,8 @@ def setting(
 ) -> Any:
     """A field of a ``Settings`` class: its default, its description and what it may be.
 
-    Numbers may lie from ``minimum`` to ``maximum``, texts may be limited to ``choices``; any other condition is a
-    ``check`` with ``allowed``, its description in words.
+    Numbers may lie from ``minimum`` to ``maximum``, texts may be limited to ``choices``; any other condition
+    is a ``check`` with ``allowed``, its description in words.
     """
     if not allowed:
         kind = _KINDS[type(default)]
@@ -50,7 +50,7 @@ def frame(default: str, description: str) -> Any:
 
 
 class BadParameter(ValueError):
-    """A parameter that is unknown or outside what is allowed; the message is one line that says which, and what is."""
+    """A parameter that is unknown or outside what is allowed; the message is one line that says so."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,10 @@ SettingsType = TypeVar("SettingsType", bound=Settings)
 def declare_settings(node: Node, settings_type: type[SettingsType]) -> SettingsType:
     """Declare every field of ``settings_type`` on ``node`` and return what the user set.
 
-    The node must be made with ``automatically_declare_parameters_from_overrides=True``: this is how the names that the
-    user gave become visible. All parameters are read-only, as they shape what is built at the start. An integer given
-    for a number is taken as that number. Raises ``BadParameter`` for unknown names and values that are not allowed.
+    The node must be made with ``automatically_declare_parameters_from_overrides=True``: this is how the names
+    that the user gave become visible. All parameters are read-only, as they shape what is built at the start.
+    An integer given for a number is taken as that number. Raises ``BadParameter`` for unknown names and
+    values that are not allowed.
     """
     known = {entry.name: entry for entry in fields(settings_type)}
     given = {

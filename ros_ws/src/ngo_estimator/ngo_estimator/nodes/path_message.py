@@ -12,27 +12,28 @@ _TEMPLATE_POSES = 3
 
 
 class PathWriter:
-    """Writes planar trajectories as serialised ``nav_msgs/Path`` messages, ready for ``publisher.publish(bytes)``.
+    """Writes planar trajectories as serialised ``nav_msgs/Path``, ready for ``publisher.publish(bytes)``.
 
-    A template is serialised once. In CDR every pose after the first then takes the same number of bytes, because it
-    follows eight-byte doubles and all poses share one ``frame_id``; each starts with its stamp and ends with its seven
-    doubles. The first pose may be padded differently, as the message's header comes before it, so it belongs to the
-    head of the buffer. The buffer doubles when a trajectory outgrows it, which costs O(1) a pose.
+    A template is serialised once. In CDR every pose after the first then takes the same number of bytes,
+    because it follows eight-byte doubles and all poses share one ``frame_id``; each starts with its stamp and
+    ends with its seven doubles. The first pose may be padded differently, as the message's header comes
+    before it, so it belongs to the head of the buffer. The buffer doubles when a trajectory outgrows it,
+    which costs O(1) a pose.
     """
 
     def __init__(self, frame_id: str) -> None:
-        """Lay out the buffer for poses in ``frame_id``; raises ``RuntimeError`` where the layout is not as described."""
+        """Lay out the buffer for poses in ``frame_id``; raises ``RuntimeError`` for any other layout."""
         self._frame_id = frame_id
         template = _serialised(frame_id, _TEMPLATE_POSES)
         self._stride = len(template) - len(_serialised(frame_id, _TEMPLATE_POSES - 1))
         self._head = len(template) - (_TEMPLATE_POSES - 1) * self._stride  # up to the end of the first pose
-        # The encapsulation (4 bytes), the stamp (8), the length of frame_id (4) and its bytes with a final zero.
+        # Encapsulation (4 bytes), stamp (8), length of frame_id (4), and its bytes with a final zero.
         self._count = 16 + _aligned(len(frame_id.encode()) + 1, 4)
         self._buffer = bytearray(template)
         self._check_layout()
 
     def write(self, stamp_ns: int, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> bytes:
-        """The message of one trajectory: ``stamps_ns`` ``(frames,)`` int64 and ``poses_xyyaw`` ``(frames, 3)``.
+        """The message of one trajectory: ``stamps_ns`` ``(frames,)`` int64, ``poses_xyyaw`` ``(frames, 3)``.
 
         ``stamp_ns`` becomes the stamp of the path itself.
         """
@@ -73,7 +74,7 @@ class PathWriter:
 def plain_path(frame_id: str, stamp_ns: int, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Path:
     """The same message built pose by pose: the slow definition of what ``PathWriter`` writes."""
     poses = []
-    for pose_stamp_ns, (x, y, yaw) in zip(stamps_ns, poses_xyyaw):
+    for pose_stamp_ns, (x, y, yaw) in zip(stamps_ns, poses_xyyaw, strict=True):
         orientation = Quaternion(z=float(np.sin(0.5 * yaw)), w=float(np.cos(0.5 * yaw)))
         pose = Pose(position=Point(x=float(x), y=float(y)), orientation=orientation)
         poses.append(PoseStamped(header=Header(stamp=_time(int(pose_stamp_ns)), frame_id=frame_id), pose=pose))

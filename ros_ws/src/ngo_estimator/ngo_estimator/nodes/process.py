@@ -19,8 +19,8 @@ class StartError(Exception):
 def run_node(name: str, create: Callable[[], Node]) -> int:
     """Spin the node that ``create`` makes until SIGINT or SIGTERM, and return the process's exit code.
 
-    0 after a signal, 2 where the node could not start: ROS arguments that cannot be read, a ``BadParameter`` or a
-    ``StartError``. One line then says why.
+    0 after a signal, 2 where the node could not start: ROS arguments that cannot be read, a ``BadParameter``
+    or a ``StartError``. One line then says why.
     """
     node = None
     try:
@@ -33,7 +33,8 @@ def run_node(name: str, create: Callable[[], Node]) -> int:
         get_logger(name).fatal(" ".join(str(error).split()))
         return 2
     except rclpy_implementation.RCLError:
-        # A signal ends the context while a callback runs: what the callback then publishes fails, as it should.
+        # A signal ends the context while a callback runs: what the callback then publishes fails, as it
+        # should.
         if rclpy.ok():
             raise
     finally:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ngo_estimator.online_trajectory import TrajectoryUpdate
 
 _DEPTH = 10
+_FIRST_POSES = 2
 
 
 class TrajectoryPublishers:
@@ -35,9 +36,12 @@ class TrajectoryPublishers:
         self._loops = self._create(MarkerArray, loops_topic)
 
     def publish(self, update: "TrajectoryUpdate | None") -> None:
-        """Publish ``update`` to those who listen, and to those who come before the next one; None: there is none."""
+        """Publish ``update`` to those who listen or come before the next one; None: there is none."""
         self._latest = update
-        for publisher in (self._path, self._trajectory, self._loops):
+        # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last
+        # one.
+        loops_changed = update is not None and (update.optimized or len(update.stamps_ns) == _FIRST_POSES)
+        for publisher in (self._path, self._trajectory, *((self._loops,) if loops_changed else ())):
             if publisher.get_subscription_count():
                 self._send_latest(publisher)
 

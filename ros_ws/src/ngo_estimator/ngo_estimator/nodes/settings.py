@@ -1,0 +1,86 @@
+"""The parameters of the estimator nodes: names, defaults, meanings and limits."""
+
+from dataclasses import dataclass
+
+from ngo_estimator.nodes.parameters import BadParameter, Settings, frame, setting, topic
+
+WORLDS = ("maze2d", "maze3d")
+
+
+@dataclass(frozen=True)
+class EstimatorSettings(Settings):
+    """What every estimator node needs."""
+
+    world: str = setting("maze3d", "World whose weights are used.", choices=WORLDS)
+    weights: str = setting("", "Folder of weights for that world; empty: the ones that ship with the package.")
+    threads: int = setting(1, "Threads that the networks compute with.", minimum=1, maximum=64)
+    odom_frame: str = frame("odom", "Frame in which the odometry is smooth and drifts.")
+    publish_tf: bool = setting(True, "Whether to publish the transform on tf_topic.")
+    relative_pose_topic: str = topic("relative_pose", "Steps of the odometry, from local_node to ngo_node.")
+    relative_pose_depth: int = setting(
+        2000, "Queue of relative_pose_topic, at least ngo_node's window_frames.", minimum=1, maximum=100_000
+    )
+    tf_topic: str = topic("/tf", "Transforms.")
+    diagnostics_topic: str = topic("/diagnostics", "Rates, drops and durations of the node.")
+    diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0)
+
+
+@dataclass(frozen=True)
+class LocalNodeSettings(EstimatorSettings):
+    """Parameters of ``local_node``."""
+
+    image_topic: str = topic("image", "Images to estimate motion from.")
+    image_reliability: str = setting(
+        "best_effort", "Whether lost images are sent again.", choices=("best_effort", "reliable")
+    )
+    image_depth: int = setting(5, "Queue of image_topic.", minimum=1, maximum=10_000)
+    action_topic: str = topic("action", "Actions, stamped with the image at which they were taken.")
+    action_timeout_s: float = setting(
+        1.0,
+        "How far newer images run ahead before one whose action is missing is dropped.",
+        minimum=0.001,
+        maximum=60.0,
+    )
+    action_capacity: int = setting(
+        64,
+        "How many images may wait for their actions before the oldest is dropped.",
+        minimum=1,
+        maximum=10_000,
+    )
+    base_frame: str = frame("base_link", "Frame of the robot.")
+    odometry_topic: str = topic("odom", "Pose in odom_frame with covariance, and velocity.")
+    publish_odometry: bool = setting(True, "Whether to publish odometry_topic.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.base_frame == self.odom_frame:
+            raise BadParameter(
+                f"parameter 'base_frame' is {self.base_frame!r}; allowed: another name than odom_frame's"
+            )
+
+
+@dataclass(frozen=True)
+class NgoNodeSettings(EstimatorSettings):
+    """Parameters of ``ngo_node``."""
+
+    window_frames: int = setting(
+        2000,
+        "How many of the newest frames are optimised together; older ones stay.",
+        minimum=2,
+        maximum=100_000,
+    )
+    map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump; its origin is the first frame.")
+    path_topic: str = topic("ngo/path", "Corrected trajectory.")
+    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, for every relative pose.")
+    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory in flat arrays, and how far each pose moved.")
+    loops_topic: str = topic("ngo/loops", "Lines between poses that the optimizer takes for the same place.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.map_frame == self.odom_frame:
+            raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
+        if self.relative_pose_depth < self.window_frames:
+            raise BadParameter(
+                f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; "
+                f"allowed: at least window_frames, which is {self.window_frames}"
+            )

@@ -1,0 +1,133 @@
+"""Real node processes for tests, and a probe that talks to them over DDS."""
+
+import os
+import re
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from demo.graph import NodeSpec
+
+TIMEOUT_S = 30.0
+
+Result = TypeVar("Result")
+
+
+class NodeProcess:
+    """One node as its own process; its output is in ``log``."""
+
+    def __init__(
+        self,
+        package: str,
+        executable: str,
+        parameters: Mapping[str, Any] | None = None,
+        ros_arguments: tuple[str, ...] = (),
+    ) -> None:
+        self.name = executable
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        command = NodeSpec(package, executable, parameters or {}, ros_arguments).command()
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", "RCUTILS_LOGGING_USE_STDOUT": "0"}
+        self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT, env=environment)
+
+    def __enter__(self) -> "NodeProcess":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        self._log.close()
+
+    @property
+    def log(self) -> str:
+        """What it wrote so far, to stdout and stderr."""
+        size = os.fstat(self._log.fileno()).st_size
+        return os.pread(self._log.fileno(), size, 0).decode()
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._process.poll() is None
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def wait(self, timeout_s: float = TIMEOUT_S) -> int:
+        """Wait for its end and return its exit code."""
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"{self.name} did not end in {timeout_s:g} s; it wrote:\n{self.log}") from None
+
+    def wait_for_log(self, pattern: str, timeout_s: float = TIMEOUT_S) -> None:
+        """Wait until it has written what ``pattern`` matches."""
+        wait_until(
+            lambda: re.search(pattern, self.log) or not self.running,
+            f"'{pattern}' from {self.name}",
+            timeout_s,
+        )
+        assert re.search(pattern, self.log), f"{self.name} ended without writing '{pattern}'; it wrote:\n{self.log}"
+
+
+def wait_until(
+    condition: Callable[[], Result], what: str, timeout_s: float = TIMEOUT_S, poll_s: float = 0.02
+) -> Result:
+    """Wait until ``condition()`` is true, and return what it gave; a failure names ``what``."""
+    deadline = time.monotonic() + timeout_s
+    while not (result := condition()):
+        assert time.monotonic() < deadline, f"waited {timeout_s:g} s for {what}"
+        time.sleep(poll_s)
+    return result
+
+
+class Probe:
+    """A node in the test's own process that publishes to others and collects what they publish."""
+
+    def __init__(self, name: str = "probe") -> None:
+        self._context = Context()
+        rclpy.init(args=[], context=self._context)
+        self.node: Node = rclpy.create_node(name, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def close(self) -> None:
+        """End the node."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def collect(self, message_type: type, topic: str, qos: QoSProfile | int = 1000) -> list[Any]:
+        """A list that grows with every message on ``topic`` while ``spin_until`` runs."""
+        received: list[Any] = []
+        self.node.create_subscription(message_type, topic, received.append, qos)
+        return received
+
+    def spin_until(self, condition: Callable[[], Result], what: str, timeout_s: float = TIMEOUT_S) -> Result:
+        """Take messages until ``condition()`` is true, and return what it gave."""
+        deadline = time.monotonic() + timeout_s
+        while not (result := condition()):
+            assert time.monotonic() < deadline, f"waited {timeout_s:g} s for {what}"
+            self._executor.spin_once(timeout_sec=0.05)
+        return result
+
+    def call(self, service_type: Any, name: str, request: Any) -> Any:
+        """Call a service and return its response."""
+        client = self.node.create_client(service_type, name)
+        self.spin_until(client.service_is_ready, f"service {name}")
+        future = client.call_async(request)
+        self.spin_until(future.done, f"an answer of {name}")
+        self.node.destroy_client(client)
+        return future.result()

@@ -1,0 +1,597 @@
+"""The estimator nodes as real processes over DDS, fed by a publisher of the test.
+
+The expensive part is to start a node, so most tests share one pair. Each plays a run of its own: its stamps
+start long before those of the run before it, which is what a restarted simulator looks like.
+"""
+
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from diagnostic_msgs.msg import DiagnosticArray
+from evo.tools import file_interface
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from ngo_msgs.msg import DiscreteAction, RelativePose, Trajectory
+from ngo_msgs.srv import Reset, SaveTrajectory
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.local_odometry import LocalEstimate, LocalOdometry
+from ngo_estimator.nodes.messages import relative_step, to_ns, to_time
+from ngo_estimator.nodes.path_message import plain_path
+from ngo_estimator.online_trajectory import OnlineTrajectory
+
+from .processes import NodeProcess, Probe, wait_until
+
+STEP_NS = 100_000_000
+RUN_NS = 1_000_000_000_000
+FIRST_RUN_NS = 1_700_000_000_000_000_000
+
+
+def scan(seed: int) -> np.ndarray:
+    """A row image of the 2D world's format."""
+    rng = np.random.default_rng(seed)
+    return np.concatenate((rng.random((1, 241, 3)), rng.uniform(0.3, 8.0, (1, 241, 1))), axis=-1).astype(np.float32)
+
+
+def image_message(pixels: np.ndarray, stamp_ns: int) -> Image:
+    """What a simulator publishes for these pixels."""
+    height, width, channels = pixels.shape
+    message = Image(height=height, width=width, step=width * channels * pixels.itemsize, data=pixels.tobytes())
+    message.encoding = "rgb8" if pixels.dtype == np.uint8 else "32FC4"
+    message.header.stamp = to_time(stamp_ns)
+    return message
+
+
+@dataclass
+class Outputs:
+    """Everything that the nodes published, topic by topic."""
+
+    relative_poses: list[RelativePose] = field(default_factory=list)
+    odometry: list[Odometry] = field(default_factory=list)
+    poses: list[PoseWithCovarianceStamped] = field(default_factory=list)
+    trajectories: list[Trajectory] = field(default_factory=list)
+    paths: list[PathMessage] = field(default_factory=list)
+    loops: list[MarkerArray] = field(default_factory=list)
+    transforms: list[TFMessage] = field(default_factory=list)
+
+    def lists(self) -> list[list[Any]]:
+        """All lists of messages."""
+        return list(vars(self).values())
+
+
+class Graph:
+    """A running pair of estimators in the 2D world, and the probe that plays runs into it."""
+
+    def __init__(self, local: NodeProcess, ngo: NodeProcess, weights: Path, probe: Probe) -> None:
+        self.local, self.ngo, self.weights, self.probe = local, ngo, weights, probe
+        self.images = probe.node.create_publisher(Image, "image", 1000)
+        self.actions = probe.node.create_publisher(DiscreteAction, "action", 1000)
+        self.out = Outputs(
+            probe.collect(RelativePose, "relative_pose"),
+            probe.collect(Odometry, "odom"),
+            probe.collect(PoseWithCovarianceStamped, "ngo/pose"),
+            probe.collect(Trajectory, "ngo/trajectory"),
+            probe.collect(PathMessage, "ngo/path"),
+            probe.collect(MarkerArray, "ngo/loops"),
+            probe.collect(TFMessage, "/tf"),
+        )
+        self._base_ns = FIRST_RUN_NS
+
+    def connect(self) -> None:
+        """Play runs until every topic has arrived: only then are all publishers and subscribers matched."""
+        self.probe.spin_until(
+            lambda: self.images.get_subscription_count() and self.actions.get_subscription_count(),
+            "subscribers",
+        )
+
+        def all_arrived() -> bool:
+            self._base_ns -= RUN_NS
+            self.play(0, 1)
+            return all(self.out.lists())
+
+        self.probe.spin_until(all_arrived, "every topic")
+        self.finish_run(frames=3)
+
+    def start_run(self) -> None:
+        """Let the next frames be those of a restarted simulator."""
+        self._base_ns -= RUN_NS
+        for messages in self.out.lists():
+            messages.clear()
+
+    def finish_run(self, frames: int) -> None:
+        """Play a whole run of ``frames`` frames and wait until everything about it has arrived."""
+        self.start_run()
+        self.play(*range(frames))
+        self.wait_for_step(frames - 1)
+
+    def stamp_ns(self, step: int) -> int:
+        """The stamp of a frame of this run."""
+        return self._base_ns + step * STEP_NS
+
+    def action(self, step: int, action: int | None = None) -> None:
+        """Publish the action taken at a frame."""
+        message = DiscreteAction(action=step % 3 if action is None else action)
+        message.header.stamp = to_time(self.stamp_ns(step))
+        self.actions.publish(message)
+
+    def frame(self, step: int, pixels: np.ndarray | None = None) -> None:
+        """Publish a frame."""
+        self.images.publish(image_message(scan(step) if pixels is None else pixels, self.stamp_ns(step)))
+
+    def play(self, *steps: int) -> None:
+        """Publish frames, each after the action taken at the step before it."""
+        for step in steps:
+            if step > 0:
+                self.action(step - 1)
+            self.frame(step)
+
+    def wait_for_step(self, step: int) -> None:
+        """Wait until the newest message on every topic is about this step."""
+
+        expected = self.stamp_ns(step)
+
+        def newest(messages: list[Any]) -> int:
+            if not messages:
+                return 0
+            if isinstance(messages[-1], MarkerArray):
+                return expected  # published when the optimizer ran
+            if isinstance(messages[-1], TFMessage):
+                children = {message.transforms[0].child_frame_id: message for message in messages}
+                stamps = [to_ns(message.transforms[0].header.stamp) for message in children.values()]
+                return min(stamps) if len(stamps) == 2 else 0
+            return to_ns(messages[-1].header.stamp)
+
+        self.probe.spin_until(
+            lambda: all(newest(m) == expected for m in self.out.lists()), f"step {step} on every topic"
+        )
+
+    def steps(self) -> list[tuple[int, int]]:
+        """The steps of this run that relative poses came for: (older, newer)."""
+        return [
+            tuple((to_ns(stamp) - self._base_ns) // STEP_NS for stamp in (message.from_stamp, message.header.stamp))
+            for message in self.out.relative_poses
+        ]
+
+    def expected(self, *steps: int) -> list[LocalEstimate]:
+        """What the core says about these frames with the action of each older one."""
+        core = LocalOdometry.load(self.weights)
+        estimates = []
+        for older, newer in zip((steps[0], *steps), steps, strict=False):
+            estimate = core.update(self.stamp_ns(newer), scan(newer), older % 3)
+            estimates += [] if estimate is None else [estimate]
+        return estimates
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Untrained weights for both worlds: what these tests say does not depend on what was learned."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("weights")
+    for world in ("maze2d", "maze3d"):
+        torch.manual_seed(0)
+        write_untrained(folder / world, world)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def graph(weights: Path) -> Iterator[Graph]:
+    """A running, connected pair of estimators."""
+    shared = {"world": "maze2d", "weights": str(weights / "maze2d"), "diagnostics_period_s": 0.1}
+    probe = Probe()
+    with (
+        NodeProcess(
+            "ngo_estimator", "local_node", {**shared, "image_reliability": "reliable", "image_depth": 1000}
+        ) as local,
+        NodeProcess("ngo_estimator", "ngo_node", shared) as ngo,
+    ):
+        graph = Graph(local, ngo, weights / "maze2d", probe)
+        graph.connect()
+        yield graph
+    probe.close()
+
+
+def test_nodes_equal_their_cores(graph: Graph) -> None:
+    graph.finish_run(frames=30)
+    out, expected = graph.out, graph.expected(*range(30))
+    trajectory = OnlineTrajectory.load(graph.weights)
+    assert [len(messages) for messages in (out.relative_poses, out.odometry, out.poses)] == [29, 29, 29]
+    for estimate, message, odometry, pose in zip(expected, out.relative_poses, out.odometry, out.poses, strict=True):
+        step = relative_step(message)
+        assert (step.stamp_ns, step.from_stamp_ns) == (estimate.stamp_ns, estimate.from_stamp_ns)
+        np.testing.assert_allclose(step.relative_xyyaw, estimate.relative_xyyaw, atol=1e-6)
+        np.testing.assert_allclose(step.covariance, estimate.covariance, rtol=1e-5)
+        np.testing.assert_allclose(step.odom_xyyaw, estimate.odom_xyyaw, atol=1e-6)
+        np.testing.assert_allclose(step.motion_feature, estimate.motion_feature, atol=1e-5)
+        np.testing.assert_allclose(step.place_code, estimate.place_code, atol=1e-5)
+        assert message.header.frame_id == odometry.child_frame_id == "base_link"
+        assert odometry.header.frame_id == "odom"
+        assert odometry.pose.pose.position.x == message.odom_x
+        assert odometry.twist.twist.linear.x == pytest.approx(message.x / 0.1)
+        update = trajectory.update(step)
+        assert to_ns(pose.header.stamp) == step.stamp_ns
+        newest = update.poses_xyyaw[-1]
+        assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == pytest.approx(tuple(newest[:2]), abs=1e-6)
+        assert pose.pose.covariance[35] == pytest.approx(update.covariance[2, 2], rel=1e-4)
+
+
+def test_path_trajectory_and_pose_are_one(graph: Graph) -> None:
+    graph.finish_run(frames=12)
+    path, trajectory, pose = graph.out.paths[-1], graph.out.trajectories[-1], graph.out.poses[-1]
+    stamps_ns = np.array(trajectory.stamps_ns)
+    poses_xyyaw = np.column_stack((trajectory.x, trajectory.y, trajectory.yaw))
+    assert stamps_ns.tolist() == [graph.stamp_ns(step) for step in range(12)]
+    assert path == plain_path("map", graph.stamp_ns(11), stamps_ns, poses_xyyaw)
+    assert trajectory.header.frame_id == pose.header.frame_id == "map"
+    assert pose.pose.pose == path.poses[-1].pose
+    assert poses_xyyaw[0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_transforms_connect_map_to_base_link(graph: Graph) -> None:
+    graph.finish_run(frames=6)
+    by_frames = {}
+    for message in graph.out.transforms:
+        (transform,) = message.transforms
+        by_frames[transform.header.frame_id, transform.child_frame_id] = transform
+    assert set(by_frames) == {("odom", "base_link"), ("map", "odom")}
+    odom_from_base = by_frames["odom", "base_link"].transform
+    assert odom_from_base.translation.x == graph.out.odometry[-1].pose.pose.position.x
+    assert odom_from_base.rotation == graph.out.odometry[-1].pose.pose.orientation
+
+
+def test_loops_are_lines_between_poses(graph: Graph) -> None:
+    graph.finish_run(frames=100)
+    (marker,) = graph.out.loops[-1].markers
+    assert marker.header.frame_id == "map"
+    assert (marker.type, marker.action) in ((Marker.LINE_LIST, Marker.ADD), (0, Marker.DELETE))
+    assert len(marker.points) % 2 == 0
+    assert len(marker.colors) == len(marker.points)
+
+
+def test_a_lost_frame_is_bridged(graph: Graph) -> None:
+    graph.start_run()
+    graph.play(0, 1, 2)
+    graph.action(2)
+    graph.play(4, 5)
+    graph.wait_for_step(5)
+    assert graph.steps() == [(0, 1), (1, 2), (2, 4), (4, 5)]
+    core = LocalOdometry.load(graph.weights)
+    for older, newer in ((0, 0), (0, 1), (1, 2), (2, 4)):
+        estimate = core.update(graph.stamp_ns(newer), scan(newer), older % 3)
+    assert estimate is not None
+    np.testing.assert_allclose(graph.out.relative_poses[2].x, estimate.relative_xyyaw[0], atol=1e-6)
+    assert len(graph.out.trajectories[-1].x) == 5
+
+
+def test_doubled_and_late_frames_change_nothing(graph: Graph) -> None:
+    graph.start_run()
+    graph.play(0, 1, 2, 3)
+    graph.frame(3)
+    graph.frame(1)
+    graph.play(4)
+    graph.wait_for_step(4)
+    assert graph.steps() == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    for estimate, message in zip(graph.expected(0, 1, 2, 3, 4), graph.out.relative_poses, strict=True):
+        np.testing.assert_allclose(message.odom_x, estimate.odom_xyyaw[0], atol=1e-6)
+    graph.local.wait_for_log("dropped image: .*(came twice|older than the last)")
+
+
+def bad_images() -> dict[str, Image]:
+    """Images that the 2D world's node cannot use; each still needs its stamp."""
+    good = scan(2)
+    with_nan, with_infinity = good.copy(), good.copy()
+    with_nan[0, 100, 3], with_infinity[0, 7, 3] = np.nan, np.inf
+    wrong_encoding, short, long = (image_message(good, 0) for _ in range(3))
+    wrong_encoding.encoding = "rgb8"
+    short.data = short.data[:-16]
+    long.data = long.data.tobytes() + bytes(16)
+    return {
+        "is 240 x 1 pixels; expected 241 x 1": image_message(good[:, :240], 0),
+        "is 241 x 2 pixels": image_message(np.concatenate((good, good)), 0),
+        "has the encoding 'rgb8'; expected '32FC4'": wrong_encoding,
+        "has 3840 bytes in 1 rows": short,
+        "has 3872 bytes in 1 rows": long,
+        "has 1 values that are not finite": image_message(with_nan, 0),
+        "1 values that are not finite": image_message(with_infinity, 0),
+    }
+
+
+def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
+    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.start_run()
+    graph.play(0, 1)
+    graph.action(1)
+    images = bad_images()
+    for message in images.values():
+        message.header.stamp = to_time(graph.stamp_ns(2))
+        graph.images.publish(message)
+    graph.play(3)
+    graph.wait_for_step(3)
+    assert graph.steps() == [(0, 1), (1, 3)]
+
+    def dropped() -> int:
+        statuses = [status for array in diagnostics for status in array.status if status.name == "/local_node"]
+        values = {entry.key: entry.value for status in statuses for entry in status.values}
+        return int(values.get("dropped: image", 0))
+
+    graph.probe.spin_until(lambda: dropped() >= len(images), "a count of the dropped images")
+    assert graph.local.running
+
+
+@pytest.mark.parametrize("reason", list(bad_images()))
+def test_the_reason_of_an_unusable_image_is_clear(reason: str) -> None:
+    from ngo_estimator.nodes.messages import image_array
+
+    with pytest.raises(ValueError, match="image .*" + reason):
+        image_array(bad_images()[reason], (1, 241, 4), "float32")
+
+
+def test_a_late_action_delays_its_frame_and_a_lost_one_drops_it(graph: Graph) -> None:
+    graph.start_run()
+    graph.play(0)
+    graph.frame(1)
+    graph.action(0)  # late
+    graph.frame(2)  # action 1 is lost
+    graph.action(2, action=7)  # no action
+    graph.action(2)
+    graph.play(3, 4)
+    graph.wait_for_step(4)
+    assert graph.steps() == [(0, 1), (1, 3), (3, 4)]
+    graph.local.wait_for_log("dropped image without action: the action on 'action' that led to it did not come")
+    graph.local.wait_for_log("dropped action: action is 7; expected one of")
+
+
+def test_unusable_relative_poses_are_dropped(graph: Graph) -> None:
+    graph.finish_run(frames=5)
+    publisher = graph.probe.node.create_publisher(RelativePose, "relative_pose", 1000)
+    graph.probe.spin_until(lambda: publisher.get_subscription_count() >= 2, "ngo_node's subscription")
+    for change in ("x", "place_code", "late"):
+        message = relative_message_after(graph, 5)
+        if change == "x":
+            message.x = float("nan")
+        elif change == "place_code":
+            message.place_code = message.place_code[:-1]
+        else:
+            message.header.stamp = to_time(graph.stamp_ns(2))
+        publisher.publish(message)
+    publisher.publish(relative_message_after(graph, 5))
+    graph.probe.spin_until(lambda: to_ns(graph.out.poses[-1].header.stamp) == graph.stamp_ns(5), "the good message")
+    graph.probe.node.destroy_publisher(publisher)
+    assert [to_ns(pose.header.stamp) for pose in graph.out.poses] == [graph.stamp_ns(step) for step in (1, 2, 3, 4, 5)]
+    assert np.isfinite(graph.out.poses[-1].pose.pose.position.x)
+    graph.ngo.wait_for_log("dropped relative pose: ")
+
+
+def relative_message_after(graph: Graph, step: int) -> RelativePose:
+    """A copy of the newest relative pose, one step later."""
+    last = graph.out.relative_poses[0]
+    return RelativePose(
+        **{
+            name: getattr(last, name)
+            for name in ("x", "y", "yaw", "covariance", "origin_stamp", "motion_feature", "place_code")
+        },
+        header=type(last.header)(stamp=to_time(graph.stamp_ns(step)), frame_id="base_link"),
+        from_stamp=to_time(graph.stamp_ns(step - 1)),
+    )
+
+
+def test_a_restarted_source_starts_both_anew_with_one_line_each(graph: Graph) -> None:
+    graph.finish_run(frames=8)
+    before = {process: process.log.count("restarted, so") for process in (graph.local, graph.ngo)}
+    graph.finish_run(frames=4)
+    assert graph.steps() == [(0, 1), (1, 2), (2, 3)]
+    np.testing.assert_allclose(
+        graph.out.relative_poses[-1].odom_x, graph.expected(0, 1, 2, 3)[-1].odom_xyyaw[0], atol=1e-6
+    )
+    assert len(graph.out.trajectories[-1].x) == 4
+    assert graph.out.odometry[0].pose.covariance[0] == pytest.approx(graph.out.relative_poses[0].covariance[0])
+    for process, count in before.items():
+        wait_until(lambda: process.log.count("restarted, so") == count + 1, f"one line of {process.name}")  # noqa: B023
+
+
+def test_saved_trajectory_is_what_was_published(graph: Graph, tmp_path: Path) -> None:
+    graph.finish_run(frames=9)
+
+    def save(path: Path) -> SaveTrajectory.Response:
+        return graph.probe.call(SaveTrajectory, "ngo_node/save_trajectory", SaveTrajectory.Request(path=str(path)))
+
+    response = save(tmp_path / "path.tum")
+    assert response.success, response.message
+    assert response.message == f"wrote 9 poses to {tmp_path / 'path.tum'}"
+    saved, published = (
+        file_interface.read_tum_trajectory_file(str(tmp_path / "path.tum")),
+        graph.out.trajectories[-1],
+    )
+    np.testing.assert_allclose(saved.timestamps, np.array(published.stamps_ns) / 1e9)
+    np.testing.assert_allclose(saved.positions_xyz[:, 0], published.x, atol=1e-8)
+    for path, reason in (
+        (tmp_path / "path.csv", "ends in .tum or .txt"),
+        (tmp_path / "no" / "a.tum", "No such file"),
+    ):
+        response = save(path)
+        assert not response.success
+        assert reason in response.message
+    assert [path.name for path in tmp_path.iterdir()] == ["path.tum"]
+
+
+def test_reset_forgets_the_trajectory(graph: Graph, tmp_path: Path) -> None:
+    graph.finish_run(frames=5)
+    response = graph.probe.call(Reset, "ngo_node/reset", Reset.Request())
+    assert (response.success, response.message) == (True, "forgot 5 poses")
+    request = SaveTrajectory.Request(path=str(tmp_path / "path.tum"))
+    response = graph.probe.call(SaveTrajectory, "ngo_node/save_trajectory", request)
+    assert (response.success, response.message) == (False, "the trajectory is empty; nothing was written")
+    graph.play(5)
+    graph.wait_for_step(5)
+    assert len(graph.out.trajectories[-1].x) == 2
+
+
+def test_who_comes_late_gets_the_newest_path_at_once(graph: Graph) -> None:
+    graph.finish_run(frames=5)
+    late = Probe("late_probe")
+    try:
+        paths = late.collect(PathMessage, "ngo/path")
+        late.spin_until(lambda: paths, "a path without new frames")
+        assert paths[0] == graph.out.paths[-1]
+    finally:
+        late.close()
+
+
+def test_diagnostics_tell_rates_times_and_the_window(graph: Graph) -> None:
+    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.finish_run(frames=7)
+
+    def newest(name: str) -> dict[str, str]:
+        values: dict[str, str] = {}
+        for array in diagnostics:
+            for status in array.status:
+                if status.name == name:
+                    values.update({entry.key: entry.value for entry in status.values})
+        return values
+
+    graph.probe.spin_until(lambda: newest("/ngo_node").get("frames") == "7", "ngo_node's diagnostics")
+    assert {
+        "input rate (Hz)", "received", "dropped", "time an update, mean (ms)", "time an update, max (ms)",
+        "window fill", "gaps", "loops", "largest move in the last update (m)",
+        "map_from_odom (x m, y m, yaw rad)",
+    } <= set(newest("/ngo_node"))  # fmt: skip
+    assert {"input rate (Hz)", "images waiting for actions", "restarts"} <= set(newest("/local_node"))
+    assert to_ns(diagnostics[-1].header.stamp) in (0, *(graph.stamp_ns(step) for step in range(7)))
+
+
+def test_sigint_ends_both_with_code_zero_and_no_traceback(graph: Graph) -> None:
+    """Last of those that share the pair."""
+    graph.start_run()
+    graph.play(*range(100))  # signals come while they work
+    for process in (graph.local, graph.ngo):
+        process.send(signal.SIGINT)
+    for process in (graph.local, graph.ngo):
+        assert process.wait() == 0, process.log
+        assert "Traceback" not in process.log, process.log
+
+
+def test_switches_names_and_the_3d_world(weights: Path) -> None:
+    """In a namespace, without TF, with other frames and topics, images best effort; ended by SIGTERM."""
+    shared = {
+        "world": "maze3d",
+        "weights": str(weights / "maze3d"),
+        "publish_tf": False,
+        "odom_frame": "drift",
+    }
+    probe = Probe("probe_3d")
+    with ExitStack() as stack:
+        local = stack.enter_context(
+            NodeProcess(
+                "ngo_estimator",
+                "local_node",
+                {**shared, "base_frame": "robot", "image_topic": "camera/image", "publish_odometry": False},
+                ("-r", "__ns:=/red"),
+            )
+        )
+        ngo = stack.enter_context(
+            NodeProcess("ngo_estimator", "ngo_node", {**shared, "map_frame": "world"}, ("-r", "__ns:=/red"))
+        )
+        best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        images = probe.node.create_publisher(Image, "/red/camera/image", best_effort)
+        actions = probe.node.create_publisher(DiscreteAction, "/red/action", 10)
+        poses = probe.collect(PoseWithCovarianceStamped, "/red/ngo/pose")
+        relative_poses = probe.collect(RelativePose, "/red/relative_pose")
+        probe.spin_until(
+            lambda: images.get_subscription_count() and actions.get_subscription_count(),
+            "local_node's subscriptions",
+        )
+        step = 0
+
+        def pose_arrived() -> bool:
+            nonlocal step
+            action = DiscreteAction(action=0)
+            action.header.stamp = to_time(FIRST_RUN_NS + step * STEP_NS)
+            actions.publish(action)
+            step += 1
+            pixels = np.random.default_rng(step).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+            images.publish(image_message(pixels, FIRST_RUN_NS + step * STEP_NS))
+            return bool(poses and relative_poses)
+
+        probe.spin_until(pose_arrived, "a pose")
+        assert poses[0].header.frame_id == "world"
+        assert relative_poses[0].header.frame_id == "robot"
+        for name in ("local_node", "ngo_node"):
+            published = dict(probe.node.get_publisher_names_and_types_by_node(name, "/red"))
+            assert not {"/tf", "/red/odom"} & set(published)
+        (info,) = probe.node.get_subscriptions_info_by_topic("/red/camera/image")
+        assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        for process in (local, ngo):
+            process.send(signal.SIGTERM)
+        for process in (local, ngo):
+            assert process.wait() == 0, process.log
+            assert "Traceback" not in process.log, process.log
+    probe.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["sigint", "sigterm"])
+def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path, number: signal.Signals) -> None:
+    """The node is in the graph before it loads its networks, which takes long."""
+    probe = Probe("start_probe")
+    parameters = {"world": "maze2d", "weights": str(weights / "maze2d")}
+    with NodeProcess("ngo_estimator", "ngo_node", parameters, ("-r", f"__ns:=/{number.name}")) as process:
+        probe.spin_until(
+            lambda: ("ngo_node", f"/{number.name}") in probe.node.get_node_names_and_namespaces(),
+            "the node",
+            20.0,
+        )
+        process.send(number)
+        assert process.wait() == 0, process.log
+        assert "Traceback" not in process.log, process.log
+    probe.close()
+
+
+BAD_STARTS = """
+local_node world:=mars             parameter 'world' is 'mars'; allowed: maze2d or maze3d
+local_node wrld:=maze2d            parameter 'wrld' is 'maze2d', but unknown; allowed: .*world
+local_node image_topic:='a/'       parameter 'image_topic' is 'a/'; allowed: a topic name
+local_node image_depth:=5.5        parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000
+local_node action_timeout_s:=.nan  parameter 'action_timeout_s' is nan; allowed: a number from 0.001 to 60
+local_node publish_tf:=1           parameter 'publish_tf' is 1; allowed: true or false
+ngo_node   window_frames:=one      parameter 'window_frames' is 'one'; allowed: an integer from 2 to 100000
+ngo_node   window_frames:=4000     parameter 'relative_pose_depth' is 2000; allowed: at least window_frames
+ngo_node   map_frame:=odom         parameter 'map_frame' is 'odom'; allowed: another name than odom_frame's
+ngo_node   publish_tf              Couldn't parse parameter override rule: '-p publish_tf'
+ngo_node   weights:=/nowhere       there is no folder '/nowhere'
+"""
+
+
+def test_bad_parameters_end_the_start_with_one_line_and_code_two() -> None:
+    for executable, argument, pattern in (line.split(maxsplit=2) for line in BAD_STARTS.strip().splitlines()):
+        with NodeProcess("ngo_estimator", executable, None, ("-p", argument)) as process:
+            assert process.wait() == 2, process.log
+            process.wait_for_log(pattern)
+            assert len(process.log.strip().splitlines()) == 1, process.log
+
+
+def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp_path: Path) -> None:
+    write_untrained(tmp_path, "maze2d")
+    for name in ("local_pose_network", "neural_graph_optimizer"):
+        file = tmp_path / f"{name}.safetensors"
+        file.write_bytes(file.read_bytes()[:-100])
+    cases = {
+        ("local_node", "maze2d", tmp_path): "local_pose_network.safetensors: is damaged",
+        ("ngo_node", "maze2d", tmp_path): "neural_graph_optimizer.safetensors: is damaged",
+        ("local_node", "maze2d", weights / "maze3d"): "was trained for the world 'maze3d'; expected 'maze2d'",
+        ("ngo_node", "maze3d", weights): "cannot be read",
+    }
+    for (executable, world, folder), pattern in cases.items():
+        with NodeProcess("ngo_estimator", executable, {"world": world, "weights": str(folder)}) as process:
+            assert process.wait() == 2, process.log
+            process.wait_for_log(pattern)
+            assert len(process.log.strip().splitlines()) == 1, process.log
