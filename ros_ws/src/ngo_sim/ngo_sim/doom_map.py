@@ -1,7 +1,7 @@
-"""Mazes as Doom maps: UDMF ``TEXTMAP`` lumps, many maps in one PWAD, written without any Doom software.
+"""Mazes as Doom maps: UDMF text, many maps in one PWAD file.
 
-The engine builds the BSP nodes of a UDMF map by itself when it loads the map, so a map here is text alone. The map's axes
-are the maze's axes (x right, y up, angles counter-clockwise from x), scaled by :data:`UNITS_PER_M`.
+The engine builds the nodes of a UDMF map when it loads it, so that a map is text alone. Its axes are the
+maze's (x right, y up, angles counter-clockwise from x), scaled by UNITS_PER_M.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ WALL_HEIGHT_UNITS = 128
 PLAYER_RADIUS_UNITS = 16
 """Half the side of the box with which Doom's player collides."""
 
-# Opaque, 128 units high, static in freedoom2.wad (no member of an ANIMATED sequence, no switch), and told apart by colour or
-# pattern even at 80x60 pixels.
+# Of freedoom2.wad: opaque, 128 units high, static (no animated sequence, no switch), and told apart by colour
+# or pattern even at 80 x 60 pixels.
 WALL_TEXTURES: tuple[str, ...] = (
     "A-BROCK2", "A-CAMO1", "A-CAMO3", "A-CAMO4", "A-CONCTE", "A-DBRI28", "A-MOSRK2", "A-MOSROK",
     "A-TILE", "AQBRIK02", "AQBRIK03", "AQCONC06", "AQCONC13", "AQPANL03", "AQRUST06", "AQSECT04",
@@ -66,7 +66,7 @@ class MapStyle:
 
     def __post_init__(self) -> None:
         if not 0 <= self.light_level <= 255:
-            raise ValueError(f"light_level is {self.light_level}; allowed: 0 to 255")
+            raise ValueError(f"light_level is {self.light_level}; it must be from 0 to 255")
 
 
 def wall_faces(walls: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -76,18 +76,18 @@ def wall_faces(walls: NDArray[np.bool_]) -> NDArray[np.int64]:
         walls: (height, width) True where a block is wall; the border must be wall.
 
     Returns:
-        (faces, 4) grid corners x0, y0, x1, y1 in blocks, ordered by side (south, west, north, east of the free
+        (faces, 4) grid corners x0, y0, x1, y1 in blocks; by side (south, west, north, east of the free
         block), then row-major.
 
     Raises:
         ValueError: If an outer block is free: the map would leak into the void.
     """
     if walls.ndim != 2 or min(walls.shape) < 3:
-        raise ValueError(f"walls has shape {walls.shape}; expected (height, width), both at least 3")
+        raise ValueError(f"walls has shape {walls.shape}; it must be 2-D and at least 3 x 3")
     if not (walls[0].all() and walls[-1].all() and walls[:, 0].all() and walls[:, -1].all()):
-        raise ValueError("walls has a free block on the border; expected a closed border")
-    # Neighbour (row, col) offset, then the edge's corners relative to the free block's lower left corner. A one-sided
-    # line shows its front, which is on its right.
+        raise ValueError("walls has a free block on the border; it must be closed")
+    # Offset (row, col) of the wall block, then the edge's corners from the free block's lower left corner.
+    # The engine draws the right side of a line.
     sides = (
         ((-1, 0), (1, 0, 0, 0)),
         ((0, -1), (0, 0, 0, 1)),
@@ -122,9 +122,9 @@ def textmap(maze: Maze, style: MapStyle, start_xy: tuple[float, float], start_he
     """
     faces = wall_faces(maze.walls)
     if len(style.wall_textures) != len(faces):
-        raise ValueError(f"style has {len(style.wall_textures)} wall textures; the maze has {len(faces)} faces")
+        raise ValueError(f"style has {len(style.wall_textures)} wall textures; it must have {len(faces)}")
     if maze.walls[maze.block_at(*start_xy)]:
-        raise ValueError(f"start_xy is {start_xy}, inside a wall; expected a free block")
+        raise ValueError(f"start_xy is {start_xy}, inside a wall; it must be in a free block")
     corners, ends = np.unique(faces.reshape(-1, 2), axis=0, return_inverse=True)
     ends = ends.reshape(-1, 2)
     block_units = maze.block_m * UNITS_PER_M
@@ -154,7 +154,7 @@ def write_pwad(path: Path, maps: Iterable[tuple[str, str]]) -> None:
     names: set[str] = set()
     for name, text in maps:
         if not _LUMP_NAME.fullmatch(name) or name in names:
-            raise ValueError(f"map name is {name!r}; allowed: 1 to 8 of A-Z 0-9 _ - [ ] \\, each name once")
+            raise ValueError(f"map name is {name!r}; it must be 1 to 8 of A-Z 0-9 _ - [ ] \\, each name once")
         names.add(name)
         lumps += [(name, b""), ("TEXTMAP", text.encode("ascii")), ("ENDMAP", b"")]
     body, directory, offset = [], [], 12

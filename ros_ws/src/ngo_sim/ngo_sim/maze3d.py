@@ -1,14 +1,15 @@
-"""A gymnasium environment over ViZDoom: first-person pictures of a textured block maze, exact poses, three actions."""
+"""The 3D world: a walker in a maze of textured walls, seen by ViZDoom in first-person pictures."""
 
 from __future__ import annotations
 
 import math
 import os
+import shutil
 import tempfile
 import threading
-from collections.abc import Iterable
+import weakref
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,12 @@ from vizdoom import Button, GameVariable, ScreenResolution
 
 from ngo_sim.doom_map import PLAYER_RADIUS_UNITS, UNITS_PER_M, random_style, textmap, wall_faces, write_pwad
 from ngo_sim.drivers import Action
-from ngo_sim.mazes import Maze, kruskal_maze
+from ngo_sim.mazes import Maze, check_maze_size, kruskal_maze
 
 TICS_PER_S = 35
 """Doom's fixed rate of simulation."""
 
-SUPERSAMPLING = 2
-"""Side in rendered pixels of the square that is averaged into one pixel of an observation."""
-
-# ViZDoom renders a fixed list of sizes. These are the ones of aspect 4:3, to which alone the camera model below applies.
+# Of the fixed list of sizes that ViZDoom renders those of 4:3, to which alone the camera model below applies.
 _RESOLUTIONS = {
     (80, 60): ScreenResolution.RES_160X120,
     (160, 120): ScreenResolution.RES_320X240,
@@ -36,86 +34,65 @@ _RESOLUTIONS = {
     (256, 192): ScreenResolution.RES_512X384,
     (320, 240): ScreenResolution.RES_640X480,
 }
-# Doom's pixels are 1.2 times as high as wide: a 320x200 picture filled a 4:3 screen. The engine keeps that stretch at any size.
+# Doom's pixels are 1.2 times as high as wide (320 x 200 of them filled a screen of 4:3), at any size.
 _PIXEL_STRETCH = 1.2
-# The engine ignores input during the first 7 tics of a map and widens the field of view by 7 degrees a tic at most.
+# A new map ignores input for 7 tics, and its field of view changes by 7 degrees a tic at most.
 _SETTLING_TICS = 20
 _ENGINE_SEED = 1
-# The engine writes a folder into its working directory, which it can only inherit: see Maze3D._start_game.
 _WORKING_DIRECTORY_LOCK = threading.Lock()
+_TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TURN_RIGHT: -1.0}
 
 
 @dataclass(frozen=True)
 class Maze3DConfig:
-    """Everything that a 3D world depends on besides its seed.
+    """The 3D world. Turn rates are given a step, as in w <- turn_decay w + turn_deg."""
 
-    Attributes:
-        rows: Cells of the maze along y.
-        cols: Cells of the maze along x.
-        extra_openings: Walls opened beyond the spanning tree, each making a cycle.
-        block_m: Side of a block and width of a corridor, m.
-        actuation_noise: Standard deviation of thrust and angular acceleration as a fraction of their size. Doom
-            takes thrust in whole units, so the thrust is rounded to 1/25 of its size.
-        width: Width of an observation in pixels.
-        height: Height of an observation in pixels.
-        field_of_view_deg: Horizontal field of view, whole degrees.
-        frame_skip: Tics of 1/35 s in one step.
-        thrust: Doom's forward command, 25 = walking, 50 = running.
-        turn_acceleration_deg: Angular velocity gained by a step of turning, degrees a step.
-        turn_retention: Share of the angular velocity that is left after a step.
-        light_level: Brightness of the maze, 0 to 255.
-    """
-
-    rows: int = 5
-    cols: int = 5
-    extra_openings: int = 2
-    block_m: float = 3.0
-    actuation_noise: float = 0.1
-    width: int = 80
-    height: int = 60
-    field_of_view_deg: int = 108
-    frame_skip: int = 2
-    thrust: int = 25
-    turn_acceleration_deg: float = 2.2
-    turn_retention: float = 0.75
-    light_level: int = 208
+    rows: int = 5  # cells of the maze along y
+    cols: int = 5  # cells of the maze along x
+    extra_openings: int = 2  # walls opened on top of the spanning tree, each one a cycle
+    block_m: float = 3.0  # side of a block and width of a corridor, m
+    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it
+    width: int = 80  # of an observation, pixels
+    height: int = 60  # of an observation, pixels
+    field_of_view_deg: int = 108  # from the left to the right border of the picture
+    frame_skip: int = 2  # tics of 1/35 s in a step
+    thrust: int = 25  # Doom's forward command in whole units, into which noise is rounded: 25 walks, 50 runs
+    turn_deg: float = 2.2  # gain of turn rate by one turn action, degrees a step
+    turn_decay: float = 0.75  # share of the turn rate that a step leaves
+    light_level: int = 208  # of the whole maze, 0 (black) to 255
 
     def __post_init__(self) -> None:
-        _check_int("rows", self.rows, 2, 30)
-        _check_int("cols", self.cols, 2, 30)
-        _check_int("extra_openings", self.extra_openings, 0, (self.rows - 1) * (self.cols - 1))
-        _check_float("block_m", self.block_m, 4 * PLAYER_RADIUS_UNITS / UNITS_PER_M, 10.0)
-        _check_float("actuation_noise", self.actuation_noise, 0.0, 1.0)
+        check_maze_size(self.rows, self.cols, self.extra_openings)
+        # Doom's coordinates end at 32767 units, its player is a square of 1 m.
+        _check_integer("rows", self.rows, 2, 100)
+        _check_integer("cols", self.cols, 2, 100)
+        _check_number("block_m", self.block_m, 4 * PLAYER_RADIUS_UNITS / UNITS_PER_M, 5.0)
+        _check_number("actuation_noise", self.actuation_noise, 0.0, 1.0)
         if (self.width, self.height) not in _RESOLUTIONS:
-            allowed = ", ".join(f"{w}x{h}" for w, h in _RESOLUTIONS)
-            raise ValueError(f"width, height are {self.width!r}, {self.height!r}; allowed: {allowed}")
-        _check_int("field_of_view_deg", self.field_of_view_deg, 30, 150)
-        _check_int("frame_skip", self.frame_skip, 1, 35)
-        _check_int("thrust", self.thrust, 1, 50)
-        _check_float("turn_acceleration_deg", self.turn_acceleration_deg, 0.1, 90.0)
-        _check_float("turn_retention", self.turn_retention, 0.0, 0.99)
-        _check_int("light_level", self.light_level, 0, 255)
+            allowed = ", ".join(f"{width} x {height}" for width, height in _RESOLUTIONS)
+            raise ValueError(f"width x height is {self.width} x {self.height}; it must be one of {allowed}")
+        _check_integer("field_of_view_deg", self.field_of_view_deg, 30, 150)
+        _check_integer("frame_skip", self.frame_skip, 1, TICS_PER_S)
+        _check_integer("thrust", self.thrust, 1, 50)
+        _check_number("turn_deg", self.turn_deg, 0.0, 90.0)
+        _check_number("turn_decay", self.turn_decay, 0.0, 0.99)
+        _check_integer("light_level", self.light_level, 0, 255)
 
     @property
     def period_s(self) -> float:
-        """Simulated time of one step, s."""
+        """Time between two frames, s."""
         return self.frame_skip / TICS_PER_S
 
     @property
     def focal_lengths_px(self) -> tuple[float, float]:
-        """Horizontal and vertical focal length in pixels of an observation; the optical axis is the picture's centre."""
+        """Horizontal and vertical focal length in pixels of an observation, whose middle is the axis."""
         horizontal = self.width / 2 / math.tan(math.radians(self.field_of_view_deg) / 2)
         return horizontal, horizontal * _PIXEL_STRETCH
 
 
-@dataclass(frozen=True)
-class World:
-    """One maze as the engine is to load it.
-
-    Attributes:
-        maze: The maze.
-        text: Its UDMF text with textures and start.
-    """
+@dataclass(frozen=True, eq=False)
+class DoomWorld:
+    """A maze and its UDMF text, which adds textures and the start."""
 
     maze: Maze
     text: str
@@ -124,155 +101,152 @@ class World:
 class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     """Drive through a Kruskal maze in ViZDoom.
 
-    Observations are (height, width, 3) uint8 RGB, the exact 2x2 mean of the rendered picture. Actions are
-    :class:`ngo_sim.drivers.Action`. The reward is the distance travelled in the step, m; episodes never end by themselves.
-    ``info`` has ``pose_xyyaw``, float64 (3,): x, y in m and yaw in (-pi, pi], in the maze's frame, at the very tic that the
-    picture shows; and ``time_s``, simulated time since the reset. After ``reset(seed=s)`` everything is a function of ``s`` and
-    the configuration, to the byte.
+    Observations are uint8 (height, width, 3) RGB, the exact mean of 2 x 2 rendered pixels. Actions are
+    `ngo_sim.drivers.Action`. The reward is the distance travelled in the step in m; episodes never end by
+    themselves. info has "pose_xyyaw", float64 (3,) in the maze's frame (m, m, rad in [-pi, pi],
+    counter-clockwise) at the very tic that the picture shows, and "time_s" since the reset.
 
-    The engine is a process of its own with files of its own: call :meth:`close`, or use the environment in a ``with`` block.
+    reset(seed=s) makes maze, textures, start and noise functions of s and the config, to the byte, preloaded
+    or not. The engine is a process with files of its own, which end with close(), with the environment or
+    with the interpreter, whichever comes first.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": TICS_PER_S}
 
     def __init__(self, config: Maze3DConfig | None = None, render_mode: str | None = None) -> None:
-        """Prepare an environment; the engine starts at the first reset.
-
-        Raises:
-            ValueError: If ``render_mode`` is unknown.
-        """
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode is {render_mode!r}; allowed: None, 'rgb_array'")
+            raise ValueError(f"render_mode is {render_mode!r}; it must be None or 'rgb_array'")
         self.config = config if config is not None else Maze3DConfig()
         self.render_mode = render_mode
         self.period_s = self.config.period_s
-        self.observation_space = gymnasium.spaces.Box(0, 255, (self.config.height, self.config.width, 3), np.uint8)
-        self.action_space = gymnasium.spaces.Discrete(len(Action))
         self.maze: Maze
-        self._preloaded: dict[int, World] = {}
-        self._loaded: dict[int, World] = {}
-        self._game: vizdoom.DoomGame | None = None
+        self.action_space = gymnasium.spaces.Discrete(len(Action))
+        shape = (self.config.height, self.config.width, 3)
+        self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+        self._engine = _Engine(self.config)
+        weakref.finalize(self, self._engine.close)
+        self._preloaded: dict[int, DoomWorld] = {}
+        self._loaded: dict[int, DoomWorld] = {}
         self._picture: NDArray[np.uint8] | None = None
+        self._pose_xyyaw = np.zeros(3)
+        self._turn_rate_deg = 0.0  # a step
+        self._frame = 0
 
     def preload(self, seeds: Iterable[int]) -> None:
-        """Write the maps of ``seeds`` into one WAD, in place of those preloaded before.
+        """Write the maps of these seeds, instead of those preloaded before, into one WAD.
 
-        A reset to one of them then costs milliseconds instead of a start of the engine. What it gives is the same.
+        A reset to one of them then costs milliseconds, to any other seed a restart of the engine (0.2 s).
         """
-        self._preloaded = {int(seed): self._build_world(int(seed)) for seed in seeds}
-        self._start_game(self._preloaded)
+        preloaded = {int(seed): self._build_world(int(seed)) for seed in seeds}
+        if not preloaded:
+            raise ValueError("seeds is empty; it must have at least one seed")
+        self._preloaded = preloaded
+        self._load(preloaded)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """Load the maze of ``seed`` (without one: of a seed drawn from the environment's generator), standing still."""
+        """Stand still at the start of the seed's maze; without a seed, of one drawn by the generator."""
         super().reset(seed=seed)
+        if options:
+            raise ValueError(f"options has {sorted(options)}; this world has none")
         if seed is None:
             seed = int(self.np_random.integers(2**31))
-        if self._game is None or seed not in self._loaded:
-            worlds = dict(self._preloaded)
-            if seed not in worlds:
-                worlds[seed] = self._build_world(seed)
-            self._start_game(worlds)
-        assert self._game is not None
+        if not self._engine.running or seed not in self._loaded:
+            wanted = {} if seed in self._preloaded else {seed: self._build_world(seed)}
+            self._load({**self._preloaded, **wanted})
         self.maze = self._loaded[seed].maze
         self._noise_rng = _generator(seed, stream=2)
-        self._turn_rate_deg = 0.0
-        self._steps = 0
-        self._game.set_doom_map(_map_name(list(self._loaded).index(seed)))
-        self._game.new_episode()
-        # A new map brings the default field of view back; `+fov` as an argument of the engine holds for its first map only.
-        self._game.send_game_command(f"fov {self.config.field_of_view_deg}")
-        self._game.make_action([0, 0], _SETTLING_TICS)
-        field_of_view = self._game.get_game_variable(GameVariable.CAMERA_FOV)
-        if field_of_view != self.config.field_of_view_deg:
-            raise RuntimeError(f"the engine's field of view is {field_of_view}, not {self.config.field_of_view_deg} degrees")
-        observation, self._pose_xyyaw = self._observe()
-        return observation, self._info()
+        self._turn_rate_deg, self._frame = 0.0, 0
+        self._picture, self._pose_xyyaw = self._engine.enter(list(self._loaded).index(seed))
+        return mean_2x2(self._picture), self._info()
 
     def step(self, action: np.int64 | int) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
-        """Apply one action for ``frame_skip`` tics.
+        """Take one of the three actions and let period_s pass.
 
-        Raises:
-            ValueError: If ``action`` is no :class:`Action`.
-            RuntimeError: If the environment was not reset, or the engine ended.
+        Raises ValueError for another action, RuntimeError before a reset or where the engine has ended.
         """
-        if self._game is None:
+        if not self._engine.running:
             raise RuntimeError("step() before reset(), or after close()")
-        if not self.action_space.contains(action):
-            raise ValueError(f"action is {action!r}; allowed: 0 (forward), 1 (turn left), 2 (turn right)")
+        if action not in _TURN:
+            raise ValueError(f"action is {action!r}; it must be 0 (forward), 1 (turn left) or 2 (turn right)")
         config = self.config
         strength = 1.0 + config.actuation_noise * self._noise_rng.standard_normal()
-        direction = (0.0, 1.0, -1.0)[int(action)]
-        self._turn_rate_deg = (
-            config.turn_retention * self._turn_rate_deg + direction * config.turn_acceleration_deg * strength
-        )
+        turn = _TURN[int(action)] * config.turn_deg * strength
+        self._turn_rate_deg = config.turn_decay * self._turn_rate_deg + turn
         thrust = round(config.thrust * strength) if action == Action.FORWARD else 0
-        # The engine turns clockwise for a positive number, and by that number in each tic.
-        self._game.make_action([thrust, -self._turn_rate_deg / config.frame_skip], config.frame_skip)
-        observation, pose_xyyaw = self._observe()
-        distance_m = math.hypot(pose_xyyaw[0] - self._pose_xyyaw[0], pose_xyyaw[1] - self._pose_xyyaw[1])
-        self._pose_xyyaw = pose_xyyaw
-        self._steps += 1
-        return observation, distance_m, False, False, self._info()
+        last_pose_xyyaw = self._pose_xyyaw
+        self._picture, self._pose_xyyaw = self._engine.advance(thrust, self._turn_rate_deg)
+        self._frame += 1
+        moved = self._pose_xyyaw - last_pose_xyyaw
+        return mean_2x2(self._picture), math.hypot(moved[0], moved[1]), False, False, self._info()
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """Return the first-person picture before averaging, (2 height, 2 width, 3) RGB; None without a render mode."""
+    def render(self) -> NDArray[np.uint8] | None:
+        """The picture as rendered, uint8 (2 height, 2 width, 3); None without a mode or before a reset."""
         return None if self.render_mode is None or self._picture is None else self._picture.copy()
 
     def close(self) -> None:
-        """End the engine and delete its files; the environment can be reset again."""
-        game, self._game = getattr(self, "_game", None), None
-        if game is not None:
-            game.close()
-        self._loaded = {}
-        directory = self.__dict__.pop("_directory", None)
-        if directory is not None:
-            directory.cleanup()
+        """End the engine and delete its files; another reset starts it again."""
+        self._engine.close()
 
-    def __del__(self) -> None:
-        self.close()
-
-    @cached_property
-    def _directory(self) -> tempfile.TemporaryDirectory[str]:
-        return tempfile.TemporaryDirectory(prefix="ngo_maze3d_")
-
-    def _build_world(self, seed: int) -> World:
+    def _build_world(self, seed: int) -> DoomWorld:
         config = self.config
-        maze = kruskal_maze(config.rows, config.cols, _generator(seed, stream=0), config.extra_openings, config.block_m)
-        rng = _generator(seed, stream=1)
+        maze_rng, rng = _generator(seed, stream=0), _generator(seed, stream=1)
+        maze = kruskal_maze(config.rows, config.cols, maze_rng, config.extra_openings, config.block_m)
         style = random_style(len(wall_faces(maze.walls)), rng, config.light_level)
         start_x, start_y = maze.block_center(rng.choice(maze.free_blocks()))
-        return World(maze, textmap(maze, style, (float(start_x), float(start_y)), int(rng.integers(360))))
+        start_heading_deg = int(rng.integers(360))
+        return DoomWorld(maze, textmap(maze, style, (float(start_x), float(start_y)), start_heading_deg))
 
-    def _start_game(self, worlds: dict[int, World]) -> None:
-        if self._game is not None:
-            self._game.close()
-            self._game = None
-        folder = Path(self._directory.name)
-        write_pwad(folder / "maps.wad", ((_map_name(i), world.text) for i, world in enumerate(worlds.values())))
+    def _load(self, worlds: dict[int, DoomWorld]) -> None:
+        self._engine.start([world.text for world in worlds.values()])
+        self._loaded = worlds
+
+    def _info(self) -> dict[str, Any]:
+        return {"pose_xyyaw": self._pose_xyyaw.copy(), "time_s": self._frame * self.period_s}
+
+
+class _Engine:
+    """ViZDoom's process and the files that it reads and writes."""
+
+    def __init__(self, config: Maze3DConfig) -> None:
+        self._config = config
+        self._game: vizdoom.DoomGame | None = None
+        self._folder: Path | None = None
+
+    @property
+    def running(self) -> bool:
+        return self._game is not None
+
+    def start(self, texts: Sequence[str]) -> None:
+        """Start the process anew with these UDMF maps, which are known by their index from then on."""
+        self.close()
+        folder = self._folder = Path(tempfile.mkdtemp(prefix="ngo_maze3d_"))
+        write_pwad(folder / "maps.wad", [(_map_name(index), text) for index, text in enumerate(texts)])
         game = vizdoom.DoomGame()
         game.set_doom_game_path(str(Path(vizdoom.__file__).parent / "freedoom2.wad"))
         game.set_doom_scenario_path(str(folder / "maps.wad"))
         game.set_doom_config_path(str(folder / "engine.ini"))
         game.set_doom_map(_map_name(0))
-        game.set_screen_resolution(_RESOLUTIONS[self.config.width, self.config.height])
+        game.set_screen_resolution(_RESOLUTIONS[self._config.width, self._config.height])
         game.set_screen_format(vizdoom.ScreenFormat.RGB24)
-        for hide in (
-            game.set_render_hud, game.set_render_minimal_hud, game.set_render_crosshair, game.set_render_weapon,
-            game.set_render_decals, game.set_render_particles, game.set_render_effects_sprites,
-            game.set_render_messages, game.set_render_corpses, game.set_render_screen_flashes,
-            game.set_window_visible, game.set_sound_enabled, game.set_console_enabled,
-        ):  # fmt: skip
-            hide(False)
+        for part in ("hud", "minimal_hud", "crosshair", "weapon", "decals", "particles", "effects_sprites",
+                     "messages", "corpses", "screen_flashes"):  # fmt: skip
+            getattr(game, f"set_render_{part}")(False)
+        game.set_window_visible(False)
+        game.set_sound_enabled(False)
+        game.set_console_enabled(False)
         game.set_mode(vizdoom.Mode.PLAYER)
         game.set_episode_timeout(0)
         game.set_seed(_ENGINE_SEED)
         game.set_available_buttons([Button.MOVE_FORWARD_BACKWARD_DELTA, Button.TURN_LEFT_RIGHT_DELTA])
-        game.set_available_game_variables([GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE])
+        game.set_available_game_variables(
+            [GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE]
+        )
         # The camera of a walking player goes up and down by default.
         game.set_game_args("+movebob 0 +stillbob 0")
         with _WORKING_DIRECTORY_LOCK:
+            # The process makes a folder in its working directory, which it can only inherit.
             caller = os.open(".", os.O_RDONLY)
             try:
                 os.chdir(folder)
@@ -280,25 +254,51 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
             finally:
                 os.fchdir(caller)
                 os.close(caller)
-        self._game, self._loaded = game, worlds
+        self._game = game
 
-    def _observe(self) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    def enter(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Begin the map of this index; return the first picture and pose, as advance() does."""
         assert self._game is not None
-        state = self._game.get_state()
-        if state is None:
-            raise RuntimeError("the engine ended the episode")
-        self._picture = state.screen_buffer
-        x, y, angle_deg = state.game_variables
-        yaw = math.radians(angle_deg)
-        yaw = math.pi - (math.pi - yaw) % (2 * math.pi)
-        return mean_2x2(self._picture), np.array([x / UNITS_PER_M, y / UNITS_PER_M, yaw])
+        self._game.set_doom_map(_map_name(index))
+        self._game.new_episode()
+        # Each map begins with the default field of view: the argument `+fov` holds for the first one alone.
+        self._game.send_game_command(f"fov {self._config.field_of_view_deg}")
+        observed = self._act([0, 0], _SETTLING_TICS)
+        wanted, given = self._config.field_of_view_deg, self._game.get_game_variable(GameVariable.CAMERA_FOV)
+        if given != wanted:
+            raise RuntimeError(f"the engine's field of view is {given}, not {wanted} degrees")
+        return observed
 
-    def _info(self) -> dict[str, Any]:
-        return {"pose_xyyaw": self._pose_xyyaw.copy(), "time_s": self._steps * self.period_s}
+    def advance(self, thrust: int, turn_deg: float) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Let a step pass; return the picture (2 height, 2 width, 3) and the pose (3,) at its end."""
+        # The engine turns clockwise for a positive number, and by that number in each tic.
+        return self._act([thrust, -turn_deg / self._config.frame_skip], self._config.frame_skip)
+
+    def _act(self, buttons: list[float], tics: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        assert self._game is not None
+        try:
+            self._game.make_action(buttons, tics)
+        except (vizdoom.ViZDoomErrorException, vizdoom.ViZDoomUnexpectedExitException) as error:
+            self.close()
+            raise RuntimeError(f"the engine has ended: {error}") from error
+        state = self._game.get_state()
+        assert state.game_variables is not None
+        x, y, angle_deg = state.game_variables
+        yaw = math.remainder(math.radians(angle_deg), math.tau)
+        return state.screen_buffer, np.array([x / UNITS_PER_M, y / UNITS_PER_M, yaw])
+
+    def close(self) -> None:
+        """End the process, then delete its files, among them some that it writes at its end."""
+        game, self._game = self._game, None
+        if game is not None:
+            game.close()
+        folder, self._folder = self._folder, None
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def mean_2x2(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average squares of 2x2 pixels, (2 h, 2 w, channels) -> (h, w, channels), rounding halves up."""
+    """The mean of 2 x 2 pixels each, uint8 (2 h, 2 w, channels) to (h, w, channels), halves rounded up."""
     rows = picture[0::2].astype(np.uint16)
     rows += picture[1::2]
     total = rows[:, 0::2] + rows[:, 1::2]
@@ -316,11 +316,11 @@ def _map_name(index: int) -> str:
     return f"M{index:07d}"
 
 
-def _check_int(name: str, value: int, low: int, high: int) -> None:
+def _check_integer(name: str, value: int, low: int, high: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}; allowed: a whole number from {low} to {high}")
+        raise ValueError(f"{name} is {value!r}; it must be an integer from {low} to {high}")
 
 
-def _check_float(name: str, value: float, low: float, high: float) -> None:
+def _check_number(name: str, value: float, low: float, high: float) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}; allowed: a number from {low:g} to {high:g}")
+        raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
