@@ -23,7 +23,11 @@ def revision() -> str:
             ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True
         ).stdout.strip()
         changes = subprocess.run(
-            ["git", "status", "--porcelain", "--untracked-files=no"], cwd=ROOT, check=True, capture_output=True, text=True
+            ["git", "status", "--porcelain", "--untracked-files=no"],
+            cwd=ROOT,
+            check=True,
+            capture_output=True,
+            text=True,
         ).stdout
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
@@ -54,6 +58,20 @@ def make_trainer(run: Path, epochs: int, seed: int, precision: str, **options: A
         num_sanity_val_steps=0,
         **options,
     )
+
+
+def one_cycle(optimizer: torch.optim.Optimizer, trainer: lightning.Trainer) -> dict[str, Any]:
+    """Warm-up over a tenth of the training, then a cosine to zero, in the form that Lightning takes."""
+    steps = int(trainer.estimated_stepping_batches)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer,
+        [group["lr"] for group in optimizer.param_groups],
+        total_steps=steps,
+        pct_start=max(0.1, 2.0 / steps),
+        div_factor=10.0,
+        final_div_factor=100.0,
+    )
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 def resume_from(run: Path) -> str | None:

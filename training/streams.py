@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from ngo_estimator import se2
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from ngo_estimator import se2
 from ngo_sim.drivers import Action
 from ngo_sim.episodes import Episode, record_episode
 from training.worlds import World
@@ -23,7 +23,7 @@ _GROUP = 8
 
 
 def simulate(world: World, seeds: list[int], frames: int) -> Iterator[Episode]:
-    """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one random size (a function of the first seed)."""
+    """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one size, a function of the first seed."""
     env = world.make_random(np.random.default_rng(seeds[0]))
     try:
         if hasattr(env, "preload"):
@@ -174,7 +174,8 @@ class PlaceStream(_Stream):
 def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.ndarray:
     """Pairs of frames ``(pairs, 2)``, earlier first, of one place: near in position and heading, well apart in time.
 
-    A frame later than another by ``min_steps_apart`` forms a pair with it within the world's place radius and heading limit.
+    A frame later than another by ``min_steps_apart`` forms a pair with it within the world's place radius and heading
+    limit.
     """
     xy, yaw = poses_xyyaw[:, :2], poses_xyyaw[:, 2]
     distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1)

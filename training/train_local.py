@@ -2,8 +2,8 @@
 
     python -m training.train_local --world maze2d
 
-Run again, it goes on where it was stopped. It ends with the network's output calibrated on mazes that it has not seen (one
-bias and scale a component, folded into its normalisation) and its weights written into the estimator's package.
+Run again, it goes on where it was stopped. It ends with the network's output calibrated on mazes that it has not seen
+(one bias and scale a component, folded into its normalisation) and its weights written into the estimator's package.
 """
 
 import dataclasses
@@ -15,13 +15,13 @@ import lightning
 import numpy as np
 import torch
 import tyro
-from ngo_estimator import se2
-from ngo_estimator.checkpoint import LOCAL, save_checkpoint
-from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 from torch.utils.data import DataLoader
 
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import LOCAL, save_checkpoint
+from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from training import runs
 from training.streams import Batch, PairStream, images_of, loader, relative_poses, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
@@ -56,7 +56,7 @@ class Arguments:
 
 
 class LocalTraining(lightning.LightningModule):
-    """Smooth-L1 on normalised relative poses, heading weighted, and the likelihood of what the network says of its errors."""
+    """Smooth-L1 on normalised relative poses, and the likelihood of what the network says of its errors."""
 
     HEADING_WEIGHT = 3.0
     LIKELIHOOD_WEIGHT = 0.1
@@ -89,11 +89,7 @@ class LocalTraining(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-4)
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.arguments.learning_rate, total_steps=steps, pct_start=0.1, div_factor=10, final_div_factor=100
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return runs.one_cycle(optimizer, self.trainer)
 
 
 class _Data(lightning.LightningDataModule):
@@ -106,7 +102,8 @@ class _Data(lightning.LightningDataModule):
         assert self.trainer is not None
         a = self.arguments
         return loader(
-            PairStream(self.world, TRAIN_SEEDS, self.trainer.current_epoch, a.datapoints, a.batch_size), a.workers
+            PairStream(self.world, TRAIN_SEEDS, self.trainer.current_epoch, a.datapoints, a.batch_size),
+            a.workers,
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:

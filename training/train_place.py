@@ -12,13 +12,13 @@ from typing import Any
 import lightning
 import torch
 import tyro
-from ngo_estimator import se2
-from ngo_estimator.checkpoint import PLACE, PlaceNetworks, save_checkpoint
-from ngo_estimator.place_encoder import PlaceConfig
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import DataLoader
 
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import PLACE, PlaceNetworks, save_checkpoint
+from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
 from training.streams import Batch, PlaceStream, loader
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
@@ -117,16 +117,15 @@ class PlaceTraining(lightning.LightningModule):
     def validation_step(self, batch: Batch, _: int) -> None:
         figures = self(batch, augment=False)
         self.log_dict(
-            {f"validation_{k}": v for k, v in figures.items()}, on_epoch=True, prog_bar=True, batch_size=len(batch["a"])
+            {f"validation_{k}": v for k, v in figures.items()},
+            on_epoch=True,
+            prog_bar=True,
+            batch_size=len(batch["a"]),
         )
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-3)
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.arguments.learning_rate, total_steps=steps, pct_start=0.1, div_factor=10, final_div_factor=100
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return runs.one_cycle(optimizer, self.trainer)
 
 
 class _Data(lightning.LightningDataModule):

@@ -5,9 +5,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.images import ImageFormat
-
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 
 # A maze is a function of its seed and size: these ranges never meet (tests/unit/training/test_worlds.py).

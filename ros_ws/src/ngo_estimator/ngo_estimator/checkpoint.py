@@ -100,7 +100,9 @@ def load_description(path: Path, kind: str, world: str | None = None) -> dict[st
     try:
         description = json.loads(beside.read_text())
     except OSError as error:
-        raise CheckpointError(f"{beside}: cannot be read ({error.strerror}); expected the description of a {kind}") from error
+        raise CheckpointError(
+            f"{beside}: cannot be read ({error.strerror}); expected the description of a {kind}"
+        ) from error
     except ValueError as error:
         raise CheckpointError(f"{beside}: is not JSON ({error})") from error
     if not isinstance(description, dict) or description.get("format") != FORMAT:
@@ -133,7 +135,9 @@ def load_network(
     except safetensors.SafetensorError as error:
         raise CheckpointError(f"{path}: is damaged or no safetensors file ({error})") from error
     if hashlib.sha256(content).hexdigest() != description.get("sha256"):
-        raise CheckpointError(f"{path}: is not the file that {path.with_suffix('.json').name} describes (sha256 differs)")
+        raise CheckpointError(
+            f"{path}: is not the file that {path.with_suffix('.json').name} describes (sha256 differs)"
+        )
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
@@ -165,7 +169,13 @@ def write_untrained(weights: Path, world: str) -> None:
     std = (0.1, 0.02, 0.05)
     details = {"training": "none: freshly initialised"}
     local = LocalPoseNetwork(
-        LocalPoseConfig(image=image, width=0.125, actions=3, period_s=0.1 if world == "maze2d" else 2 / 35, relative_std=std)
+        LocalPoseConfig(
+            image=image,
+            width=0.125,
+            actions=3,
+            period_s=0.1 if world == "maze2d" else 2 / 35,
+            relative_std=std,
+        )
     )
     place = PlaceNetworks(PlaceConfig(image=image, width=0.125, offset_scale_m=0.5))
     aggregation = PoseAggregationConfig(motion_feature_size=local.config.feature_size, relative_std=std)

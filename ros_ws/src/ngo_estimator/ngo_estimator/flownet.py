@@ -32,7 +32,10 @@ class FlowNetConvolutions(nn.Module):
         layers: list[nn.Module] = []
         for full, kernel, stride in _LAYERS:
             outputs = max(8, 8 * round(full * width / 8))
-            layers += [convolution(channels, outputs, kernel, stride, kernel // 2), nn.LeakyReLU(0.1, inplace=True)]
+            layers += [
+                convolution(channels, outputs, kernel, stride, kernel // 2),
+                nn.LeakyReLU(0.1, inplace=True),
+            ]
             channels = outputs
         self.layers = nn.Sequential(*layers)
         for module in self.layers:

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Depth d (m) enters as DEPTH_NEAR / (DEPTH_SOFTENING + d): near walls, which say most about motion, get most of the range.
+# Depth d (m) enters as DEPTH_NEAR / (DEPTH_SOFTENING + d): near walls, which say most about motion, get most of the
+# range.
 _DEPTH_GAIN_M = 0.6
 _DEPTH_SOFTENING_M = 0.3
 
@@ -26,7 +27,9 @@ class ImageFormat:
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 8:
-            raise ValueError(f"image is {self.height} x {self.width}; expected a height of at least 1 and a width of at least 8")
+            raise ValueError(
+                f"image is {self.height} x {self.width}; expected a height of at least 1 and a width of at least 8"
+            )
         if (self.channels, self.dtype) not in ((3, "uint8"), (4, "float32")):
             raise ValueError(
                 f"image has {self.channels} channels of {self.dtype}; expected 3 of uint8 (colour) or 4 of float32 "

@@ -1,6 +1,7 @@
 """Loop closures: candidates from place codes, their residuals, and the correction that they ask for.
 
-Not in the paper, whose attention has to learn all this. A loop says where a meta-pose lies relative to an earlier frame.
+Not in the paper, whose attention has to learn all this. A loop says where a meta-pose lies relative to an earlier
+frame.
 """
 
 from dataclasses import dataclass
@@ -16,11 +17,12 @@ from ngo_estimator.place_encoder import PairHead
 class Loops:
     """Loop candidates of a batch, ``(batch, loops)`` each.
 
-    ``start`` indexes the global meta-poses with the origin in front: the measurement starts at the pose before meta-step
-    ``start`` and ends at the pose after meta-step ``end``, so the meta-steps ``start .. end`` lie on the loop.
-    ``measured`` ``(batch, loops, 3)`` is the end's pose in the frame of the start, ``log_scale`` ``(batch, loops, 2)``
-    the logarithm of its scale (position in m, heading in rad), ``logit`` the belief that it is the same place,
-    ``similarity`` the inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false for fill.
+    ``start`` indexes the global meta-poses with the origin in front: the measurement starts at the pose before
+    meta-step ``start`` and ends at the pose after meta-step ``end``, so the meta-steps ``start .. end`` lie on the
+    loop. ``measured`` ``(batch, loops, 3)`` is the end's pose in the frame of the start, ``log_scale`` ``(batch,
+    loops, 2)`` the logarithm of its scale (position in m, heading in rad), ``logit`` the belief that it is the same
+    place, ``similarity`` the inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false
+    for fill.
     """
 
     start: Tensor
@@ -79,7 +81,14 @@ def find_loops(
     # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
     start = torch.minimum(start, end)
     return Loops(
-        start, end, frame, se2.compose(frame_in_block, measured), log_scale, logit.clamp(min=-20.0), similarity_kept, valid
+        start,
+        end,
+        frame,
+        se2.compose(frame_in_block, measured),
+        log_scale,
+        logit.clamp(min=-20.0),
+        similarity_kept,
+        valid,
     )
 
 
@@ -123,8 +132,8 @@ def gauss_newton_correction(
 ) -> Tensor:
     """Total correction ``(batch, blocks, 3)`` of the relative meta-poses that best explains all loops at once.
 
-    Minimises ``|y / step_std|^2 + sum information * (residual + J deviation - J y)^2`` in its dual form: the linear system
-    has the size of the loops, not of the trajectory, and a loop of information zero has exactly no effect.
+    Minimises ``|y / step_std|^2 + sum information * (residual + J deviation - J y)^2`` in its dual form: the linear
+    system has the size of the loops, not of the trajectory, and a loop of information zero has exactly no effect.
 
     Args:
         jacobian: ``(batch, loops, 3, blocks, 3)`` of ``loop_jacobian`` at the current poses.

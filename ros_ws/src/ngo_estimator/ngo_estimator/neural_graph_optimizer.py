@@ -30,10 +30,10 @@ from ngo_estimator.pose_aggregation import (
 class NeuralGraphOptimizerConfig:
     """What the optimizer is made of; ``paper_form`` gives the paper's.
 
-    ``iterations`` attend-optimise iterations share their weights. ``attention`` is ``softmax``, or ``sum``, the paper's
-    C / sum(C). With ``loops`` every iteration sees the residuals of the loop candidates under the current poses and takes a
-    step that reduces them. ``dilations`` holds one number a convolution. ``correction_std`` (m, m, rad), the typical error
-    of a relative meta-pose, is the unit of the adjustments.
+    ``iterations`` attend-optimise iterations share their weights. ``attention`` is ``softmax``, or ``sum``, the
+    paper's C / sum(C). With ``loops`` every iteration sees the residuals of the loop candidates under the current
+    poses and takes a step that reduces them. ``dilations`` holds one number a convolution. ``correction_std`` (m, m,
+    rad), the typical error of a relative meta-pose, is the unit of the adjustments.
     """
 
     aggregation: PoseAggregationConfig
@@ -63,7 +63,12 @@ class NeuralGraphOptimizerConfig:
     @classmethod
     def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> "NeuralGraphOptimizerConfig":
         """Nine plain convolutions of kernel 3 over features and attention; nothing but motion features goes in."""
-        form: dict[str, object] = {"attention": "sum", "dilations": (1,) * 9, "skip_connections": False, "loops": False}
+        form: dict[str, object] = {
+            "attention": "sum",
+            "dilations": (1,) * 9,
+            "skip_connections": False,
+            "loops": False,
+        }
         return cls(aggregation=aggregation, **{**form, **changes})  # type: ignore[arg-type]
 
 
@@ -72,9 +77,9 @@ class OptimizedTrajectory:
     """What the optimizer gives for ``(batch, steps)``, on whole blocks of steps.
 
     ``poses`` ``(batch, steps, 3)``: corrected global poses of all frames after the origin. ``meta_relative``: one
-    ``(batch, blocks, 3)`` for each iteration, first to last. ``loops`` with ``loop_weights`` ``(batch, loops)`` of the last
-    iteration, zero to one. ``loop_information`` ``(batch, loops, 3)`` and ``step_std`` ``(batch, blocks, 3)``: the belief in
-    the loops and in the relative meta-poses.
+    ``(batch, blocks, 3)`` for each iteration, first to last. ``loops`` with ``loop_weights`` ``(batch, loops)`` of
+    the last iteration, zero to one. ``loop_information`` ``(batch, loops, 3)`` and ``step_std`` ``(batch, blocks,
+    3)``: the belief in the loops and in the relative meta-poses.
     """
 
     poses: Tensor
@@ -90,7 +95,9 @@ class OptimizedTrajectory:
         loops, information = self.loops, self.loop_information
         if loops is None or information is None:
             none = poses.new_zeros(poses.shape[0], 0, 3)
-            return end_covariance(poses, none[..., None, None].expand(-1, -1, 3, poses.shape[1] - 1, 3), self.step_std, none)
+            return end_covariance(
+                poses, none[..., None, None].expand(-1, -1, 3, poses.shape[1] - 1, 3), self.step_std, none
+            )
         return end_covariance(poses, loop_jacobian(loops, poses), self.step_std, information)
 
 
@@ -174,7 +181,7 @@ class NeuralGraphOptimizer(nn.Module):
             self.loop_gain = nn.Parameter(torch.tensor(0.0))
 
     def attend(self, features: Tensor, place_similarity: Tensor | None) -> Tensor:
-        """Attention weights ``(batch, poses, poses)`` of features ``(batch, poses, width)`` (paper, "Attention Phase")."""
+        """Attention weights ``(batch, poses, poses)`` of features ``(batch, poses, width)`` ("Attention Phase")."""
         queries = self.query(features)
         if self.config.attention == "sum":
             # The paper divides by a sum that can vanish; queries of one sign, like the features, keep it positive.
@@ -220,7 +227,12 @@ class NeuralGraphOptimizer(nn.Module):
             if place_codes is None or pair_head is None:
                 raise ValueError("an optimizer with loops needs place codes and a pair head")
             loops = find_loops(
-                pair_head, place_codes, in_blocks, config.loops_per_pose, config.max_loops, config.min_loop_separation
+                pair_head,
+                place_codes,
+                in_blocks,
+                config.loops_per_pose,
+                config.max_loops,
+                config.min_loop_separation,
             )
             embeddings = pair_head.embed(place_codes[:, config.aggregation.block - 1 :: config.aggregation.block])
             similarity = embeddings @ embeddings.mT

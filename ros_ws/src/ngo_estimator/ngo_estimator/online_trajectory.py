@@ -36,11 +36,12 @@ class RelativeStep:
 class TrajectoryUpdate:
     """The trajectory after a step: ``n`` frames, the first at the origin of ``map``.
 
-    ``stamps_ns`` (n,) int64; ``poses_xyyaw`` (n, 3) corrected, in ``map``; ``odometry_xyyaw`` (n, 3) as the local odometry has
-    it; ``moved_m`` (n,) how far this update moved each pose; ``loops`` (e, 2) frame indices, earlier first, with
-    ``loop_weights`` (e,) of zero to one; ``map_from_odom_xyyaw`` (3,); ``covariance`` (3, 3) of the last pose in ``map``.
-    ``optimized`` says whether this step ran the optimizer, ``restarted`` whether it began a new trajectory, ``gap``
-    whether steps before it were lost and composed from the odometry. The arrays are read-only and stay as they are.
+    ``stamps_ns`` (n,) int64; ``poses_xyyaw`` (n, 3) corrected, in ``map``; ``odometry_xyyaw`` (n, 3) as the local
+    odometry has it; ``moved_m`` (n,) how far this update moved each pose; ``loops`` (e, 2) frame indices, earlier
+    first, with ``loop_weights`` (e,) of zero to one; ``map_from_odom_xyyaw`` (3,); ``covariance`` (3, 3) of the last
+    pose in ``map``. ``optimized`` says whether this step ran the optimizer, ``restarted`` whether it began a new
+    trajectory, ``gap`` whether steps before it were lost and composed from the odometry. The arrays are read-only and
+    stay as they are.
     """
 
     stamps_ns: np.ndarray
@@ -59,9 +60,9 @@ class TrajectoryUpdate:
 class OnlineTrajectory:
     """Keeps the trajectory and re-optimises it whenever a meta-pose is complete.
 
-    Between two meta-poses the newest frames follow the last corrected one by odometry. After ``n`` steps the result is that
-    of ``optimize_offline`` on the first ``n``. Only the last ``window_frames`` are optimised: older poses stay where
-    they were when they left the window.
+    Between two meta-poses the newest frames follow the last corrected one by odometry. After ``n`` steps the result
+    is that of ``optimize_offline`` on the first ``n``. Only the last ``window_frames`` are optimised: older poses
+    stay where they were when they left the window.
     """
 
     def __init__(self, optimizer: NeuralGraphOptimizer, pair_head: PairHead | None, window_frames: int = 2000) -> None:
@@ -75,14 +76,16 @@ class OnlineTrajectory:
 
     @classmethod
     def load(cls, weights: Path, window_frames: int = 2000, world: str | None = None) -> "OnlineTrajectory":
-        """Load the networks in the folder ``weights``; raises ``CheckpointError`` (a ``ValueError``) with one clear line."""
+        """Load the networks in the folder ``weights``; raises ``CheckpointError``, a ``ValueError`` of one clear line."""
         optimizer, description = load_optimizer(weights, world)
         if not optimizer.config.loops:
             return cls(optimizer, None, window_frames)
         place, place_description = load_place(weights, description["world"])
         expected = description.get("place_encoder_sha256", place_description["sha256"])
         if place_description["sha256"] != expected:
-            raise CheckpointError(f"{weights}: the optimizer was trained with another place encoder than the one beside it")
+            raise CheckpointError(
+                f"{weights}: the optimizer was trained with another place encoder than the one beside it"
+            )
         return cls(optimizer, place.pair_head, window_frames)
 
     @property
@@ -116,9 +119,9 @@ class OnlineTrajectory:
     def update(self, step: RelativeStep) -> TrajectoryUpdate:
         """Take the next step and give the whole trajectory.
 
-        A step that begins after the last frame means lost steps: the motion between is composed from the odometry poses. A
-        step of an odometry with another origin begins a new trajectory, for the motion between is unknown; so does
-        one that lies ``RESTART_AFTER_NS`` or more in the past.
+        A step that begins after the last frame means lost steps: the motion between is composed from the odometry
+        poses. A step of an odometry with another origin begins a new trajectory, for the motion between is unknown;
+        so does one that lies ``RESTART_AFTER_NS`` or more in the past.
 
         Raises:
             RejectedStep: values that are not finite or of the wrong size, a stamp that came already, or a little late.
@@ -161,7 +164,9 @@ class OnlineTrajectory:
             if not np.isfinite(value).all():
                 raise RejectedStep(f"{name} has values that are not finite")
         if not (np.diagonal(step.covariance) > 0.0).all():
-            raise RejectedStep(f"covariance has the variances {np.diagonal(step.covariance).tolist()}; expected positive ones")
+            raise RejectedStep(
+                f"covariance has the variances {np.diagonal(step.covariance).tolist()}; expected positive ones"
+            )
         if step.from_stamp_ns >= step.stamp_ns:
             raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")
 
@@ -206,7 +211,10 @@ class OnlineTrajectory:
         result = optimize_offline(
             self._optimizer,
             self._pair_head,
-            *(torch.from_numpy(rows.values[inside]) for rows in (self._relative, self._log_std, self._motion, self._codes)),
+            *(
+                torch.from_numpy(rows.values[inside])
+                for rows in (self._relative, self._log_std, self._motion, self._codes)
+            ),
         )
         before = self._poses.values.copy()
         start = torch.from_numpy(before[self._window_start])
@@ -254,7 +262,7 @@ def optimize_offline(
     motion_features: Tensor,
     place_codes: Tensor,
 ) -> OptimizedTrajectory:
-    """Optimise one trajectory ``(steps, ...)`` whose number of steps is any; frames after the last whole block follow it.
+    """Optimise one trajectory ``(steps, ...)`` of any number of steps; those after the last whole block follow it.
 
     Arguments as in ``NeuralGraphOptimizer.forward``, without the batch. ``poses`` of the result is ``(1, steps, 3)``.
     """

@@ -61,7 +61,11 @@ class PairHead(nn.Module):
         self.embedding = nn.Linear(config.code_size, config.embedding_size)
         hidden = config.pair_hidden_size
         self.layers = nn.Sequential(
-            nn.Linear(3 * config.code_size, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 7)
+            nn.Linear(3 * config.code_size, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, 7),
         )
 
     def embed(self, codes: Tensor) -> Tensor:

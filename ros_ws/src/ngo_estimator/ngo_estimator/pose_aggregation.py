@@ -25,7 +25,9 @@ class PoseAggregationConfig:
         if not 0 <= self.halvings <= 6:
             raise ValueError(f"halvings is {self.halvings}; expected 0 to 6")
         if self.motion_feature_size < 1 or self.width < 1:
-            raise ValueError(f"motion_feature_size, width are {self.motion_feature_size}, {self.width}; expected at least 1")
+            raise ValueError(
+                f"motion_feature_size, width are {self.motion_feature_size}, {self.width}; expected at least 1"
+            )
 
     @property
     def block(self) -> int:

@@ -1,0 +1,114 @@
+"""Compute the optimizer's training data once: odometry, motion features and place codes of whole trajectories.
+
+    python -m training.featurise --world maze2d
+
+Images are far too many to keep (2000 a trajectory): what the local network and the place encoder make of them goes into
+memory-mapped arrays, the features as float16. Run again, it goes on where it was stopped.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+from ngo_estimator.checkpoint import load_local, load_place
+from ngo_sim.episodes import Episode
+from training import runs
+from training.metrics import seen_from_first
+from training.streams import images_of, simulate
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+
+_GROUP = 8  # mazes of one size
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the feature store."""
+
+    world: str
+    """maze2d or maze3d."""
+    trajectories: int = 320
+    """Trajectories for training, each in a maze of its own that the local network has not seen."""
+    validation_trajectories: int = 32
+    """Trajectories of the validation split."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/local_pose_network.safetensors and WORLD/place_encoder.safetensors."""
+    out: Path = runs.ROOT / "runs"
+    """Folder that gets WORLD/features/."""
+    part: int = 0
+    """This process makes the groups of mazes whose number leaves this rest ..."""
+    parts: int = 1
+    """... when divided by this: several processes can share the work."""
+
+
+@torch.inference_mode()
+def features_of(world: World, episode: Episode, weights: Path, networks: tuple | None = None) -> dict[str, np.ndarray]:
+    """What the estimator makes of an episode in ``frames - 1`` steps, and the true poses after each of them."""
+    local, place = networks or (load_local(weights, world.name)[0], load_place(weights, world.name)[0])
+    images = images_of(world, episode)
+    actions = torch.from_numpy(episode.actions).long()
+    parts: list[tuple[torch.Tensor, ...]] = []
+    for chunk in torch.arange(len(actions)).split(256):
+        relative, log_std, motion = local(images[chunk], images[chunk + 1], actions[chunk])
+        parts.append((relative, log_std, motion, place.encoder(images[chunk + 1])))
+    relative, log_std, motion, codes = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
+    return {
+        "relative": relative,
+        "log_std": log_std,
+        "motion": motion.astype(np.float16),
+        "codes": codes.astype(np.float16),
+        "truth": seen_from_first(episode.poses_xyyaw)[1:],
+    }
+
+
+def _groups(seeds: list[int], part: int, parts: int) -> Iterator[tuple[int, list[int]]]:
+    for number, first in enumerate(range(0, len(seeds), _GROUP)):
+        if number % parts == part:
+            yield first, seeds[first : first + _GROUP]
+
+
+def main(arguments: Arguments) -> None:
+    """Make the arrays ``WORLD/features/{train,validation}/NAME.npy`` of shape ``(trajectories, steps, ...)``."""
+    world = world_named(arguments.world)
+    folder = arguments.weights / world.name
+    networks = (load_local(folder, world.name)[0], load_place(folder, world.name)[0])
+    splits = {
+        "train": list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories]),
+        "validation": list(VALIDATION_SEEDS[-arguments.validation_trajectories :]),
+    }
+    for split, seeds in splits.items():
+        store = arguments.out / world.name / "features" / split
+        store.mkdir(parents=True, exist_ok=True)
+        progress = store / f"done.{arguments.part}of{arguments.parts}.json"
+        done = set(json.loads(progress.read_text())) if progress.exists() else set()
+        bar = tqdm(
+            desc=f"{world.name} {split}",
+            total=len(range(arguments.part, -(-len(seeds) // _GROUP), arguments.parts)),
+        )
+        for first, group in _groups(seeds, arguments.part, arguments.parts):
+            if first not in done:
+                for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1)):
+                    for name, value in features_of(world, episode, folder, networks).items():
+                        _array(store / f"{name}.npy", (len(seeds), *value.shape), value.dtype)[first + offset] = value
+                done.add(first)
+                progress.write_text(json.dumps(sorted(done)))
+            bar.update()
+        bar.close()
+
+
+def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
+    if not path.exists():
+        np.lib.format.open_memmap(path, "w+", dtype, shape).flush()
+    array: np.memmap = np.load(path, mmap_mode="r+")
+    if array.shape != shape:
+        raise ValueError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")
+    return array
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
