@@ -82,7 +82,7 @@ def cpu_s() -> float:
     ticks = 0
     for children in Path("/proc/self/task").glob("*/children"):
         for child in children.read_text().split():
-            # The name in parentheses may hold spaces; user and system time are the 12th and 13th field after it.
+            # The name in parentheses may hold spaces; user and system time are fields 12 and 13 after it.
             fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
             ticks += int(fields[11]) + int(fields[12])
     return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")

@@ -72,6 +72,7 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    observation_space: gymnasium.spaces.Box[np.float32]
 
     def __init__(self, config: Maze2DConfig | None = None, render_mode: str | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
