@@ -14,7 +14,7 @@ TYPED := ros_ws/src/ngo_sim/ngo_sim ros_ws/src/ngo_estimator/ngo_estimator tools
 
 OPEN := . ./env.sh
 
-.PHONY: help venv build demo test lint format clean
+.PHONY: help venv build demo train test lint format clean
 .DEFAULT_GOAL := help
 # One step at a time, and nothing printed after the demo's last line.
 .NOTPARALLEL:
@@ -31,6 +31,10 @@ build: venv ## the workspace, with colcon
 
 demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000
 	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
+
+train: build ## every network of a world, from simulated data, into the estimator's package: WORLD=maze3d|maze2d
+	@$(OPEN) && for script in train_local train_place featurise train_optimizer evaluate; do \
+		python -m training.$$script --world $(WORLD) || exit; done
 
 test: build ## every test below tests/: ARGS='-k name' passes on to pytest
 	@$(OPEN) && exec python -m pytest tests $(ARGS)

@@ -35,7 +35,7 @@ class Arguments:
     """maze2d or maze3d."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
-    epochs: int = 12
+    epochs: int = 8
     """Passes of new data."""
     datapoints: int = 200_000
     """Frame pairs in an epoch."""

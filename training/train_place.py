@@ -32,7 +32,7 @@ class Arguments:
     """maze2d or maze3d."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
-    epochs: int = 12
+    epochs: int = 10
     """Passes of new data."""
     batches: int = 256
     """Steps of the optimiser in an epoch."""

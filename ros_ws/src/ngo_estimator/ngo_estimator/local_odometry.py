@@ -63,7 +63,7 @@ class LocalOdometry:
 
     @classmethod
     def load(cls, weights: Path, world: str | None = None) -> "LocalOdometry":
-        """Load the networks in the folder ``weights``; raises ``CheckpointError``, a ``ValueError`` of one clear line."""
+        """Load the networks in the folder ``weights``; raises ``CheckpointError``, of one clear line."""
         network, description = load_local(weights, world)
         place, place_description = load_place(weights, description["world"])
         if place.config.image != network.config.image:

@@ -76,7 +76,7 @@ class OnlineTrajectory:
 
     @classmethod
     def load(cls, weights: Path, window_frames: int = 2000, world: str | None = None) -> "OnlineTrajectory":
-        """Load the networks in the folder ``weights``; raises ``CheckpointError``, a ``ValueError`` of one clear line."""
+        """Load the networks in the folder ``weights``; raises ``CheckpointError``, of one clear line."""
         optimizer, description = load_optimizer(weights, world)
         if not optimizer.config.loops:
             return cls(optimizer, None, window_frames)
