@@ -10,9 +10,10 @@ from ngo_sim.drivers import Action
 class ExternalActions:
     """The actions that come from outside, and when they count.
 
-    From a command until timeout_s after it the outside is in charge. At a steady pace the newest command is held: it is applied
-    to every step until a newer one comes. Without a pace (rate 0, time has no meaning) each command is applied to exactly one
-    step, in order, and the simulator waits for the next one, so that whoever answers every image drives alone.
+    From a command until timeout_s after it the outside is in charge. At a steady pace the newest command is held: it
+    is applied to every step until a newer one comes. Without a pace (rate 0, time has no meaning) each command is
+    applied to exactly one step, in order, and the simulator waits for the next one, so that whoever answers every
+    image drives alone.
     """
 
     def __init__(self) -> None:
@@ -22,7 +23,9 @@ class ExternalActions:
     def command(self, action: int, now_s: float) -> None:
         """Somebody sent an action; ValueError where there is no such action."""
         if action not in tuple(Action):
-            raise ValueError(f"action is {action}; allowed: " + ", ".join(f"{int(a)} ({a.name.lower()})" for a in Action))
+            raise ValueError(
+                f"action is {action}; allowed: " + ", ".join(f"{int(a)} ({a.name.lower()})" for a in Action)
+            )
         self._commands.append(Action(action))
         self._last_s = now_s
 
@@ -32,6 +35,10 @@ class ExternalActions:
             self._commands.clear()
             self._last_s = None
         return self._last_s is not None
+
+    def pending(self) -> bool:
+        """Whether a command waits for its step."""
+        return bool(self._commands)
 
     def next_action(self, hold: bool) -> Action | None:
         """The action for the next step, None where there is none yet. hold keeps the newest, else each is used once."""

@@ -1,4 +1,4 @@
-"""Keeps a simulator from running ahead of those who take its frames, and keeps its pace. No clock of its own, no ROS."""
+"""Keeps a simulator from running ahead of those who take its frames, and keeps its pace: without a clock or ROS."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Iterable
 class FlowControl:
     """Counts the frames that each consumer still has in hand, from the stamps of what the consumers publish.
 
-    A consumer is a topic. Its newest stamp says which frame it has finished, so frames that it skips are finished as well. A
-    consumer of motion has nothing to say about its first frame: until its first answer, one frame is not counted. Consumers
-    come and go while the simulator runs; a new one starts with nothing in hand.
+    A consumer is a topic. Its newest stamp says which frame it has finished, so frames that it skips are finished as
+    well. A consumer of motion has nothing to say about its first frame: until its first answer, one frame is not
+    counted. Consumers come and go while the simulator runs; a new one starts with nothing in hand.
 
     Raises ValueError where max_in_flight is below 1.
     """
@@ -51,7 +51,7 @@ class FlowControl:
         self._forget_finished()
 
     def seen(self, topic: str, stamp_ns: int) -> None:
-        """A consumer published this stamp on its topic; stamps that no frame has reached yet are of another run, and ignored."""
+        """A consumer published this stamp; one that no frame has reached yet is of another run, and ignored."""
         if topic in self._finished and self._finished[topic] < stamp_ns <= self._last_published:
             self._finished[topic] = stamp_ns
             self._answered.add(topic)
@@ -60,8 +60,10 @@ class FlowControl:
     def in_flight(self) -> int:
         """Frames that the slowest consumer has in hand."""
         stamps = list(self._stamps)
-        counts = [len(stamps) - bisect_right(stamps, stamp) - (topic not in self._answered)
-                  for topic, stamp in self._finished.items()]
+        counts = [
+            len(stamps) - bisect_right(stamps, stamp) - (topic not in self._answered)
+            for topic, stamp in self._finished.items()
+        ]
         return max([0, *counts])
 
     def may_publish(self) -> bool:
@@ -85,7 +87,7 @@ class FlowControl:
 
 
 class Pacer:
-    """Says when the next frame of an even pace is due. A frame that is more than a period late shifts those behind it."""
+    """Says when the next frame of an even pace is due; one that is over a period late shifts those behind it."""
 
     def __init__(self) -> None:
         self._due_s: float | None = None
@@ -107,6 +109,8 @@ def header_stamp_ns(cdr: bytes) -> int:
     Raises ValueError where the bytes are no CDR message of that length.
     """
     if len(cdr) < 12 or cdr[1] not in (0, 1):
-        raise ValueError(f"cdr has {len(cdr)} bytes that begin with {bytes(cdr[:4])!r}; expected a CDR message with a header")
+        raise ValueError(
+            f"cdr has {len(cdr)} bytes that begin with {bytes(cdr[:4])!r}; expected a CDR message with a header"
+        )
     seconds, nanoseconds = struct.unpack_from("<iI" if cdr[1] == 1 else ">iI", cdr, 4)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -37,9 +37,9 @@ class World(Protocol):
 class Frame:
     """What the robot sees at one moment and where it then is.
 
-    index: number of the frame, from 0. observation: of the world's shape and type. pose_xyyaw: float64 (3,) in the maze's
-    frame. twist_xyyaw: float64 (3,), the constant velocity in the robot's own frame (m/s, m/s, rad/s) that leads from the
-    previous frame to this one; zero in frame 0, where the robot rests.
+    index: number of the frame, from 0. observation: of the world's shape and type. pose_xyyaw: float64 (3,) in the
+    maze's frame. twist_xyyaw: float64 (3,), the constant velocity in the robot's own frame (m/s, m/s, rad/s) that
+    leads from the previous frame to this one; zero in frame 0, where the robot rests.
     """
 
     index: int
@@ -49,13 +49,15 @@ class Frame:
 
 
 class Simulation:
-    """Frame after frame of one seed. driver is a name for make_driver, or "none": then only actions from outside move it."""
+    """Frame after frame of one seed; driver is a name for make_driver, or "none": only actions from outside move it."""
 
     def __init__(self, world: World, seed: int, driver: str) -> None:
         self.world = world
         self.external = ExternalActions()
         observation, info = world.reset(seed=seed)
-        self._driver: Driver | None = None if driver == "none" else make_driver(driver, world.maze, driver_generator(seed))
+        self._driver: Driver | None = (
+            None if driver == "none" else make_driver(driver, world.maze, driver_generator(seed))
+        )
         self.frame = Frame(0, observation, info["pose_xyyaw"], np.zeros(3))
 
     def choose_action(self, now_s: float, timeout_s: float, hold: bool) -> Action | None:
@@ -82,8 +84,9 @@ class Simulation:
         return self.frame
 
 
-def body_twist(from_xyyaw: npt.NDArray[np.float64], to_xyyaw: npt.NDArray[np.float64],
-               period_s: float) -> npt.NDArray[np.float64]:
+def body_twist(
+    from_xyyaw: npt.NDArray[np.float64], to_xyyaw: npt.NDArray[np.float64], period_s: float
+) -> npt.NDArray[np.float64]:
     """float64 (3,): the constant velocity in the moving frame (m/s, m/s, rad/s) that leads from one pose to the other.
 
     The logarithm of the relative pose over the time; the turn must be below half a revolution.

@@ -11,11 +11,20 @@ from typing import Any
 from ngo_sim.drivers import DRIVER_NAMES
 
 
-def _setting(default: Any, text: str, low: float | None = None, high: float | None = None, *, changeable: bool = False,
-             choices: tuple[str, ...] = ()) -> Any:
+def _setting(
+    default: Any,
+    text: str,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    changeable: bool = False,
+    choices: tuple[str, ...] = (),
+) -> Any:
     """A field with its description and what is allowed, for the validation below and for ROS parameter descriptors."""
-    return field(default=default, metadata={"description": text, "low": low, "high": high, "changeable": changeable,
-                                            "choices": choices})
+    return field(
+        default=default,
+        metadata={"description": text, "low": low, "high": high, "changeable": changeable, "choices": choices},
+    )
 
 
 @dataclass(frozen=True)
@@ -26,27 +35,51 @@ class SimulatorConfig:
     """
 
     seed: int = _setting(0, "Maze, textures, start, noise and driver are functions of this number.", 0, 2**31 - 1)
-    rate: float = _setting(10.0, "Frames a second of wall time; 0: as fast as the subscribers take them, none lost.",
-                           0.0, 10_000.0, changeable=True)
-    driver: str = _setting("corners", "Who chooses the actions: paths to the corners, paths to random goals, chance, or "
-                                      "nobody but action_command.", choices=(*DRIVER_NAMES, "none"))
+    rate: float = _setting(
+        10.0,
+        "Frames a second of wall time; 0: as fast as the subscribers take them, none lost.",
+        0.0,
+        10_000.0,
+        changeable=True,
+    )
+    driver: str = _setting(
+        "corners",
+        "Who chooses the actions: paths to the corners, paths to random goals, chance, or nobody but action_command.",
+        choices=(*DRIVER_NAMES, "none"),
+    )
     frames: int = _setting(0, "Frames to publish before the node ends with exit code 0; 0: endless.", 0, 2**31 - 1)
     wait_for_subscribers: int = _setting(0, "Subscribers that the image must have before frame 0 is published.", 0, 100)
-    wait_for_flow_control: bool = _setting(False, "Wait before frame 0 until each of flow_control_topics has a publisher.")
+    wait_for_flow_control: bool = _setting(
+        False, "Wait before frame 0 until each of flow_control_topics has a publisher."
+    )
     flow_control_topics: tuple[str, ...] = _setting(
-        ("odom", "ngo/pose"), "Stamped topics of those who take the frames; at rate 0 the simulator stays at most "
-                              "max_in_flight frames ahead of the slowest of them that has a publisher.")
+        ("odom", "ngo/pose"),
+        "Stamped topics of those who take the frames; at rate 0 the simulator stays at most "
+        "max_in_flight frames ahead of the slowest of them that has a publisher.",
+    )
     max_in_flight: int = _setting(4, "Frames at rate 0 that the slowest flow control topic may be behind.", 1, 1000)
-    stall_timeout_s: float = _setting(10.0, "Wall time at rate 0 without any answer on a flow control topic after which "
-                                            "its frames count as lost and the simulator goes on; 0: wait for ever.",
-                                      0.0, 3600.0)
-    action_timeout_s: float = _setting(0.5, "Wall time after the last action_command after which the driver takes over "
-                                            "again.", 0.0, 3600.0, changeable=True)
-    start_time_s: float = _setting(1.0, "Stamp of frame 0 in simulated time; frame k has start_time_s + k period_s.",
-                                   0.001, 2e9)
+    stall_timeout_s: float = _setting(
+        10.0,
+        "Wall time at rate 0 without any answer on a flow control topic after which "
+        "its frames count as lost and the simulator goes on; 0: wait for ever.",
+        0.0,
+        3600.0,
+    )
+    action_timeout_s: float = _setting(
+        0.5,
+        "Wall time after the last action_command after which the driver takes over again.",
+        0.0,
+        3600.0,
+        changeable=True,
+    )
+    start_time_s: float = _setting(
+        1.0, "Stamp of frame 0 in simulated time; frame k has start_time_s + k period_s.", 0.001, 2e9
+    )
     use_wall_stamps: bool = _setting(False, "Stamp every frame with the wall clock instead of simulated time.")
     publish_clock: bool = _setting(False, "Publish /clock with the stamp of every frame; not with use_wall_stamps.")
-    ground_truth_frame: str = _setting("map", "Frame of the ground truth: origin at the maze's corner, x along columns.")
+    ground_truth_frame: str = _setting(
+        "map", "Frame of the ground truth: origin at the maze's corner, x along columns."
+    )
     base_frame: str = _setting("base_link", "Frame that moves: child of the ground truth, frame of actions and scan.")
     camera_frame: str = _setting("base_link", "Frame of the image and of camera_info.")
 
@@ -54,7 +87,9 @@ class SimulatorConfig:
         for item in dataclasses.fields(self):
             _check(item.name, getattr(self, item.name), item.default, item.metadata)
         if self.publish_clock and self.use_wall_stamps:
-            raise ValueError("publish_clock is True; allowed: False together with use_wall_stamps, which has no simulated time")
+            raise ValueError(
+                "publish_clock is True; allowed: False together with use_wall_stamps, which has no simulated time"
+            )
 
     def stamp_ns(self, frame: int, period_s: float) -> int:
         """Simulated time of a frame, computed from its number so that rounding never adds up."""
@@ -90,7 +125,7 @@ def allowed_values(default: Any, metadata: Any) -> str:
 
 
 def field_descriptions(config_type: type) -> dict[str, str]:
-    """What each field of a config dataclass means: its metadata, its line in the docstring, or its comment in the source.
+    """What each field of a config means: its metadata, its line in the docstring, or its comment in the source.
 
     A field that is described nowhere raises a ValueError: a parameter without a description is a mistake.
     """
@@ -102,8 +137,10 @@ def field_descriptions(config_type: type) -> dict[str, str]:
             match = re.search(rf"^( *){item.name}: (.+(?:\n\1 +\S.*)*)", doc, re.MULTILINE)
             match = match or re.search(rf"^( +){item.name}: .*?  # (.+)$", source, re.MULTILINE)
             if match is None:
-                raise ValueError(f"{config_type.__name__}.{item.name} is described nowhere; expected a line "
-                                 f"`{item.name}: ...` in the docstring or a comment behind the field")
+                raise ValueError(
+                    f"{config_type.__name__}.{item.name} is described nowhere; expected a line "
+                    f"`{item.name}: ...` in the docstring or a comment behind the field"
+                )
             text = " ".join(match.group(2).split())
         described[item.name] = text[0].upper() + text[1:].rstrip(".") + "."
     return described

@@ -1,30 +1,30 @@
-"""Those who take a simulator's frames, as the topics they answer on: found in the graph, heard by their stamps alone."""
+"""Those who take a simulator's frames, as the topics that they answer on, heard by their stamps alone."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
 
-from ngo_sim.flow_control import FlowControl, header_stamp_ns
-from ngo_sim.nodes.parameters import BadParameter
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
+
+from ngo_sim.flow_control import FlowControl, header_stamp_ns
+from ngo_sim.nodes.parameters import BadParameter
 
 
 class Consumers:
     """Feeds a FlowControl from topics of any stamped type. Call look() now and then: consumers come and go.
 
-    Messages are never deserialised: the stamp is read from the bytes of the header. Raises BadParameter for a topic name that
-    ROS does not allow.
+    Messages are never deserialised: the stamp is read from the bytes of the header. Raises BadParameter for a topic
+    name that ROS does not allow.
     """
 
     def __init__(self, node: Node, topics: Sequence[str], flow: FlowControl) -> None:
         for topic in topics:
             try:
                 node.resolve_topic_name(topic)
-            except (InvalidTopicNameException, ValueError) as error:
+            except (RuntimeError, ValueError) as error:
                 reason = " ".join(str(error).split())
                 raise BadParameter(f"flow_control_topics has {topic!r}; allowed: names of topics ({reason})") from None
         self._node = node
@@ -42,8 +42,9 @@ class Consumers:
             publishers = self._node.get_publishers_info_by_topic(topic)
             if not publishers or topic in self._unstamped:
                 continue
-            if topic not in self._subscriptions and not self._listen(topic, publishers[0].topic_type,
-                                                                     publishers[0].qos_profile.reliability):
+            if topic not in self._subscriptions and not self._listen(
+                topic, publishers[0].topic_type, publishers[0].qos_profile.reliability
+            ):
                 continue
             present.add(topic)
         self._flow.set_topics(present)
@@ -71,8 +72,10 @@ class Consumers:
             self._answers, self._progress_s = 0, now_s
         if stall_timeout_s == 0.0 or now_s - self._progress_s < stall_timeout_s:
             return False
-        self._node.get_logger().warning(f"no answer on {', '.join(self._flow.waiting_for())} for {stall_timeout_s:g} s: "
-                                        f"counting {self._flow.in_flight()} frames as lost and going on")
+        self._node.get_logger().warning(
+            f"no answer on {', '.join(self._flow.waiting_for())} for {stall_timeout_s:g} s: "
+            f"counting {self._flow.in_flight()} frames as lost and going on"
+        )
         self._flow.give_up()
         return True
 
@@ -85,15 +88,18 @@ class Consumers:
             first_field = None
         if first_field != "std_msgs/Header":
             self._unstamped.add(topic)
-            self._node.get_logger().warning(f"{topic} of type {type_name} has no stamp that can be read: "
-                                            "it takes no part in flow control")
+            self._node.get_logger().warning(
+                f"{topic} of type {type_name} has no stamp that can be read: it takes no part in flow control"
+            )
             return False
         self._subscriptions[topic] = self._node.create_subscription(
-            message_type, topic, self._heard(topic), QoSProfile(depth=100, reliability=reliability), raw=True)
+            message_type, topic, self._heard(topic), QoSProfile(depth=100, reliability=reliability), raw=True
+        )
         return True
 
     def _heard(self, topic: str) -> Callable[[bytes], None]:
         def heard(cdr: bytes) -> None:
             self._answers += 1
             self._flow.seen(topic, header_stamp_ns(cdr))
+
         return heard

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import array
+import math
 import sys
 
 from builtin_interfaces.msg import Time
-from ngo_sim.maze2d import Maze2D, Maze2DConfig
-from ngo_sim.nodes.simulator_node import SimulatorNode, run_simulator
-from ngo_sim.simulation import Frame, World
 from sensor_msgs.msg import Image, LaserScan
+
+from ngo_sim.maze2d import Maze2D, Maze2DConfig
+from ngo_sim.nodes.process import run_simulator
+from ngo_sim.nodes.simulator_node import SimulatorNode
+from ngo_sim.simulation import Frame, World
 
 
 class Maze2DNode(SimulatorNode):
     """Publishes `image` (32FC4, one row: red, green, blue in [0, 1] and depth in m, leftmost ray first) and `scan`.
 
-    A LaserScan runs counter-clockwise, so its index 0 is the rightmost ray. There is no camera_info: 300 degrees are no pinhole
-    camera, and the scan's angle_min and angle_increment say where every column looks.
+    A LaserScan runs counter-clockwise, so its index 0 is the rightmost ray. There is no camera_info: 300 degrees are
+    no pinhole camera, and the scan's angle_min and angle_increment say where every column looks.
     """
 
     world_config_type = Maze2DConfig
@@ -24,8 +27,8 @@ class Maze2DNode(SimulatorNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.image_publisher = self.create_publisher(Image, "image", self.qos)
         self._scan = self.create_publisher(LaserScan, "scan", self.qos)
+        self.image_publisher = self.create_publisher(Image, "image", self.qos)
 
     def make_world(self) -> World:
         """The world of the parameters."""
@@ -35,14 +38,20 @@ class Maze2DNode(SimulatorNode):
     def publish_sensors(self, frame: Frame, stamp: Time) -> None:
         """Publish the scan and the image of a frame."""
         angles = self._world.ray_angles_rad
-        scan = LaserScan(angle_min=angles[-1], angle_max=angles[0], angle_increment=angles[0] - angles[1],
-                         scan_time=self._world.period_s, range_max=float(self._world.observation_space.high[0, 3]))
+        scan = LaserScan(
+            angle_min=angles[-1],
+            angle_max=angles[0],
+            angle_increment=angles[0] - angles[1],
+            scan_time=self._world.period_s,
+            range_max=math.hypot(*self._world.maze.size_m),
+        )
         scan.header.stamp, scan.header.frame_id = stamp, self.config.base_frame
         scan.ranges = array.array("f", frame.observation[::-1, 3].tobytes())
         self._scan.publish(scan)
         rays, channels = frame.observation.shape
-        image = Image(height=1, width=rays, encoding="32FC4", step=rays * channels * 4,
-                      is_bigendian=sys.byteorder == "big")
+        image = Image(
+            height=1, width=rays, encoding="32FC4", step=rays * channels * 4, is_bigendian=sys.byteorder == "big"
+        )
         image.header.stamp, image.header.frame_id = stamp, self.config.camera_frame
         image.data = array.array("B", frame.observation.tobytes())
         self.image_publisher.publish(image)

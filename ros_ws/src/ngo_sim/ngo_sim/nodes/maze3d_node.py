@@ -6,10 +6,12 @@ import array
 import sys
 
 from builtin_interfaces.msg import Time
-from ngo_sim.maze3d import Maze3D, Maze3DConfig
-from ngo_sim.nodes.simulator_node import SimulatorNode, run_simulator
-from ngo_sim.simulation import Frame, World
 from sensor_msgs.msg import CameraInfo, Image
+
+from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from ngo_sim.nodes.process import run_simulator
+from ngo_sim.nodes.simulator_node import SimulatorNode
+from ngo_sim.simulation import Frame, World
 
 
 class Maze3DNode(SimulatorNode):
@@ -19,21 +21,25 @@ class Maze3DNode(SimulatorNode):
     """
 
     world_config_type = Maze3DConfig
-    defaults = {"rate": 17.5, "camera_frame": "camera_optical_frame"}
+    defaults = {"rate": 17.5, "driver": "random_goals", "camera_frame": "camera_optical_frame"}
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.image_publisher = self.create_publisher(Image, "image", self.qos)
         self._camera_info = self.create_publisher(CameraInfo, "camera_info", self.qos)
+        self.image_publisher = self.create_publisher(Image, "image", self.qos)
         config: Maze3DConfig = self.world_config
         focal_x, focal_y = config.focal_lengths_px
         # The middle of the picture, where the centre of pixel 0 is 0.
         center_x, center_y = (config.width - 1) / 2, (config.height - 1) / 2
         self._camera = CameraInfo(
-            width=config.width, height=config.height, distortion_model="plumb_bob", d=[0.0] * 5,
+            width=config.width,
+            height=config.height,
+            distortion_model="plumb_bob",
+            d=[0.0] * 5,
             k=[focal_x, 0.0, center_x, 0.0, focal_y, center_y, 0.0, 0.0, 1.0],
             r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-            p=[focal_x, 0.0, center_x, 0.0, 0.0, focal_y, center_y, 0.0, 0.0, 0.0, 1.0, 0.0])
+            p=[focal_x, 0.0, center_x, 0.0, 0.0, focal_y, center_y, 0.0, 0.0, 0.0, 1.0, 0.0],
+        )
 
     def make_world(self) -> World:
         """The world of the parameters."""

@@ -6,10 +6,11 @@ import dataclasses
 import difflib
 from typing import Any, TypeVar
 
-from ngo_sim.simulator_config import field_descriptions
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+
+from ngo_sim.simulator_config import field_descriptions
 
 # Every rclpy node declares these two by itself.
 _OWN_TO_ROS = ("use_sim_time", "start_type_description_service")
@@ -23,17 +24,13 @@ class BadParameter(ValueError):
 
 
 class ConfigParameters:
-    """The parameters of a node that was made with automatically_declare_parameters_from_overrides=True.
-
-    That way the node holds exactly what was given in arguments and files, known or not.
-    """
+    """The parameters of a node, declared from config dataclasses, with every parameter that was given accounted for."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        names = [name for name in node.list_parameters([], 0).names if name not in _OWN_TO_ROS]
-        self._given = {name: node.get_parameter(name).value for name in names}
-        for name in names:
-            node.undeclare_parameter(name)
+        # What was given in arguments and files, declared or not: rclpy shows this nowhere else.
+        given = {name: parameter.value for name, parameter in node.handle.get_parameters(Parameter).items()}
+        self._given = {name: value for name, value in given.items() if name not in _OWN_TO_ROS}
         self._known: list[str] = []
 
     def declare(self, config_type: type[Config], **defaults: Any) -> Config:
@@ -54,9 +51,14 @@ class ConfigParameters:
         except ValueError as error:
             raise BadParameter(str(error)) from None
         for field in fields:
-            value = values[field.name]
-            self._node.declare_parameter(field.name, list(value) if isinstance(value, tuple) else value,
-                                         _descriptor(field, descriptions[field.name]), ignore_override=True)
+            value = list(values[field.name]) if isinstance(values[field.name], tuple) else values[field.name]
+            # ROS has no empty list: neither in files nor in values, where it would take it for a list of bytes.
+            self._node.declare_parameter(
+                field.name,
+                Parameter.Type.STRING_ARRAY if value == [] else value,
+                _descriptor(field, descriptions[field.name]),
+                ignore_override=True,
+            )
         return config
 
     def finish(self) -> None:
@@ -78,8 +80,10 @@ def changed(config: Config, parameters: list[Parameter]) -> tuple[Config, SetPar
 
 
 def _converted(name: str, value: Any, default: Any) -> Any:
-    """The value as the type of the default; `10` for a float and `[]` for a list of strings lose nothing."""
+    """The value as the type of the default: `10` is a float, too, and an empty list comes from ROS as None."""
     kind = type(default)
+    if kind is tuple and value is None:
+        return ()
     if kind is float and type(value) is int:
         return float(value)
     if kind is tuple and isinstance(value, (list, tuple)) and all(isinstance(item, str) for item in value):
@@ -94,8 +98,10 @@ def _descriptor(field: dataclasses.Field[Any], description: str) -> ParameterDes
     descriptor = ParameterDescriptor(description=description, read_only=not field.metadata.get("changeable", False))
     if choices := field.metadata.get("choices"):
         descriptor.additional_constraints = "one of " + ", ".join(choices)
-    if low is not None and isinstance(field.default, float):
+    if low is None or high is None:
+        return descriptor
+    if isinstance(field.default, float):
         descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
-    elif low is not None:
+    else:
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return descriptor

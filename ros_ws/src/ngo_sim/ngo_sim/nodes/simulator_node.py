@@ -2,43 +2,46 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from abc import abstractmethod
 from typing import Any, ClassVar
 
-import rclpy
 import rclpy.signals
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
-from ngo_sim.flow_control import FlowControl, Pacer
-from ngo_sim.nodes.consumers import Consumers
-from ngo_sim.nodes.parameters import BadParameter, ConfigParameters, changed
-from ngo_sim.simulation import Frame, Simulation, World, yaw_quaternion_zw
-from ngo_sim.simulator_config import SimulatorConfig
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
+from ngo_sim.flow_control import FlowControl, Pacer
+from ngo_sim.nodes.consumers import Consumers
+from ngo_sim.nodes.parameters import BadParameter, ConfigParameters, changed
+from ngo_sim.simulation import Frame, Simulation, World, yaw_quaternion_zw
+from ngo_sim.simulator_config import SimulatorConfig
+
 _LOOK_AT_GRAPH_S = 0.1
 _IDLE_S = 0.05
 
 
 class SimulatorNode(Node):
-    """Publishes the frames of one world. A subclass names the configs, makes the world and publishes what the robot sees."""
+    """Publishes the frames of one world; a subclass makes the world and publishes what the robot sees."""
 
     world_config_type: ClassVar[type]
     defaults: ClassVar[dict[str, Any]] = {}
     image_publisher: Publisher  # its subscribers are those that wait_for_subscribers counts
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        try:
+            super().__init__(name)
+        except InvalidParameterTypeException as error:  # of one of those that every node declares by itself
+            raise BadParameter(str(error)) from None
         parameters = ConfigParameters(self)
         self.config = parameters.declare(SimulatorConfig, **self.defaults)
         self.world_config: Any = parameters.declare(self.world_config_type)
@@ -60,6 +63,11 @@ class SimulatorNode(Node):
         self._looked_s = 0.0
         self._stamp = Time()
 
+    def destroy_node(self) -> None:
+        """End the world, too."""
+        self.simulation.world.close()
+        super().destroy_node()
+
     @abstractmethod
     def make_world(self) -> World:
         """The world of world_config; the seed comes with its reset. Raises ValueError for a config that cannot be."""
@@ -69,7 +77,7 @@ class SimulatorNode(Node):
         """Publish what the robot sees."""
 
     def run(self) -> None:
-        """Publish frames until there are enough of them and all are taken. Raises ExternalShutdownException when told to end."""
+        """Publish frames until there are enough and all are taken; ExternalShutdownException ends it earlier."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         while True:
@@ -92,7 +100,8 @@ class SimulatorNode(Node):
         config = self.config
         if self._published == 0:
             awaited = self.image_publisher.get_subscription_count() < config.wait_for_subscribers or (
-                config.wait_for_flow_control and not self._consumers.complete())
+                config.wait_for_flow_control and not self._consumers.complete()
+            )
             return _IDLE_S if awaited else 0.0
         if not self.simulation.ready(now_s, config.action_timeout_s, hold=config.rate > 0):
             return _IDLE_S
@@ -140,27 +149,3 @@ class SimulatorNode(Node):
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         self.config, result = changed(self.config, parameters)
         return result
-
-
-def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | None = None) -> int:
-    """Run a simulator node until it has published its frames or is told to end; return the exit code."""
-    node = None
-    try:
-        rclpy.init(args=args)
-        node = node_type(name)
-        node.run()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except BadParameter as error:
-        print(f"{name}: bad parameter: {error}", file=sys.stderr)
-        return 2
-    except Exception:
-        # A signal invalidates the context at once, and whatever ROS call comes next fails for that reason alone.
-        if node is None or rclpy.ok():
-            raise
-    finally:
-        if node is not None:
-            node.simulation.world.close()
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0

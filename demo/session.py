@@ -1,0 +1,193 @@
+"""One run of the graph: start the three nodes, record until every frame is through, end them, evaluate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Pose
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.serialization import deserialize_message
+
+from demo.graph import Graph, GraphError, NodeSpec
+from demo.picture import save_picture
+from demo.recording import Recorder, StampTimes
+from demo.trajectories import Poses, evaluate, match
+from ngo_estimator.trajectory_file import write_tum
+from ngo_sim.flow_control import header_stamp_ns
+from ngo_sim.mazes import Maze
+
+START_TIMEOUT_S = 90.0
+SILENCE_TIMEOUT_S = 60.0
+"""How long nothing at all may come through before a run counts as stuck."""
+
+Show = Callable[[str, int], None]
+"""Called with what is going on and how many frames are through."""
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """Which maze is driven, how fast, and with which weights (None: those that ship)."""
+
+    world: str
+    seed: int
+    frames: int
+    rate: float = 0.0
+    weights: Path | None = None
+
+    def estimators(self) -> list[NodeSpec]:
+        """The two estimator nodes; the image comes reliably, because a demo must not depend on luck."""
+        weights = {} if self.weights is None else {"weights": str(self.weights.resolve())}
+        window = {"window_frames": max(2000, self.frames), "relative_pose_depth": max(2000, self.frames)}
+        local = {
+            "image_reliability": "reliable",
+            "image_depth": 100,
+            "relative_pose_depth": window["relative_pose_depth"],
+        }
+        return [
+            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, **window, **weights}),
+            NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
+        ]
+
+    def simulator(self) -> NodeSpec:
+        """The simulator, which waits for local_node and the recorder."""
+        return NodeSpec(
+            "ngo_sim",
+            self.world,
+            {
+                "seed": self.seed,
+                "frames": self.frames,
+                "rate": float(self.rate),
+                "wait_for_subscribers": 2,
+                "wait_for_flow_control": True,
+            },
+        )
+
+
+class Session:
+    """Runs the graph once; everything it leaves behind lies below out."""
+
+    def __init__(self, config: SessionConfig, out: Path) -> None:
+        self._config = config
+        self._out = out
+        self._truth: dict[int, Poses] = {}
+        self._odometry: dict[int, Poses] = {}
+        self._path = b""
+        self._image_times, self._path_times = StampTimes(), StampTimes()
+
+    def run(self, show: Show, with_latency: bool = False) -> dict[str, Any]:
+        """Run, write recording.mcap, picture.png, the trajectories and the logs, and return the result."""
+        config = self._config
+        with Graph(self._out / "logs") as graph, Recorder(self._out / "recording.mcap", graph.domain_id) as recorder:
+            recorder.listen("ground_truth", self._on_truth)
+            recorder.listen("odom", self._on_odometry)
+            recorder.listen("ngo/path", self._on_path)
+            recorder.listen("image", self._image_times)
+            show("loading the networks", 0)
+            for spec in config.estimators():
+                graph.start(spec)
+            # The recorder subscribes relative_pose and image, too: the estimators are up when there is one more of
+            # each.
+            graph.wait_for(
+                lambda: (
+                    recorder.has_publisher("ngo/path")
+                    and recorder.has_publisher("odom")
+                    and recorder.has_subscriber("relative_pose")
+                    and recorder.has_subscriber("image")
+                ),
+                "the estimators to come up",
+                START_TIMEOUT_S,
+                recorder.spin_once,
+            )
+            show("starting the world", 0)
+            graph.start(config.simulator())
+            graph.wait_for(lambda: bool(self._truth), "the first frame", START_TIMEOUT_S, recorder.spin_once)
+            self._record(graph, recorder, show)
+            graph.stop()
+        return self._evaluate(with_latency)
+
+    def _record(self, graph: Graph, recorder: Recorder, show: Show) -> None:
+        heard, heard_s = 0, time.monotonic()
+        while not (graph.exit_code(self._config.world) == 0 and self._path_times.newest_ns >= max(self._truth)):
+            recorder.spin_once()
+            graph.check()
+            now_s = time.monotonic()
+            if (total := sum(recorder.counts.values()) - recorder.counts["/diagnostics"]) != heard:
+                heard, heard_s = total, now_s
+            elif now_s - heard_s > SILENCE_TIMEOUT_S:
+                raise GraphError(
+                    f"nothing came through for {SILENCE_TIMEOUT_S:g} s after {len(self._truth)} frames; "
+                    + "; ".join(
+                        f"{name} wrote last:\n{graph.tail(name)}"
+                        for name in (self._config.world, "local_node", "ngo_node")
+                    )
+                )
+            show("driving", len(self._path_times.received_ns) + 1)
+
+    def _evaluate(self, with_latency: bool) -> dict[str, Any]:
+        message = deserialize_message(self._path, PathMessage)
+        corrected = {_stamp_ns(pose.header.stamp): _xyyaw(pose.pose) for pose in message.poses}
+        try:
+            trajectories = match(self._truth, self._odometry, corrected)
+        except ValueError as error:
+            raise GraphError(str(error)) from None
+        result = evaluate(self._config.world, self._config.seed, trajectories)
+        if with_latency:
+            result["latency_ms"] = self._latency_ms()
+        for name in ("truth", "odometry", "corrected"):
+            write_tum(self._out / f"{name}.tum", trajectories.stamps_ns, getattr(trajectories, name))
+        save_picture(self._out / "picture.png", maze_of(self._config.world, self._config.seed), trajectories, result)
+        if (lost := trajectories.frames_published - len(trajectories.stamps_ns)) > 0:
+            print(f"{lost} of {trajectories.frames_published} frames did not get into the corrected path")
+        return result
+
+    def _latency_ms(self) -> dict[str, float]:
+        images, paths = self._image_times.published_ns, self._path_times.received_ns
+        latencies = np.array([paths[stamp] - images[stamp] for stamp in paths.keys() & images.keys()]) / 1e6
+        median, p99 = np.percentile(latencies, [50, 99])
+        return {
+            "median": round(float(median), 2),
+            "p99": round(float(p99), 2),
+            "max": round(float(latencies.max()), 2),
+            "frames": len(latencies),
+        }
+
+    def _on_truth(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
+        self._truth[header_stamp_ns(cdr)] = _xyyaw(deserialize_message(cdr, Odometry).pose.pose)
+
+    def _on_odometry(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
+        self._odometry[header_stamp_ns(cdr)] = _xyyaw(deserialize_message(cdr, Odometry).pose.pose)
+
+    def _on_path(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
+        self._path = cdr
+        self._path_times(cdr, published_ns, received_ns)
+
+
+def maze_of(world: str, seed: int) -> Maze:
+    """The maze that the simulator of this name drives through, of its standard size."""
+    if world == "maze2d":
+        from ngo_sim.maze2d import Maze2D
+
+        env: Any = Maze2D()
+    else:
+        from ngo_sim.maze3d import Maze3D  # loads the engine, which the 2D world does without
+
+        env = Maze3D()
+    env.reset(seed=seed)
+    maze: Maze = env.maze
+    env.close()
+    return maze
+
+
+def _stamp_ns(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _xyyaw(pose: Pose) -> Poses:
+    """(3,) x, y, yaw of a planar pose."""
+    return np.array([pose.position.x, pose.position.y, 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)])
