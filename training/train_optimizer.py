@@ -15,7 +15,7 @@ import lightning
 import numpy as np
 import torch
 import tyro
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 from torch.utils.data import DataLoader, IterableDataset
 
@@ -147,12 +147,13 @@ class OptimizerTraining(lightning.LightningModule):
             self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(error))
 
     def configure_optimizers(self) -> Any:
-        slow, fast = [], []
+        slow: list[nn.Parameter] = []
+        fast: list[nn.Parameter] = []
         for name, parameter in self.optimizer.named_parameters():
             # Single numbers that start from zero, and hold everything else back until they move.
             (fast if name in ("loop_gain", "place_gain") else slow).append(parameter)
         rate = self.arguments.learning_rate
-        groups = [{"params": slow}, {"params": fast, "lr": 20.0 * rate, "weight_decay": 0.0}]
+        groups: list[dict[str, Any]] = [{"params": slow}, {"params": fast, "lr": 20.0 * rate, "weight_decay": 0.0}]
         optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=1e-3)
         return runs.one_cycle(optimizer, self.trainer)
 

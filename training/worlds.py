@@ -40,7 +40,7 @@ class World:
     heading_limit_rad: float
     actions: int = 3
 
-    def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, int]:
+    def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size, by default the simulator's own size."""
         changes = {} if rows is None else {"rows": rows, "cols": rows}
         if extra_openings is not None:
@@ -51,7 +51,7 @@ class World:
 
         return Maze3D(Maze3DConfig(**changes))
 
-    def make_random(self, rng: np.random.Generator) -> gymnasium.Env[Any, int]:
+    def make_random(self, rng: np.random.Generator) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of a random size and number of openings."""
         rows = int(rng.integers(self.rows[0], self.rows[1] + 1))
         openings = int(rng.integers(self.extra_openings[0], self.extra_openings[1] + 1))

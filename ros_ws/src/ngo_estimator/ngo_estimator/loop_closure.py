@@ -142,34 +142,47 @@ def gauss_newton_correction(
         loop_information: inverse variances ``(batch, loops, 3)``, zero or more.
         deviation: correction already applied ``(batch, blocks, 3)``.
     """
-    batch, loops, _, blocks, _ = jacobian.shape
-    scaled = (jacobian * step_std[:, None, None]).reshape(batch, 3 * loops, 3 * blocks)
-    weight = loop_information.reshape(batch, 3 * loops, 1).sqrt()
-    weighted = weight * scaled
-    system = weighted @ weighted.mT
-    system.diagonal(dim1=-2, dim2=-1).add_(1.0)
-    target = residuals.reshape(batch, 3 * loops, 1) + scaled @ (deviation / step_std).reshape(batch, 3 * blocks, 1)
-    multipliers = torch.cholesky_solve(weight * target, torch.linalg.cholesky(system))
-    return (weighted.mT @ multipliers).reshape(batch, blocks, 3) * step_std
+    batch, _, _, blocks, _ = jacobian.shape
+    weighted, factor = _weighted_system(jacobian, step_std, loop_information)
+    # What the residuals would be without the deviation, weighted.
+    target = _root(loop_information).reshape(batch, -1, 1) * residuals.reshape(batch, -1, 1)
+    target = target + weighted @ (deviation / step_std).reshape(batch, 3 * blocks, 1)
+    return (weighted.mT @ torch.cholesky_solve(target, factor)).reshape(batch, blocks, 3) * step_std
 
 
 def end_covariance(poses: Tensor, jacobian: Tensor, step_std: Tensor, loop_information: Tensor) -> Tensor:
     """Covariance ``(batch, 3, 3)`` of the last meta-pose (x, y, yaw in the map), given the odometry and the loops.
 
-    The odometry's covariance, carried to the end, less what the loops take away from it. Arguments as in
-    ``gauss_newton_correction``, with ``poses`` ``(batch, blocks + 1, 3)``.
+    The odometry's covariance, carried to the end, less what the loops take away from it: a difference of numbers that
+    may be close, so that float64 is needed for a positive definite result. Arguments as in ``gauss_newton_correction``,
+    with ``poses`` ``(batch, blocks + 1, 3)``.
     """
-    batch, loops, _, blocks, _ = jacobian.shape
+    batch, _, _, blocks, _ = jacobian.shape
     ends = torch.full((batch, 1), blocks - 1, device=poses.device)
     fill = poses.new_zeros(batch, 1)
     whole = Loops(ends * 0, ends, ends, poses[:, :1], poses[:, :1, :2], fill, fill, fill > 0)
     to_end = (loop_jacobian(whole, poses) * step_std[:, None, None]).reshape(batch, 3, 3 * blocks)
-    weighted = (jacobian * step_std[:, None, None]).reshape(batch, 3 * loops, 3 * blocks)
-    weighted = weighted * loop_information.reshape(batch, 3 * loops, 1).sqrt()
+    weighted, factor = _weighted_system(jacobian, step_std, loop_information)
+    taken = torch.linalg.solve_triangular(factor, weighted @ to_end.mT, upper=False)
+    return to_end @ to_end.mT - taken.mT @ taken
+
+
+def _weighted_system(jacobian: Tensor, step_std: Tensor, loop_information: Tensor) -> tuple[Tensor, Tensor]:
+    """``A = sqrt(information) J step_std`` ``(batch, 3 loops, 3 blocks)`` and the Cholesky factor of ``A A^T + 1``."""
+    batch, loops, _, blocks, _ = jacobian.shape
+    scaled = (jacobian * step_std[:, None, None]).reshape(batch, 3 * loops, 3 * blocks)
+    weighted = _root(loop_information).reshape(batch, 3 * loops, 1) * scaled
     system = weighted @ weighted.mT
-    system.diagonal(dim1=-2, dim2=-1).add_(1.0)
-    cross = weighted @ to_end.mT
-    return to_end @ to_end.mT - cross.mT @ torch.cholesky_solve(cross, torch.linalg.cholesky(system))
+    # Loops between the same places differ by the one alone, which must not drown in the rounding of large numbers.
+    trace = system.detach().diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    system.diagonal(dim1=-2, dim2=-1).add_(1.0 + 8.0 * torch.finfo(system.dtype).eps * trace)
+    return weighted, torch.linalg.cholesky(system)
+
+
+def _root(information: Tensor) -> Tensor:
+    """Square root whose gradient at zero is zero, that of a loop without effect, and not infinite."""
+    positive = information > 0.0
+    return torch.where(positive, information, 1.0).sqrt() * positive
 
 
 def spread_over_span(loops: Loops, values: Tensor, weights: Tensor, blocks: int) -> tuple[Tensor, Tensor]:

@@ -90,15 +90,15 @@ class OptimizedTrajectory:
     step_std: Tensor
 
     def end_covariance(self) -> Tensor:
-        """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw)."""
-        poses = _with_origin(se2.r2g(self.meta_relative[-1]))
-        loops, information = self.loops, self.loop_information
-        if loops is None or information is None:
-            none = poses.new_zeros(poses.shape[0], 0, 3)
+        """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
+        poses = _with_origin(se2.r2g(self.meta_relative[-1].double()))
+        step_std = self.step_std.double()
+        batch, blocks = step_std.shape[:2]
+        if self.loops is None or self.loop_information is None:
             return end_covariance(
-                poses, none[..., None, None].expand(-1, -1, 3, poses.shape[1] - 1, 3), self.step_std, none
+                poses, poses.new_zeros(batch, 0, 3, blocks, 3), step_std, poses.new_zeros(batch, 0, 3)
             )
-        return end_covariance(poses, loop_jacobian(loops, poses), self.step_std, information)
+        return end_covariance(poses, loop_jacobian(self.loops, poses), step_std, self.loop_information.double())
 
 
 class LoopGate(nn.Module):
@@ -256,7 +256,7 @@ class NeuralGraphOptimizer(nn.Module):
             beta = torch.sigmoid(self.gate(hidden)).mT
             adjusted = adjusted + beta * self.adjustment(hidden).mT * self.correction_std
             features = torch.relu(self.feature(hidden)).mT
-            if loops is not None:
+            if loops is not None and information is not None:
                 step_std = base_std * torch.exp(self.stiffness(hidden).mT.clamp(-3.0, 3.0))
                 total = gauss_newton_correction(jacobian, residuals, step_std, information, deviation)
                 deviation = deviation + self.loop_gain * (total - deviation)
