@@ -95,8 +95,8 @@ def engines(folder: Path) -> list[int]:
 def wait_until_gone(folder: Path) -> None:
     """Until no engine and no file is left below a folder."""
     deadline = time.monotonic() + 20
-    while engines(folder) or list(folder.iterdir()):
-        assert time.monotonic() < deadline, f"left: {engines(folder)} {list(folder.iterdir())}"
+    while left := [*map(str, engines(folder)), *map(str, folder.iterdir())]:
+        assert time.monotonic() < deadline, f"left: {left}"
         time.sleep(0.02)
 
 
