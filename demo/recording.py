@@ -52,10 +52,12 @@ class Recorder:
     Log time is when a message was received here, publish time when its writer published it, both of the wall clock.
     """
 
-    def __init__(self, path: Path, domain_id: int, topics: Mapping[str, str] = ALL_TOPICS) -> None:
+    def __init__(
+        self, path: Path, domain_id: int, topics: Mapping[str, str] = ALL_TOPICS, chunk_bytes: int = 2**20
+    ) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("wb")
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD)
+        self._writer = Writer(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="ngo demo")
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain_id)

@@ -36,7 +36,7 @@ def latency_table(latency: dict[str, float]) -> Table:
         title="Latency from image to corrected path",
         caption=(
             "From the publish call of an image in the simulator to the arrival, at the recorder, of the ngo/path "
-            "message whose newest pose has its stamp. Times are those that DDS takes, by the clock that all processes share; "
+            "message whose newest pose has its stamp. Times are those that DDS takes, all by the same clock; "
             "transport and both estimators are included."
         ),
     )
