@@ -1,0 +1,333 @@
+"""The stand-in for `ros2` against a real node in its own process; expected is what the real command prints."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, PoseWithCovariance
+from ngo_msgs.msg import RelativePose
+from std_msgs.msg import Header
+
+TOOLS = Path(__file__).parents[2] / "tools"
+sys.path.insert(0, str(TOOLS))
+
+from ros2_stand_in import cli  # noqa: E402
+from ros2_stand_in.errors import CommandError  # noqa: E402
+from ros2_stand_in.message_text import echo_text, message_class, message_to_yaml, select_field  # noqa: E402
+from ros2_stand_in.parameters import parse_value  # noqa: E402
+from ros2_stand_in.topics import RateWindow  # noqa: E402
+
+ROS2 = TOOLS / "ros2"
+TIMEOUT_S = 60.0
+
+
+def without_real_ros2() -> dict[str, str]:
+    """The environment with no folder on PATH that holds a real `ros2`."""
+    folders = os.environ["PATH"].split(os.pathsep)
+    return {**os.environ, "PATH": os.pathsep.join(f for f in folders if cli.real_ros2(f) is None)}
+
+
+def ros2(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(ROS2), *arguments],
+        capture_output=True, text=True, timeout=TIMEOUT_S, env={**without_real_ros2(), **environment}, check=False,
+    )  # fmt: skip
+
+
+def listed(*arguments: str, expected: list[str]) -> list[str]:
+    """The lines that a list command prints, tried again while they differ: discovery takes long on a busy machine."""
+    deadline = time.monotonic() + TIMEOUT_S
+    while (lines := ros2(*arguments).stdout.splitlines()) != expected and time.monotonic() < deadline:
+        pass
+    return lines
+
+
+@pytest.fixture(scope="module")
+def talker() -> Iterator[None]:
+    process = subprocess.Popen([sys.executable, str(Path(__file__).with_name("talker.py"))])
+    try:
+        assert listed("node", "list", expected=["/test/talker"]) == ["/test/talker"]
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT_S) == 0
+
+
+# What it is, and what it leaves to the real one
+
+
+def test_help_says_that_it_is_a_stand_in_and_what_it_serves() -> None:
+    text = ros2("--help").stdout
+    assert "not the real `ros2` command but a stand-in" in text
+    assert cli.SERVED in text
+
+
+@pytest.mark.parametrize("arguments", [["bag", "record"], ["launch"], ["topic", "info", "/x"], ["param", "dump", "/n"]])
+def test_another_command_gives_one_line_that_names_the_served_ones(arguments: list[str]) -> None:
+    result = ros2(*arguments)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert cli.SERVED in result.stderr
+
+
+def test_a_real_ros2_on_path_is_run_instead(tmp_path: Path) -> None:
+    real = tmp_path / "ros2"
+    real.write_text('#!/bin/sh\necho "real: $*"\nexit 5\n')
+    real.chmod(0o755)
+    result = ros2("topic", "list", "--anything", PATH=f"{TOOLS}:{tmp_path}:{os.environ['PATH']}")
+    assert (result.returncode, result.stdout) == (5, "real: topic list --anything\n")
+
+
+def test_another_stand_in_is_no_real_ros2(tmp_path: Path) -> None:
+    link = tmp_path / "ros2"
+    link.symlink_to(ROS2)
+    assert cli.real_ros2(f"{TOOLS}:{tmp_path}:/nowhere::") is None
+
+
+# run
+
+
+@pytest.fixture
+def prefix(tmp_path: Path) -> Path:
+    """An install prefix with one package `tool`, whose executable prints its arguments and ends with code 3."""
+    index = tmp_path / "share/ament_index/resource_index/packages"
+    index.mkdir(parents=True)
+    (index / "tool").touch()
+    executable = tmp_path / "lib/tool/print"
+    executable.parent.mkdir(parents=True)
+    executable.write_text('#!/bin/sh\nfor a in "$@"; do echo "<$a>"; done\nexit 3\n')
+    executable.chmod(0o755)
+    (executable.parent / "data").touch()
+    return tmp_path
+
+
+def test_run_passes_arguments_and_exit_code_through(prefix: Path) -> None:
+    arguments = ["--ros-args", "-p", "name:=a b", "-r", "__ns:=/x", "--", "--help"]
+    result = ros2("run", "tool", "print", *arguments, AMENT_PREFIX_PATH=str(prefix))
+    assert result.returncode == 3
+    assert result.stdout.splitlines() == [f"<{argument}>" for argument in arguments]
+
+
+def test_run_finds_the_packages_of_the_workspace() -> None:
+    result = ros2("run", "--prefix", "echo would run", "ngo_sim", "maze2d", "--ros-args")
+    assert re.fullmatch(r"would run .*/install/ngo_sim/lib/ngo_sim/maze2d --ros-args\n", result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("package", "executable", "line"),
+    [
+        ("tool", "data", "No executable found"),
+        ("tool", "nothing", "No executable found"),
+        ("nothing", "print", "Package 'nothing' not found"),
+    ],
+)
+def test_run_says_what_is_not_there(prefix: Path, package: str, executable: str, line: str) -> None:
+    result = ros2("run", package, executable, AMENT_PREFIX_PATH=str(prefix))
+    assert (result.returncode, result.stderr) == (1, f"{line}\n")
+
+
+# Messages as text
+
+
+def test_a_message_is_printed_as_yaml_in_block_style() -> None:
+    header = Header(stamp=Time(sec=1, nanosec=2), frame_id="odom")
+    assert echo_text(header, None, 128) == "stamp:\n  sec: 1\n  nanosec: 2\nframe_id: odom\n---"
+    assert echo_text(Header(), None, 128).splitlines()[-2] == "frame_id: ''"
+    assert message_to_yaml(Header(frame_id="größe")).splitlines()[-1] == "frame_id: größe"
+
+
+def test_arrays_of_every_kind_are_lists_and_end_with_dots_past_the_limit() -> None:
+    message = RelativePose(
+        covariance=np.arange(9.0), motion_feature=[0.5, 1.5], place_code=np.ones(200, dtype=np.float32).tolist()
+    )
+    text = message_to_yaml(message, truncate_length=128)
+    assert "covariance:\n- 0.0\n- 1.0\n" in text
+    assert "motion_feature:\n- 0.5\n- 1.5\n" in text
+    assert text.endswith("- 1.0\n- '...'\n")
+    assert text.count("\n- 1.0") == 128 + 1
+    assert message_to_yaml(message, truncate_length=None).count("\n- 1.0") == 200 + 1
+    assert message_to_yaml(RelativePose()).endswith("motion_feature: []\nplace_code: []\n")
+
+
+def test_messages_within_arrays_are_printed_in_full() -> None:
+    path = message_class("nav_msgs/msg/Path")(poses=[PoseStamped()])
+    lines = message_to_yaml(path).splitlines()
+    assert lines[5:8] == ["poses:", "- header:", "    stamp:"]
+
+
+def test_a_field_is_a_message_a_number_or_an_array() -> None:
+    message = PoseWithCovariance()
+    message.pose.position.x = 2.5
+    assert echo_text(message, "pose.position", 128) == "x: 2.5\ny: 0.0\nz: 0.0\n---"
+    assert echo_text(message, "pose.position.x", 128) == "2.5\n---"
+    with pytest.raises(CommandError, match=r"Invalid field 'pose\.speed'"):
+        select_field(message, "pose.speed")
+
+
+@pytest.mark.parametrize("name", ["Header", "std_msgs/Header", "std_msgs/msg/Nothing", "nothing/msg/Header", "//"])
+def test_a_wrong_type_name_is_refused(name: str) -> None:
+    with pytest.raises(CommandError, match="invalid"):
+        message_class(name)
+
+
+# Rates
+
+
+def test_the_rate_is_the_real_commands_report() -> None:
+    rate = RateWindow(window=10_000)
+    reports = []
+    for index in range(0, 25):
+        rate.add(1_000_000_000 + index * 100_000_000)
+        reports.append(rate.report())
+    # The first interval only starts the clock; a report follows each second after it.
+    assert [index for index, report in enumerate(reports) if report] == [11, 21]
+    assert reports[11] == "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 11"
+
+
+def test_the_rate_goes_by_the_window_alone() -> None:
+    rate = RateWindow(window=2)
+    for time_ns in (0, 7_000_000_000, 7_100_000_000, 7_400_000_000):
+        rate.add(time_ns)
+        last = rate.report()
+    assert last is None, "a second report within the same second"
+    rate.add(9_400_000_000)
+    assert rate.report() == "average rate: 0.870\n\tmin: 0.300s max: 2.000s std dev: 0.85000s window: 2"
+
+
+# Parameter values
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "value"),
+    [
+        ("5", "integer_value", 5),
+        ("-5", "integer_value", -5),
+        ("5.0", "double_value", 5.0),
+        ("true", "bool_value", True),
+        ("word", "string_value", "word"),
+        ("[1, 2]", "integer_array_value", [1, 2]),
+        ("['a', b]", "string_array_value", ["a", "b"]),
+        ("{a: 1}", "string_value", "{a: 1}"),
+        ("a: b: c", "string_value", "a: b: c"),
+        ("[1", "string_value", "[1"),
+    ],
+)
+def test_a_value_has_the_type_that_yaml_takes_it_for(text: str, field: str, value: object) -> None:
+    parsed = getattr(parse_value(text), field)
+    assert (list(parsed) if isinstance(value, list) else parsed) == value
+
+
+# Against a real node
+
+
+@pytest.mark.processes
+@pytest.mark.usefixtures("talker")
+class TestAgainstARealNode:
+    def test_node_list(self) -> None:
+        assert listed("node", "list", expected=["/test/talker"]) == ["/test/talker"]
+        assert re.search(r"^/_ros2cli_\d+$", ros2("node", "list", "--all").stdout, re.MULTILINE)
+
+    def test_topic_list(self) -> None:
+        names = ["/parameter_events", "/rosout", "/test/header", "/test/image", "/test/path", "/test/status"]
+        assert listed("topic", "list", expected=names) == names
+        types = ["rcl_interfaces/msg/ParameterEvent", "rcl_interfaces/msg/Log", "std_msgs/msg/Header"]
+        types += ["sensor_msgs/msg/Image", "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticStatus"]
+        typed = [f"{name} [{kind}]" for name, kind in zip(names, types, strict=True)]
+        assert listed("topic", "list", "-t", expected=typed) == typed
+
+    def test_echo_of_a_best_effort_topic(self) -> None:
+        result = ros2("topic", "echo", "/test/header", "--once")
+        assert result.returncode == 0, result.stderr
+        assert re.fullmatch(r"stamp:\n  sec: 12\n  nanosec: \d+\nframe_id: odom\n---\n", result.stdout)
+
+    def test_echo_of_a_field_with_the_type_given(self) -> None:
+        result = ros2("topic", "echo", "test/header", "std_msgs/msg/Header", "--field", "stamp.sec", "--once")
+        assert result.stdout == "12\n---\n"
+
+    def test_echo_of_a_message_published_before_it_came(self) -> None:
+        lines = ros2("topic", "echo", "/test/image", "--once").stdout.splitlines()
+        start = lines.index("data:")
+        assert lines[start + 1 :] == [*(f"- {value}" for value in range(128)), "- '...'", "---"]
+        whole = ros2("topic", "echo", "/test/image", "--once", "--full-length").stdout.splitlines()
+        assert whole[start + 1 :] == [*(f"- {value}" for value in range(200)), "---"]
+
+    def test_echo_of_bytes_and_long_strings(self) -> None:
+        lines = ros2("topic", "echo", "/test/status", "--once").stdout.splitlines()
+        message = f"message: {'x' * 128}..."
+        assert lines == ['level: "\\x01"', "name: größe", message, "hardware_id: ''", "values: []", "---"]
+
+    def test_echo_ends_with_an_interrupt(self) -> None:
+        command = [sys.executable, str(ROS2), "topic", "echo", "/test/header", "--field", "frame_id"]
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=without_real_ros2()
+        )
+        assert process.stdout is not None
+        assert [process.stdout.readline() for _ in range(4)] == ["odom\n", "---\n"] * 2
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+        assert (process.returncode, errors) == (int(signal.SIGINT), "")
+
+    def test_hz(self) -> None:
+        command = [sys.executable, str(ROS2), "topic", "hz", "/test/header"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=without_real_ros2())
+        assert process.stdout is not None
+        text = process.stdout.readline() + process.stdout.readline()
+        process.terminate()
+        assert process.wait(TIMEOUT_S) == 0
+        process.stdout.close()
+        numbers = r"min: \d+\.\d{3}s max: \d+\.\d{3}s std dev: \d+\.\d{5}s window: \d+"
+        found = re.fullmatch(rf"average rate: (\d+\.\d{{3}})\n\t{numbers}\n", text)
+        assert found, text
+        assert 10.0 < float(found[1]) < 30.0
+
+    def test_param_list(self) -> None:
+        own = ["enabled", "frame", "gain", "names", "speed", "steps"]
+        lines = ros2("param", "list", "/test/talker").stdout.splitlines()
+        assert set(own) <= {line.removeprefix("  ") for line in lines}
+        assert lines == sorted(lines)
+        every = ["/test/talker:", *lines]
+        assert listed("param", "list", expected=every) == every
+
+    @pytest.mark.parametrize(
+        ("name", "line"),
+        [
+            ("speed", "Integer value is: 7"),
+            ("gain", "Double value is: 0.5"),
+            ("frame", "String value is: base_link"),
+            ("enabled", "Boolean value is: True"),
+            ("steps", "Integer values are: array('q', [1, 2, 3])"),
+            ("names", "String values are: ['a', 'b']"),
+        ],
+    )
+    def test_param_get(self, name: str, line: str) -> None:
+        assert ros2("param", "get", "/test/talker", name).stdout == f"{line}\n"
+
+    def test_param_get_without_the_type(self) -> None:
+        assert ros2("param", "get", "test/talker", "frame", "--hide-type").stdout == "base_link\n"
+
+    def test_param_set(self) -> None:
+        result = ros2("param", "set", "/test/talker", "gain", "0.25")
+        assert (result.returncode, result.stdout) == (0, "Set parameter successful\n")
+        assert ros2("param", "get", "/test/talker", "gain").stdout == "Double value is: 0.25\n"
+
+    def test_param_set_refused_by_the_node(self) -> None:
+        result = ros2("param", "set", "/test/talker", "gain", "2.0")
+        assert (result.stdout, result.stderr) == ("", "Setting parameter failed: gain is at most 1\n")
+
+    def test_a_node_topic_or_parameter_that_is_not_there(self) -> None:
+        result = ros2("param", "get", "/test/nobody", "speed")
+        assert (result.returncode, result.stderr) == (1, "Node not found\n")
+        result = ros2("param", "get", "/test/talker", "nothing")
+        assert (result.returncode, result.stderr) == (1, "Parameter not set\n")
+        result = ros2("topic", "echo", "/test/nothing")
+        assert result.stdout == "WARNING: topic [/test/nothing] does not appear to be published yet\n"
+        assert (result.returncode, result.stderr) == (1, "Could not determine the type for the passed topic\n")
