@@ -57,6 +57,11 @@ class NodeProcess:
         return os.pread(self._log.fileno(), size, 0).decode()
 
     @property
+    def lines(self) -> list[str]:
+        """The lines that it wrote, without those of the middleware about what other processes left behind."""
+        return [line for line in self.log.splitlines() if line.strip() and "RTPS_" not in line]
+
+    @property
     def running(self) -> bool:
         """Whether it has not ended yet."""
         return self._process.poll() is None

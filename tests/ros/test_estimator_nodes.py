@@ -576,7 +576,7 @@ def test_bad_parameters_end_the_start_with_one_line_and_code_two() -> None:
         with NodeProcess("ngo_estimator", executable, None, ("-p", argument)) as process:
             assert process.wait() == 2, process.log
             process.wait_for_log(pattern)
-            assert len(process.log.strip().splitlines()) == 1, process.log
+            assert len(process.lines) == 1, process.log
 
 
 def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp_path: Path) -> None:
@@ -594,4 +594,4 @@ def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp
         with NodeProcess("ngo_estimator", executable, {"world": world, "weights": str(folder)}) as process:
             assert process.wait() == 2, process.log
             process.wait_for_log(pattern)
-            assert len(process.log.strip().splitlines()) == 1, process.log
+            assert len(process.lines) == 1, process.log

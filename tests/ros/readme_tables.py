@@ -1,0 +1,179 @@
+"""What the four nodes say about their parameters and topics, and what README.md says about them.
+
+python -m tests.ros.readme_tables      # writes the nodes' parameters into README.md
+"""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import ReliabilityPolicy
+
+from .processes import NodeProcess, Probe
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+NODES = {"maze2d": "ngo_sim", "maze3d": "ngo_sim", "local_node": "ngo_estimator", "ngo_node": "ngo_estimator"}
+BEGIN = "<!-- Written by `python -m tests.ros.readme_tables`; a test compares it with the nodes. -->\n"
+END = "<!-- End of the parameters. -->\n"
+_OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+
+
+@dataclass(frozen=True, order=True)
+class Endpoint:
+    """A node's end of a topic."""
+
+    node: str
+    publishes: bool
+    topic: str
+    type: str
+    reliability: str
+
+
+class NodeFacts:
+    """A running node, asked over ROS."""
+
+    def __init__(self, probe: Probe, name: str) -> None:
+        self._probe = probe
+        self.name = name
+
+    def parameter_rows(self) -> list[str]:
+        """A row of Markdown a parameter: name, default, meaning, what is allowed."""
+        names = self._ask(ListParameters, "list_parameters", ListParameters.Request()).result.names
+        names = sorted(name for name in names if not name.startswith(_OF_RCLPY))
+        values = self._ask(GetParameters, "get_parameters", GetParameters.Request(names=names)).values
+        described = self._ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
+        rows = ["| Parameter | Default | Meaning | Allowed |", "|---|---|---|---|"]
+        for name, value, descriptor in zip(names, values, described.descriptors, strict=True):
+            default = default_text(parameter_value_to_python(value))
+            rows.append(f"| `{name}` | {default} | {descriptor.description} | {allowed_text(descriptor)} |")
+        return rows
+
+    def endpoints(self) -> set[Endpoint]:
+        """Its ends of all topics, but for those that every node has."""
+        node, found = self._probe.node, set()
+        for publishes in (True, False):
+            by_node = (
+                node.get_publisher_names_and_types_by_node if publishes else node.get_subscriber_names_and_types_by_node
+            )
+            by_topic = node.get_publishers_info_by_topic if publishes else node.get_subscriptions_info_by_topic
+            for topic, types in by_node(self.name, "/"):
+                if topic in ("/rosout", "/parameter_events"):
+                    continue
+                (info,) = (info for info in by_topic(topic) if info.node_name == self.name)
+                best_effort = info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+                reliability = "best effort" if best_effort else "reliable"
+                found.add(Endpoint(self.name, publishes, topic, types[0], reliability))
+        return found
+
+    def services(self) -> set[tuple[str, str]]:
+        """Names and types of its services, but for those that every node has."""
+        return {
+            (name, types[0])
+            for name, types in self._probe.node.get_service_names_and_types_by_node(self.name, "/")
+            if not types[0].startswith(("rcl_interfaces/", "type_description_interfaces/"))
+        }
+
+    def _ask(self, service_type: Any, name: str, request: Any) -> Any:
+        return self._probe.call(service_type, f"/{self.name}/{name}", request)
+
+
+@contextmanager
+def running_nodes() -> Iterator[dict[str, NodeFacts]]:
+    """All four nodes, in one graph."""
+    probe = Probe()
+    facts: dict[str, NodeFacts] = {}
+    processes: list[NodeProcess] = []
+    try:
+        for name, package in NODES.items():
+            processes.append(NodeProcess(package, name))
+            facts[name] = NodeFacts(probe, name)
+
+        def complete() -> bool:
+            """The simulators are when they listen to the answers of both estimators."""
+            for process in processes:
+                assert process.running, process.log
+            estimators = all("ready: " in process.log for process in processes[2:])
+            return estimators and all(probe.node.count_subscribers(topic) == 2 for topic in ("/odom", "/ngo/pose"))
+
+        probe.spin_until(complete, "all nodes")
+        yield facts
+    finally:
+        for process in processes:
+            process.__exit__(None, None, None)
+        probe.close()
+
+
+def default_text(value: object) -> str:
+    """A parameter's value as it is written on the command line."""
+    if isinstance(value, str):
+        return f"`{value}`" if value else "`''`"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    if isinstance(value, list):
+        return f"`[{', '.join(value)}]`"
+    return f"`{value}`"
+
+
+def allowed_text(descriptor: ParameterDescriptor) -> str:
+    """What a parameter may be."""
+    if descriptor.additional_constraints:
+        return descriptor.additional_constraints
+    for span in (*descriptor.integer_range, *descriptor.floating_point_range):
+        return f"{span.from_value:.12g} to {span.to_value:.12g}"
+    return ""
+
+
+def parameter_section(facts: dict[str, NodeFacts]) -> str:
+    """The generated part of README.md."""
+    parts = [
+        f"<details>\n<summary><code>{name}</code></summary>\n\n" + "\n".join(node.parameter_rows()) + "\n\n</details>\n"
+        for name, node in facts.items()
+    ]
+    return BEGIN + "\n" + "\n".join(parts) + "\n" + END
+
+
+def readme_part(text: str) -> tuple[int, int]:
+    """Where the generated part of README.md begins and ends."""
+    assert text.count(BEGIN) == text.count(END) == 1, "README.md has lost the marks around the parameters"
+    return text.index(BEGIN), text.index(END) + len(END)
+
+
+def readme_rows(text: str, heading: str) -> list[list[str]]:
+    """The cells of the first table below a heading of README.md, without its head."""
+    section = text.split(f"\n{heading}\n", 1)[1]
+    match = re.search(r"(?:^\|.*\n)+", section, re.MULTILINE)
+    assert match, f"README.md has no table below {heading}"
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in match.group().splitlines()]
+    return rows[2:]
+
+
+def documented_endpoints(text: str) -> set[Endpoint]:
+    """What the table of topics says; only names in backticks count, so ends that exist on request are left out."""
+    found = set()
+    for topic, kind, publishers, subscribers, offered, asked, _ in readme_rows(text, "## Topics and services"):
+        (name,) = re.findall(r"`(.+?)`", topic)
+        for publishes, nodes, qos in ((True, publishers, offered), (False, subscribers, asked)):
+            for node in re.findall(r"`(.+?)`", nodes):
+                resolved = name if name.startswith("/") else f"/{name}"
+                package, message = kind.strip("`").split("/")
+                found.add(Endpoint(node, publishes, resolved, f"{package}/msg/{message}", qos.split(",")[0]))
+    return found
+
+
+def main() -> None:
+    """Write the nodes' parameters into README.md."""
+    with running_nodes() as facts:
+        section = parameter_section(facts)
+    text = README.read_text()
+    begin, end = readme_part(text)
+    README.write_text(text[:begin] + section + text[end:])
+
+
+if __name__ == "__main__":
+    main()
