@@ -1,0 +1,43 @@
+"""Image formats: what is refused, and what the networks see."""
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator.checkpoint import WORLD_IMAGES
+from ngo_estimator.images import ImageFormat, to_network
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(0, 80, 3, "uint8"), (60, 7, 3, "uint8"), (60, 80, 4, "uint8"), (60, 80, 3, "float32"), (1, 9, 1, "u1")],
+)
+def test_impossible_image_formats_are_refused(arguments: tuple[int, int, int, str]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        ImageFormat(*arguments)
+
+
+def test_check_names_what_is_wrong() -> None:
+    image = WORLD_IMAGES["maze2d"]
+    good = np.ones((1, 241, 4), np.float32)
+    image.check(good)
+    with pytest.raises(ValueError, match=r"\(241, 4\)"):
+        image.check(good[0])
+    with pytest.raises(ValueError, match="float64"):
+        image.check(good.astype(np.float64))
+    bad = good.copy()
+    bad[0, 3, 1] = np.nan
+    with pytest.raises(ValueError, match="1 values that are not finite"):
+        image.check(bad)
+    bad = good.copy()
+    bad[0, :2, 3] = -0.3  # where the network's input would be infinite
+    with pytest.raises(ValueError, match="2 negative depths"):
+        image.check(bad)
+
+
+def test_network_input_is_channels_first_and_near_zero() -> None:
+    colour = to_network(torch.tensor([0, 255], dtype=torch.uint8).reshape(1, 1, 2, 1).expand(1, 1, 2, 3))
+    assert colour.shape == (1, 3, 1, 2) and colour.dtype == torch.float32
+    assert colour[0, :, 0, 0].tolist() == [-0.5] * 3 and colour[0, :, 0, 1].tolist() == [0.5] * 3
+    scan = torch.tensor([[[1.0, 0.0, 0.5, 0.3]]])  # one pixel: red 1, green 0, blue a half, 0.3 m
+    assert torch.allclose(to_network(scan).flatten(), torch.tensor([0.5, -0.5, 0.0, 0.5]))

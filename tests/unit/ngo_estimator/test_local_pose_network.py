@@ -1,0 +1,67 @@
+"""The local pose network: shapes, units, batches, actions."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ngo_estimator.local_pose_network import LocalPoseNetwork
+from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_local_network_gives_poses_deviations_and_features(world: str) -> None:
+    network = LocalPoseNetwork(local_config(world, feature_size=20)).eval()
+    images = observations(world, 6)
+    mean, log_std, feature = network(images[:5], images[1:], torch.tensor([0, 1, 2, 0, 1]))
+    assert mean.shape == log_std.shape == (5, 3) and feature.shape == (5, 20)
+    assert all(value.isfinite().all() and value.dtype == torch.float32 for value in (mean, log_std, feature))
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_batch_is_as_many_singles(world: str) -> None:
+    network = LocalPoseNetwork(local_config(world)).eval()
+    images, actions = observations(world, 6), torch.tensor([0, 1, 2, 0, 1])
+    together = network(images[:5], images[1:], actions)
+    for k in range(5):
+        alone = network(images[k : k + 1], images[k + 1 : k + 2], actions[k : k + 1])
+        for a, b in zip(together, alone, strict=True):
+            assert torch.allclose(a[k], b[0], atol=1e-5, rtol=1e-4)
+
+
+def test_normalisation_turns_the_output_into_metres_and_radians() -> None:
+    torch.manual_seed(0)
+    plain = LocalPoseNetwork(local_config("maze2d")).eval()
+    scaled_config = dataclasses.replace(plain.config, relative_mean=(0.3, -0.1, 0.02), relative_std=(0.5, 0.1, 0.2))
+    scaled = LocalPoseNetwork(scaled_config).eval()
+    scaled.load_state_dict(plain.state_dict())
+    images, actions = observations("maze2d", 4), torch.tensor([0, 1, 2])
+    mean, log_std, feature = plain(images[:3], images[1:], actions)
+    scaled_mean, scaled_log_std, scaled_feature = scaled(images[:3], images[1:], actions)
+    std = torch.tensor(scaled_config.relative_std)
+    assert torch.allclose(scaled_mean, mean * std + torch.tensor(scaled_config.relative_mean), atol=1e-6)
+    assert torch.allclose(scaled_log_std.exp(), log_std.exp() * std, rtol=1e-5)
+    assert torch.equal(scaled_feature, feature)
+
+
+def test_the_action_matters_and_must_be_given_exactly_when_it_was_in_training() -> None:
+    images = observations("maze2d", 2)
+    with_action = LocalPoseNetwork(local_config("maze2d")).eval()
+    without = LocalPoseNetwork(local_config("maze2d", actions=0)).eval()
+    left, right = (with_action(images[:1], images[1:], torch.tensor([action]))[0] for action in (1, 2))
+    assert not torch.equal(left, right)
+    assert without(images[:1], images[1:], None)[0].shape == (1, 3)
+    with pytest.raises(ValueError, match="no actions were given"):
+        with_action(images[:1], images[1:], None)
+    with pytest.raises(ValueError, match="actions were given"):
+        without(images[:1], images[1:], torch.tensor([1]))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"width": 0.0}, {"width": 2.1}, {"actions": -1}, {"feature_size": 0}, {"hidden_size": 0}, {"period_s": 0.0}]
+    + [{"period_s": float("nan")}, {"relative_std": (1.0, 0.0, 1.0)}],
+)
+def test_impossible_local_configurations_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        local_config("maze2d", **change)
