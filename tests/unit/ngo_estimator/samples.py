@@ -5,7 +5,9 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.local_pose_network import LocalPoseConfig
-from ngo_estimator.place_encoder import PlaceConfig
+from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.place_encoder import PairHead, PlaceConfig
+from ngo_estimator.pose_aggregation import PoseAggregationConfig
 
 WORLDS = ["maze2d", "maze3d"]
 
@@ -22,3 +24,40 @@ def local_config(world: str, **changes: object) -> LocalPoseConfig:
 
 def place_config(world: str, **changes: object) -> PlaceConfig:
     return PlaceConfig(**{"image": WORLD_IMAGES[world], "width": 0.1, "offset_scale_m": 0.5, **changes})  # type: ignore[arg-type]
+
+
+def small_optimizer(
+    form: str = "loops", trained: bool = False, seed: int = 0, **changes: object
+) -> NeuralGraphOptimizer:
+    """An optimizer for 6 motion features, fresh or with random weights that close loops and move every pose."""
+    torch.manual_seed(seed)
+    aggregation = PoseAggregationConfig(motion_feature_size=6, width=16, relative_std=(0.1, 0.02, 0.05))
+    make = NeuralGraphOptimizerConfig if form == "loops" else NeuralGraphOptimizerConfig.paper_form
+    settings = {"aggregation": aggregation, "iterations": 3, **changes}
+    if form == "loops":
+        settings = {"max_loops": 8, "min_loop_separation": 2, **settings}
+    optimizer = NeuralGraphOptimizer(make(**settings)).eval()  # type: ignore[arg-type]
+    if trained:
+        with torch.no_grad():
+            for name, parameter in optimizer.named_parameters():
+                parameter.add_(0.1 * torch.randn_like(parameter))
+                if name in ("loop_gain", "place_gain"):
+                    parameter.fill_(0.7)
+    return optimizer.requires_grad_(False)
+
+
+def small_pair_head(seed: int = 0) -> PairHead:
+    """A pair head for place codes of 12 numbers."""
+    torch.manual_seed(seed)
+    config = place_config("maze2d", code_size=12, embedding_size=8, pair_hidden_size=16)
+    return PairHead(config).eval().requires_grad_(False)
+
+
+def trajectory_inputs(batch: int, steps: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Relative poses, log deviations, motion features and place codes for ``small_optimizer``."""
+    generator = torch.Generator().manual_seed(seed)
+    std = torch.tensor([0.1, 0.02, 0.05])
+    relative = torch.randn(batch, steps, 3, generator=generator) * std + torch.tensor([0.12, 0.0, 0.02])
+    log_std = 0.3 * torch.randn(batch, steps, 3, generator=generator) + (0.1 * std).log()
+    motion = torch.rand(batch, steps, 6, generator=generator)
+    return relative, log_std, motion, torch.randn(batch, steps, 12, generator=generator)

@@ -33,6 +33,11 @@ def test_check_names_what_is_wrong() -> None:
     bad[0, :2, 3] = -0.3  # where the network's input would be infinite
     with pytest.raises(ValueError, match="2 negative depths"):
         image.check(bad)
+    for colour in (-0.1, 1.1, 1e38):
+        bad = good.copy()
+        bad[0, 7, 2] = colour
+        with pytest.raises(ValueError, match="1 colours out of range"):
+            image.check(bad)
 
 
 def test_network_input_is_channels_first_and_near_zero() -> None:

@@ -122,8 +122,8 @@ def test_g2r_undoes_r2g(shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize(
     "function",
     [
-        lambda a, b: se2.compose(a, b),
-        lambda a, b: se2.between(a, b),
+        se2.compose,
+        se2.between,
         lambda a, b: se2.inverse(a),
         lambda a, b: se2.rotate(a[..., 2], b[..., :2]),
         lambda a, b: se2.r2g(torch.stack((a, b), dim=-2)),

@@ -3,8 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import math
 import os
-import types
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -53,7 +53,12 @@ def config_from_dict(kind: type[Config], values: Any) -> Config:
     if unknown := sorted(set(values) - set(fields)):
         raise ValueError(f"{kind.__name__} has unknown keys {unknown}; expected among {sorted(fields)}")
     hints = typing.get_type_hints(kind)
-    arguments = {name: _from_json(hints[name], value) for name, value in values.items()}
+    arguments = {}
+    for name, value in values.items():
+        try:
+            arguments[name] = _from_json(hints[name], value)
+        except ValueError as error:
+            raise ValueError(f"{kind.__name__}.{name}: {error}") from error
     try:
         return kind(**arguments)
     except TypeError as error:
@@ -63,8 +68,17 @@ def config_from_dict(kind: type[Config], values: Any) -> Config:
 def _from_json(hint: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast("type[Any]", hint), value)
-    if isinstance(hint, types.GenericAlias) and hint.__origin__ is tuple:
-        return tuple(value)
+    if typing.get_origin(hint) is tuple:
+        items = typing.get_args(hint)
+        if not isinstance(value, list) or (items[-1] is not Ellipsis and len(value) != len(items)):
+            raise ValueError(f"{value!r} is given where {hint} is expected")
+        return tuple(_from_json(items[0], item) for item in value)
+    # JSON has one kind of number, and true is no number.
+    allowed = (int, float) if hint is float else hint
+    if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
+        raise ValueError(f"{value!r} is given where {hint.__name__} is expected")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{value!r} is given where a finite number is expected")
     return value
 
 
@@ -125,8 +139,8 @@ def load_network(
     description = load_description(path, kind, world)
     try:
         network = build(config_from_dict(config, description.get("config")))
-    except ValueError as error:
-        raise CheckpointError(f"{path.with_suffix('.json')}: {error}") from error
+    except (ValueError, RuntimeError) as error:  # RuntimeError: sizes that no memory holds
+        raise CheckpointError(f"{path.with_suffix('.json')}: {' '.join(str(error).split())}") from error
     try:
         content = path.read_bytes()
         tensors = load(content)
@@ -142,6 +156,8 @@ def load_network(
         network.load_state_dict(tensors)
     except RuntimeError as error:
         raise CheckpointError(f"{path}: does not fit its configuration ({' '.join(str(error).split())})") from error
+    if broken := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise CheckpointError(f"{path}: has weights that are not finite in {', '.join(broken)}")
     return network.eval().requires_grad_(False), description
 
 

@@ -42,11 +42,15 @@ class ImageFormat:
         return self.height, self.width, self.channels
 
     def check(self, image: np.ndarray) -> None:
-        """Raise ``ValueError`` unless ``image`` is one finite observation of this format."""
+        """Raise ``ValueError`` unless ``image`` is an observation of this format with possible values."""
         if image.shape != self.shape or image.dtype != np.dtype(self.dtype):
             raise ValueError(f"image is {image.shape} of {image.dtype}; expected {self.shape} of {self.dtype}")
         if self.dtype == "float32" and not np.isfinite(image).all():
             raise ValueError(f"image has {int((~np.isfinite(image)).sum())} values that are not finite")
+        if self.channels == 4 and (wrong := int((image[..., 3] < 0.0).sum())):
+            raise ValueError(f"image has {wrong} negative depths; expected metres from 0 on")
+        if self.dtype == "float32" and (wrong := int(((image[..., :3] < 0.0) | (image[..., :3] > 1.0)).sum())):
+            raise ValueError(f"image has {wrong} colours out of range; expected 0 to 1")
 
 
 def to_network(images: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ class LateFrame(RejectedFrame):
 
 
 class UnusableImage(RejectedFrame):
-    """An image of the wrong size or type, or with values that are not finite, or an unknown action."""
+    """An image of the wrong size or type, or with values that make no sense, or an unknown action."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,162 @@
+"""Between ROS messages and arrays: what goes in comes out, over the wire, and what cannot be used is named."""
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from ngo_msgs.msg import RelativePose, Trajectory
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Image
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ngo_estimator.local_odometry import LocalEstimate
+from ngo_estimator.nodes import messages
+from ngo_estimator.online_trajectory import TrajectoryUpdate
+
+SCAN_SHAPE, PICTURE_SHAPE = (1, 7, 4), (3, 5, 3)
+
+
+def over_the_wire(message: Any) -> Any:
+    return deserialize_message(serialize_message(message), type(message))
+
+
+def image(pixels: np.ndarray, encoding: str, padding: int = 0) -> Image:
+    """A message of these pixels; rows may be longer than the pixels in them."""
+    height, width = pixels.shape[:2]
+    rows = [row.tobytes() + bytes(padding) for row in pixels]
+    return Image(height=height, width=width, encoding=encoding, step=len(rows[0]), data=b"".join(rows))
+
+
+def scan() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.0, 9.0, SCAN_SHAPE).astype(np.float32)
+
+
+def picture() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, PICTURE_SHAPE, dtype=np.uint8)
+
+
+def update(loops: int) -> TrajectoryUpdate:
+    """A trajectory of five frames with so many loops."""
+    rng = np.random.default_rng(1)
+    return TrajectoryUpdate(
+        stamps_ns=np.arange(1, 6) * 1_500_000_001,
+        poses_xyyaw=rng.normal(size=(5, 3)),
+        odometry_xyyaw=rng.normal(size=(5, 3)),
+        moved_m=rng.random(5),
+        loops=np.array([[0, 4], [1, 3]])[:loops],
+        loop_weights=np.array([0.25, 1.0])[:loops],
+        map_from_odom_xyyaw=np.zeros(3),
+        covariance=np.eye(3),
+        optimized=True,
+        restarted=False,
+        gap=False,
+    )
+
+
+@pytest.mark.parametrize("padding", [0, 4, 13])
+def test_images_are_read_whatever_the_length_of_their_rows(padding: int) -> None:
+    read = messages.image_array(over_the_wire(image(picture(), "rgb8", padding)), PICTURE_SHAPE, "uint8")
+    np.testing.assert_array_equal(read, picture())
+    read = messages.image_array(over_the_wire(image(scan(), "32FC4", padding)), SCAN_SHAPE, "float32")
+    np.testing.assert_array_equal(read, scan())
+
+
+def test_images_of_the_other_byte_order_are_read() -> None:
+    message = image(scan().byteswap(), "32FC4")
+    message.is_bigendian = int(sys.byteorder == "little")
+    np.testing.assert_array_equal(messages.image_array(message, SCAN_SHAPE, "float32"), scan())
+
+
+def unusable_images() -> dict[str, Image]:
+    """Images that the 2D world's node cannot use, by what it says about them."""
+    with_nan, with_infinity = scan(), scan()
+    with_nan[0, 2, 3], with_infinity[0, 6, 0] = np.nan, -np.inf
+    short, long = image(scan(), "32FC4"), image(scan(), "32FC4")
+    short.data, long.data = short.data[:-16], long.data.tobytes() + bytes(16)
+    return {
+        "is 6 x 1 pixels; expected 7 x 1": image(scan()[:, :6], "32FC4"),
+        "is 7 x 2 pixels; expected 7 x 1": image(np.concatenate((scan(), scan())), "32FC4"),
+        "has the encoding 'rgb8'; expected '32FC4'": image(scan(), "rgb8"),
+        "has 96 bytes in 1 rows of 112; expected 112 a row": short,
+        "has 128 bytes in 1 rows of 112; expected 112 a row": long,
+        "has 0 bytes in 0 rows": Image(encoding="32FC4"),
+        "has 1 values that are not finite": image(with_nan, "32FC4"),
+        "has 1 values that are not finite ": image(with_infinity, "32FC4"),
+    }
+
+
+@pytest.mark.parametrize("reason", list(unusable_images()))
+def test_what_is_wrong_with_an_image_is_named(reason: str) -> None:
+    message = unusable_images()[reason]
+    pattern = "is 0 x 0 pixels" if "0 rows" in reason else reason.strip()
+    with pytest.raises(ValueError, match=f"^image {pattern}"):
+        messages.image_array(message, SCAN_SHAPE, "float32")
+
+
+def test_a_relative_pose_keeps_every_number() -> None:
+    rng = np.random.default_rng(2)
+    estimate = LocalEstimate(
+        stamp_ns=1_700_000_000_057_142_857,
+        from_stamp_ns=1_700_000_000_000_000_000,
+        origin_stamp_ns=1_699_999_999_999_999_999,
+        relative_xyyaw=rng.normal(size=3),
+        covariance=rng.normal(size=(3, 3)),
+        odom_xyyaw=rng.normal(size=3),
+        motion_feature=rng.normal(size=64).astype(np.float32),
+        place_code=rng.normal(size=128).astype(np.float32),
+        missed_frames=0,
+    )
+    message: RelativePose = over_the_wire(messages.relative_pose_message(estimate, "base"))
+    assert message.header.frame_id == "base"
+    step = messages.relative_step(message)
+    for name, value in vars(step).items():
+        np.testing.assert_array_equal(value, getattr(estimate, name), err_msg=name)
+
+
+def test_odometry_has_the_pose_and_the_mean_velocity() -> None:
+    estimate = LocalEstimate(
+        stamp_ns=2_250_000_000,
+        from_stamp_ns=2_000_000_000,
+        origin_stamp_ns=0,
+        relative_xyyaw=np.array([0.5, -0.1, 0.2]),
+        covariance=np.diag([0.01, 0.02, 0.03]),
+        odom_xyyaw=np.array([1.0, 2.0, np.pi]),
+        motion_feature=np.zeros(0, np.float32),
+        place_code=np.zeros(0, np.float32),
+        missed_frames=0,
+    )
+    message: Odometry = over_the_wire(messages.odometry_message(estimate, np.diag([1.0, 2.0, 3.0]), "odom", "base"))
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base")
+    assert messages.to_ns(message.header.stamp) == 2_250_000_000
+    pose, twist = message.pose.pose, message.twist.twist
+    assert (pose.position.x, pose.position.y, pose.orientation.z) == (1.0, 2.0, 1.0)
+    assert pose.orientation.w == pytest.approx(0.0, abs=1e-15)
+    assert (twist.linear.x, twist.linear.y, twist.angular.z) == (2.0, -0.4, 0.8)
+    assert [message.pose.covariance[index] for index in (0, 7, 35)] == [1.0, 2.0, 3.0]
+    assert [message.twist.covariance[index] for index in (0, 7, 35)] == pytest.approx([0.16, 0.32, 0.48])
+
+
+def test_a_trajectory_keeps_every_number() -> None:
+    expected = update(loops=0)
+    message: Trajectory = over_the_wire(messages.trajectory_message(expected, "map"))
+    assert messages.to_ns(message.header.stamp) == expected.stamps_ns[-1]
+    np.testing.assert_array_equal(message.stamps_ns, expected.stamps_ns)
+    np.testing.assert_array_equal(np.column_stack((message.x, message.y, message.yaw)), expected.poses_xyyaw)
+    np.testing.assert_array_equal(message.moved, expected.moved_m)
+
+
+def test_loops_are_lines_between_their_poses() -> None:
+    expected = update(loops=2)
+    message: MarkerArray = over_the_wire(messages.loop_markers(expected, "map"))
+    (marker,) = message.markers
+    assert (marker.type, marker.action, marker.header.frame_id) == (Marker.LINE_LIST, Marker.ADD, "map")
+    ends = [[point.x, point.y] for point in marker.points]
+    np.testing.assert_array_equal(ends, expected.poses_xyyaw[[0, 4, 1, 3], :2])
+    assert [color.a for color in marker.colors] == [0.25, 0.25, 1.0, 1.0]
+
+
+def test_without_loops_the_lines_are_deleted() -> None:
+    (marker,) = messages.loop_markers(update(loops=0), "map").markers
+    assert marker.action == Marker.DELETE
