@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 
 from demo.graph import NodeSpec
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 60.0
 
 Result = TypeVar("Result")
 

@@ -34,6 +34,8 @@ from ngo_estimator.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe, wait_until
 
+pytestmark = pytest.mark.processes
+
 STEP_NS = 100_000_000
 RUN_NS = 1_000_000_000_000
 FIRST_RUN_NS = 1_700_000_000_000_000_000
@@ -287,24 +289,14 @@ def test_doubled_and_late_frames_change_nothing(graph: Graph) -> None:
     graph.local.wait_for_log("dropped image: .*(came twice|older than the last)")
 
 
-def bad_images() -> dict[str, Image]:
-    """Images that the 2D world's node cannot use; each still needs its stamp."""
-    good = scan(2)
-    with_nan, with_infinity = good.copy(), good.copy()
-    with_nan[0, 100, 3], with_infinity[0, 7, 3] = np.nan, np.inf
-    wrong_encoding, short, long = (image_message(good, 0) for _ in range(3))
+def unusable_images() -> list[Image]:
+    """Images of the wrong size, encoding or length, or with values that are not finite."""
+    with_nan = scan(2)
+    with_nan[0, 100, 3] = np.nan
+    wrong_encoding, short = image_message(scan(2), 0), image_message(scan(2), 0)
     wrong_encoding.encoding = "rgb8"
     short.data = short.data[:-16]
-    long.data = long.data.tobytes() + bytes(16)
-    return {
-        "is 240 x 1 pixels; expected 241 x 1": image_message(good[:, :240], 0),
-        "is 241 x 2 pixels": image_message(np.concatenate((good, good)), 0),
-        "has the encoding 'rgb8'; expected '32FC4'": wrong_encoding,
-        "has 3840 bytes in 1 rows": short,
-        "has 3872 bytes in 1 rows": long,
-        "has 1 values that are not finite": image_message(with_nan, 0),
-        "1 values that are not finite": image_message(with_infinity, 0),
-    }
+    return [image_message(scan(2)[:, :240], 0), wrong_encoding, short, image_message(with_nan, 0)]
 
 
 def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
@@ -312,8 +304,8 @@ def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
     graph.start_run()
     graph.play(0, 1)
     graph.action(1)
-    images = bad_images()
-    for message in images.values():
+    images = unusable_images()
+    for message in images:
         message.header.stamp = to_time(graph.stamp_ns(2))
         graph.images.publish(message)
     graph.play(3)
@@ -327,14 +319,6 @@ def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
 
     graph.probe.spin_until(lambda: dropped() >= len(images), "a count of the dropped images")
     assert graph.local.running
-
-
-@pytest.mark.parametrize("reason", list(bad_images()))
-def test_the_reason_of_an_unusable_image_is_clear(reason: str) -> None:
-    from ngo_estimator.nodes.messages import image_array
-
-    with pytest.raises(ValueError, match="image .*" + reason):
-        image_array(bad_images()[reason], (1, 241, 4), "float32")
 
 
 def test_a_late_action_delays_its_frame_and_a_lost_one_drops_it(graph: Graph) -> None:
@@ -548,7 +532,6 @@ def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path, number: sig
         probe.spin_until(
             lambda: ("ngo_node", f"/{number.name}") in probe.node.get_node_names_and_namespaces(),
             "the node",
-            20.0,
         )
         process.send(number)
         assert process.wait() == 0, process.log

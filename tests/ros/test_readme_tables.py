@@ -15,6 +15,8 @@ from .readme_tables import (
     running_nodes,
 )
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def nodes() -> Iterator[dict[str, NodeFacts]]:
