@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
+
 from ngo_sim.maze2d import Maze2DConfig
 from ngo_sim.maze3d import Maze3DConfig
 from ngo_sim.simulator_config import SimulatorConfig

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from demo.picture import save_picture
 from demo.trajectories import Trajectories, evaluate, match, summarise
 from ngo_sim.mazes import prim_maze
@@ -82,7 +83,7 @@ def test_summary_counts_wins_and_takes_medians() -> None:
             "seed": seed,
             "frames": 3,
             "path_m": 7.0,
-            **dict(zip(("odometry", "corrected"), errors)),
+            **dict(zip(("odometry", "corrected"), errors, strict=True)),
         }
 
     summary = summarise([result(1, 1.0, 0.5), result(2, 2.0, 3.0), result(3, 4.0, 1.0)])

@@ -1,4 +1,5 @@
 import pytest
+
 from ngo_sim.drivers import Action
 from ngo_sim.external_actions import ExternalActions
 

@@ -1,6 +1,7 @@
 import struct
 
 import pytest
+
 from ngo_sim.flow_control import FlowControl, Pacer, header_stamp_ns
 
 

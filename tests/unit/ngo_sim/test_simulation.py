@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+
 from ngo_sim.drivers import Action
 from ngo_sim.episodes import record_episode
 from ngo_sim.maze2d import Maze2D

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+
 from ngo_sim.maze2d import Maze2DConfig
 from ngo_sim.maze3d import Maze3DConfig
 from ngo_sim.simulator_config import SimulatorConfig, field_descriptions
@@ -75,5 +76,5 @@ def test_a_field_without_description_is_a_mistake() -> None:
 
         size: int = 1
 
-    with pytest.raises(ValueError, match="Silent.size is described nowhere"):
+    with pytest.raises(ValueError, match=r"Silent\.size is described nowhere"):
         field_descriptions(Silent)

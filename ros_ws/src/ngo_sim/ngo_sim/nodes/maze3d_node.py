@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import array
+import contextlib
+import os
 import sys
 
 from builtin_interfaces.msg import Time
@@ -43,6 +45,12 @@ class Maze3DNode(SimulatorNode):
 
     def make_world(self) -> World:
         """The world of the parameters."""
+        # The engine is a child process. An engine that outlives a killed node must not keep the lock files of DDS,
+        # which would disturb every later process.
+        for descriptor in map(int, os.listdir("/proc/self/fd")):
+            if descriptor > 2:
+                with contextlib.suppress(OSError):  # the listing's own is closed by now
+                    os.set_inheritable(descriptor, False)
         return Maze3D(self.world_config)
 
     def publish_sensors(self, frame: Frame, stamp: Time) -> None:

@@ -1,0 +1,57 @@
+"""The demo as a person starts it, with untrained weights: then the corrected path is the odometry."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from ngo_estimator.checkpoint import write_untrained
+
+pytestmark = pytest.mark.processes
+
+DEMO = Path(__file__).parents[2] / "demo" / "run.py"
+FRAMES = 30
+ERRORS = ["position_rmse_m", "final_percent", "heading_rmse_deg"]
+
+
+def run_demo(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(DEMO), "--world", "maze2d", "--frames", str(FRAMES), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=150, env=os.environ)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("weights")
+    write_untrained(folder, "maze2d")
+    return folder
+
+
+def test_ends_with_the_table_as_json(weights: Path, tmp_path: Path) -> None:
+    done = run_demo("--weights", str(weights), "--out", str(tmp_path), "--latency")
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = json.loads(done.stdout.splitlines()[-1])
+    latency = result.pop("latency_ms")
+    assert list(result) == ["world", "seed", "frames", "path_m", "odometry", "corrected"]
+    assert (result["world"], result["seed"], result["frames"]) == ("maze2d", 2000, FRAMES)
+    assert list(result["odometry"]) == list(result["corrected"]) == ERRORS
+    assert result["corrected"] == pytest.approx(result["odometry"], abs=1e-3)
+    assert result["path_m"] > 1.0
+    assert 0.0 < latency["median"] <= latency["p99"] <= latency["max"] and latency["frames"] == FRAMES - 1
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+    with (tmp_path / "recording.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and summary.statistics is not None
+    counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+    assert counts["/image"] == counts["/ground_truth"] == FRAMES
+    assert counts["/odom"] == counts["/ngo/path"] == counts["/ngo/pose"] == FRAMES - 1
+
+
+def test_says_which_node_failed_and_why(tmp_path: Path) -> None:
+    done = run_demo("--weights", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
+    assert done.returncode == 1
+    assert "ended with exit code 2; it wrote last:" in done.stderr and "nowhere" in done.stderr
+    assert "Traceback" not in done.stderr

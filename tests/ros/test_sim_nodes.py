@@ -1,0 +1,300 @@
+"""The simulator nodes as real processes over DDS."""
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from nav_msgs.msg import Odometry
+from ngo_msgs.msg import DiscreteAction
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, LaserScan
+
+from ngo_sim.episodes import Episode, record_episode
+from ngo_sim.maze2d import Maze2D, Maze2DConfig
+from ngo_sim.maze3d import Maze3D
+from ngo_sim.nodes.parameters import BadParameter, ConfigParameters
+from ngo_sim.simulator_config import SimulatorConfig
+
+from .processes import NodeProcess, Probe
+
+pytestmark = pytest.mark.processes
+
+SEED = 7
+FRAMES = 25
+DRIVERS = {"maze2d": "corners", "maze3d": "random_goals"}
+
+
+@pytest.fixture
+def probe() -> Iterator[Probe]:
+    probe = Probe()
+    yield probe
+    probe.close()
+
+
+def simulator(world: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
+    return NodeProcess("ngo_sim", world, parameters, ros_arguments)
+
+
+def stamp_ns(message: Any) -> int:
+    stamp: Time = message if isinstance(message, Time) else message.header.stamp
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def stamps(messages: list[Any]) -> list[int]:
+    return [stamp_ns(message) for message in messages]
+
+
+def xyyaw(message: Odometry) -> tuple[float, float, float]:
+    pose = message.pose.pose
+    return pose.position.x, pose.position.y, 2 * math.atan2(pose.orientation.z, pose.orientation.w)
+
+
+def pixels(messages: list[Image], dtype: type, *shape: int) -> np.ndarray:
+    return np.array([np.frombuffer(message.data, dtype).reshape(shape) for message in messages])
+
+
+class Run:
+    """What one simulator published until it ended by itself."""
+
+    def __init__(self, probe: Probe, world: str, sensor_type: type, sensor: str, **parameters: Any) -> None:
+        self.actions = probe.collect(DiscreteAction, "action")
+        self.truth = probe.collect(Odometry, "ground_truth")
+        self.clock = probe.collect(Clock, "/clock")
+        self.sensor = probe.collect(sensor_type, sensor)
+        self.images = probe.collect(Image, "image")  # last: the simulator waits for this one
+        with simulator(
+            world, seed=SEED, frames=FRAMES, rate=0, wait_for_subscribers=1, publish_clock=True, **parameters
+        ) as node:
+            probe.spin_until(lambda: len(self.images) == FRAMES, "all images")
+            self.topics = dict(probe.node.get_topic_names_and_types())
+            probe.spin_until(lambda: not node.running, "the simulator's end")
+            probe.spin_until(lambda: len(self.sensor) == len(self.truth) == FRAMES, "everything else")
+            assert node.wait() == 0, node.log
+
+    def check(self, episode: Episode, period_s: float) -> None:
+        """Compare with what the core records without ROS."""
+        expected = [10**9 + round(frame * period_s * 1e9) for frame in range(FRAMES)]
+        assert stamps(self.images) == stamps(self.truth) == stamps(self.sensor) == expected
+        assert stamps(self.actions) == expected[:-1]
+        assert [stamp_ns(message.clock) for message in self.clock] == expected
+        assert [message.action for message in self.actions] == episode.actions.tolist()
+        np.testing.assert_allclose([xyyaw(message) for message in self.truth], episode.poses_xyyaw, atol=1e-12)
+        speeds = [math.hypot(m.twist.twist.linear.x, m.twist.twist.linear.y) for m in self.truth]
+        steps = np.linalg.norm(np.diff(episode.poses_xyyaw[:, :2], axis=0), axis=1)
+        assert speeds[0] == 0.0
+        np.testing.assert_allclose(np.array(speeds[1:]) * period_s, steps, rtol=0.02, atol=1e-9)
+        assert {m.header.frame_id for m in self.truth} == {"map"}
+        assert {m.child_frame_id for m in self.truth} == {"base_link"}
+        assert "/tf" not in self.topics
+
+
+def test_maze2d_publishes_what_the_core_records(probe: Probe) -> None:
+    run = Run(probe, "maze2d", LaserScan, "scan")
+    episode = record_episode(Maze2D(), DRIVERS["maze2d"], FRAMES, SEED)
+    run.check(episode, 0.1)
+    image, scan = run.images[0], run.sensor[0]
+    assert (image.height, image.width, image.encoding, image.step) == (1, 241, "32FC4", 241 * 16)
+    np.testing.assert_array_equal(pixels(run.images, np.float32, 241, 4), episode.observations)
+    np.testing.assert_array_equal([message.ranges for message in run.sensor], episode.observations[:, ::-1, 3])
+    assert math.degrees(scan.angle_min) == pytest.approx(-150)
+    assert math.degrees(scan.angle_max) == pytest.approx(150)
+    assert scan.angle_min + 240 * scan.angle_increment == pytest.approx(scan.angle_max, abs=1e-5)
+    assert max(max(message.ranges) for message in run.sensor) < scan.range_max
+    assert scan.header.frame_id == image.header.frame_id == "base_link"
+
+
+def test_maze3d_publishes_what_the_core_records(probe: Probe) -> None:
+    run = Run(probe, "maze3d", CameraInfo, "camera_info")
+    env = Maze3D()
+    episode = record_episode(env, DRIVERS["maze3d"], FRAMES, SEED)
+    env.close()
+    run.check(episode, 2 / 35)
+    image, info = run.images[0], run.sensor[0]
+    assert (image.height, image.width, image.encoding, image.step) == (60, 80, "rgb8", 240)
+    np.testing.assert_array_equal(pixels(run.images, np.uint8, 60, 80, 3), episode.observations)
+    assert (info.width, info.height) == (80, 60)
+    assert math.degrees(2 * math.atan(40 / info.k[0])) == pytest.approx(108)
+    assert (info.k[2], info.k[5]) == (39.5, 29.5)
+    assert info.header.frame_id == image.header.frame_id == "camera_optical_frame"
+
+
+def test_none_is_lost_by_a_slow_subscriber(probe: Probe) -> None:
+    """A consumer whose queue holds no more than what may be in flight, and that answers late."""
+    in_flight = 3
+    images = probe.collect(Image, "image", QoSProfile(depth=in_flight + 1))
+    answer = probe.node.create_publisher(Odometry, "odom", 10)
+    with simulator(
+        "maze2d",
+        frames=FRAMES,
+        rate=0,
+        max_in_flight=in_flight,
+        wait_for_subscribers=1,
+        flow_control_topics=["odom"],
+        wait_for_flow_control=True,
+    ) as node:
+        # Motion has no answer to the first frame, so one more than max_in_flight comes; then nothing until an answer.
+        probe.spin_until(lambda: len(images) == in_flight + 1, "the first frames")
+        probe.spin_until(lambda: answer.get_subscription_count() == 1, "the simulator to listen")
+        for answered in range(1, FRAMES):
+            silent_until = time.monotonic() + 0.02
+            probe.spin_until(lambda until=silent_until: time.monotonic() > until, "silence")
+            assert len(images) == min(answered + in_flight, FRAMES)
+            message = Odometry()
+            message.header.stamp = images[answered].header.stamp
+            answer.publish(message)
+            due = min(answered + 1 + in_flight, FRAMES)
+            probe.spin_until(lambda due=due: len(images) >= due, f"frame {due}")
+        assert node.wait() == 0, node.log
+    assert stamps(images) == [10**9 + 10**8 * frame for frame in range(FRAMES)]
+
+
+def test_goes_on_without_a_consumer_that_never_answers(probe: Probe) -> None:
+    images = probe.collect(Image, "image", QoSProfile(depth=100))
+    answer = probe.node.create_publisher(Odometry, "odom", 10)
+    waiting = {"wait_for_subscribers": 1, "flow_control_topics": ["odom"], "wait_for_flow_control": True}
+    with simulator("maze2d", frames=6, rate=0, max_in_flight=2, stall_timeout_s=0.2, **waiting) as node:
+        probe.spin_until(lambda: len(images) == 6, "all frames")
+        probe.spin_until(lambda: not node.running, "the simulator's end")
+        assert node.wait() == 0
+        assert "no answer on odom for 0.2 s" in node.log
+    probe.node.destroy_publisher(answer)
+
+
+def test_without_a_driver_each_command_is_one_step(probe: Probe) -> None:
+    images, actions = probe.collect(Image, "image"), probe.collect(DiscreteAction, "action")
+    command = probe.node.create_publisher(DiscreteAction, "action_command", 10)
+    wanted = [0, 1, 2, 2, 1, 0, 0]
+    with simulator("maze2d", driver="none", frames=len(wanted) + 1, rate=0, wait_for_subscribers=1) as node:
+        probe.spin_until(lambda: len(images) == 1 and command.get_subscription_count() == 1, "the first frame")
+        for step, action in enumerate(wanted):
+            command.publish(DiscreteAction(action=9))  # is no action, and is dropped
+            command.publish(DiscreteAction(action=action))
+            probe.spin_until(lambda count=step + 2: len(images) == count, f"frame {step + 1}")
+        probe.spin_until(lambda: len(actions) == len(wanted), "all actions")
+        assert node.wait() == 0, node.log
+        assert "action_command dropped: action is 9; allowed: 0 (forward)" in node.log
+    assert [message.action for message in actions] == wanted
+
+
+def test_commands_take_over_from_the_driver_until_their_timeout(probe: Probe) -> None:
+    actions = probe.collect(DiscreteAction, "action")
+    command = probe.node.create_publisher(DiscreteAction, "action_command", 10)
+    with simulator("maze2d", driver="random", rate=100, action_timeout_s=0.3):
+        probe.spin_until(lambda: command.get_subscription_count() == 1 and len(actions) > 20, "the driver")
+        assert len({message.action for message in actions}) == 3
+        command.publish(DiscreteAction(action=DiscreteAction.TURN_LEFT))
+        held = 15  # the driver alone would do that once in 10 million times
+        probe.spin_until(lambda: [m.action for m in actions[-held:]] == [DiscreteAction.TURN_LEFT] * held, "commands")
+        probe.spin_until(lambda: len({m.action for m in actions[-9:]}) == 3, "the driver again")
+
+
+def test_parameters_can_be_described_and_changed_only_where_it_makes_sense(probe: Probe) -> None:
+    images = probe.collect(Image, "image")
+    with simulator("maze2d", rate=0.001, wait_for_subscribers=1):
+        described = probe.call(
+            DescribeParameters, "maze2d/describe_parameters", DescribeParameters.Request(names=["rate", "rows"])
+        ).descriptors
+        assert [entry.read_only for entry in described] == [False, True]
+        assert all(entry.description for entry in described)
+        assert described[0].floating_point_range[0].to_value == 10_000.0
+
+        def change(name: str, value: Any) -> Any:
+            request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+            return probe.call(SetParameters, "maze2d/set_parameters", request).results[0]
+
+        assert not change("rate", -1.0).successful
+        assert not change("seed", 3).successful
+        probe.spin_until(lambda: len(images) == 1, "the first frame; the next is due in 1000 s")
+        assert change("rate", 0.0).successful
+        probe.spin_until(lambda: len(images) > 100, "many frames")
+
+
+def test_wall_stamps_and_a_namespace(probe: Probe) -> None:
+    images = probe.collect(Image, "/robot/camera")
+    before = time.time_ns()
+    remapped = ("-r", "__ns:=/robot", "-r", "image:=camera")
+    with simulator("maze2d", *remapped, frames=5, rate=0, use_wall_stamps=True, wait_for_subscribers=1) as node:
+        probe.spin_until(lambda: len(images) == 5, "the frames")
+        assert node.wait() == 0, node.log
+    received = stamps(images)
+    assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
+
+
+def declare(*arguments: str) -> SimulatorConfig:
+    """What a node of maze2d makes of its arguments, without a process."""
+    context = Context()
+    rclpy.init(args=["--ros-args", *arguments], context=context)
+    node = rclpy.create_node("maze2d", context=context, start_parameter_services=False)
+    try:
+        parameters = ConfigParameters(node)
+        config = parameters.declare(SimulatorConfig, driver="random")
+        parameters.declare(Maze2DConfig)
+        parameters.finish()
+        return config
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("rows:=many", "rows is 'many'; allowed: a whole number"),
+        ("rows:=3.0", "rows is 3.0; allowed: a whole number"),
+        ("rate:=-1.0", "rate is -1.0; allowed: a number from 0 to 10000"),
+        ("driver:=fast", "driver is 'fast'; allowed: one of corners, random_goals, random, none"),
+        ("driver:=5", "driver is 5; allowed: a string"),
+        ("extra_openings:=99", "extra_openings is 99"),
+        ("flow_control_topics:=odom", "flow_control_topics is 'odom'; allowed: a list of strings"),
+        ("drivver:=corners", "drivver is 'corners', but there is no parameter of this name; did you mean driver?"),
+        ("qqq:=1", "qqq is 1, but there is no parameter of this name; allowed: action_timeout_s, "),
+    ],
+)
+def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(argument: str, expected: str) -> None:
+    with pytest.raises(BadParameter) as error:
+        declare("-p", argument)
+    assert expected in str(error.value) and "\n" not in str(error.value)
+
+
+def test_good_parameters_and_defaults() -> None:
+    config = declare("-p", "rate:=10", "-p", "flow_control_topics:=[]", "-p", "seed:=3")
+    assert config == SimulatorConfig(rate=10.0, flow_control_topics=(), seed=3, driver="random")
+
+
+def test_bad_parameters_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text("maze2d:\n  ros__parameters:\n    rowz: 3\n")
+    cases: list[tuple[tuple[str, ...], dict[str, Any], str]] = [
+        ((), {"rows": 1}, "rows is 1; it must be an integer of at least 2"),
+        ((), {"flow_control_topics": ["a b"]}, "flow_control_topics has 'a b'; allowed: names of topics"),
+        (("--params-file", str(file)), {}, "rowz is 3, but there is no parameter of this name; did you mean rows?"),
+        (("-p", "rows"), {}, "-p rows"),
+    ]
+    for arguments, parameters, expected in cases:
+        with simulator("maze2d", *arguments, **parameters) as node:
+            assert node.wait() == 2, node.log
+            lines = [line for line in node.log.splitlines() if "RTPS_" not in line]  # DDS may have its own worries
+            assert len(lines) == 1, node.log
+            assert lines[0].startswith("maze2d: bad parameter: ") and expected in lines[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
+def test_a_signal_ends_it_cleanly(probe: Probe, world: str, number: signal.Signals) -> None:
+    images = probe.collect(Image, "image")
+    with simulator(world, rate=200) as node:
+        probe.spin_until(lambda: len(images) > 3, "some frames")
+        node.send(number)
+        assert node.wait() == 0, node.log
+        assert "Traceback" not in node.log
