@@ -6,7 +6,9 @@ Images are far too many to keep (2000 a trajectory): what the local network and 
 memory-mapped arrays, the features as float16. Run again, it goes on where it was stopped.
 """
 
+import contextlib
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +34,7 @@ class Arguments:
 
     world: str
     """maze2d or maze3d."""
-    trajectories: int = 320
+    trajectories: int = 240
     """Trajectories for training, each in a maze of its own that the local network has not seen."""
     validation_trajectories: int = 32
     """Trajectories of the validation split."""
@@ -103,7 +105,12 @@ def main(arguments: Arguments) -> None:
 
 def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
     if not path.exists():
-        np.lib.format.open_memmap(path, "w+", dtype, shape).flush()
+        # Under its name only once it is whole, and never over the one that another process has begun to fill.
+        partial = path.with_name(f"{path.name}.{os.getpid()}")
+        np.lib.format.open_memmap(partial, "w+", dtype, shape).flush()
+        with contextlib.suppress(FileExistsError):
+            os.link(partial, path)
+        partial.unlink()
     array: np.memmap = np.load(path, mmap_mode="r+")
     if array.shape != shape:
         raise ValueError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")

@@ -3,7 +3,6 @@
 import dataclasses
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +33,20 @@ def revision() -> str:
     return commit + ("+changes" if changes.strip() else "")
 
 
-def record(arguments: Any) -> dict[str, Any]:
-    """How this run was made: command, arguments and revision, for the JSON beside its weights."""
-    values = {name: str(v) if isinstance(v, Path) else v for name, v in dataclasses.asdict(arguments).items()}
-    script = Path(sys.argv[0]).name.removesuffix(".py")
-    command = shlex.join(["python", "-m", f"training.{script}", *sys.argv[1:]])
+def record(script: str, arguments: Any) -> dict[str, Any]:
+    """How this run was made: command, arguments and revision, for the JSON beside its weights.
+
+    Folders are left out: they say where a network was made, not how.
+    """
+    values, changed = {}, []
+    for field in dataclasses.fields(arguments):
+        value = getattr(arguments, field.name)
+        if isinstance(value, Path):
+            continue
+        values[field.name] = value
+        if value != field.default:
+            changed += [f"--{field.name.replace('_', '-')}", str(value)]
+    command = shlex.join(["python", "-m", f"training.{script}", *changed])
     return {"command": command, "arguments": values, "revision": revision()}
 
 

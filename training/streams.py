@@ -71,7 +71,6 @@ class _Stream(IterableDataset[Batch]):
         self.groups = [list(seeds[i : i + _GROUP]) for i in range(first, first + groups * _GROUP, _GROUP)]
 
     def __iter__(self) -> Iterator[Batch]:
-        torch.set_num_threads(1)
         worker = get_worker_info()
         mine = self.groups if worker is None else self.groups[worker.id :: worker.num_workers]
         for seeds in mine:

@@ -178,7 +178,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     final = LocalPoseNetwork(calibrated(training.network, unseen)).eval()
     final.load_state_dict(training.network.state_dict())
     metrics = measure(final, data.fixed)
-    details = {"training": runs.record(arguments), "metrics": {"validation": metrics}}
+    details = {"training": runs.record("train_local", arguments), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{LOCAL}.safetensors", final, LOCAL, world.name, details)
     print("validation", {name: round(value, 5) for name, value in metrics.items()})
     return metrics

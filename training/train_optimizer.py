@@ -43,9 +43,9 @@ class Arguments:
     """Channels of aggregation and optimizer."""
     max_loops: int = 96
     """Loop candidates of a trajectory."""
-    epochs: int = 20
+    epochs: int = 15
     """Epochs; the learning rate falls to zero over all of them."""
-    steps: int = 60
+    steps: int = 40
     """Steps of the optimiser in an epoch."""
     batch_size: int = 8
     """Trajectories in a step."""
@@ -218,7 +218,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     }
     details = {
         "place_encoder_sha256": place_description["sha256"],
-        "training": {**runs.record(arguments), "seconds": round(time.monotonic() - started)},
+        "training": {**runs.record("train_optimizer", arguments), "seconds": round(time.monotonic() - started)},
         "metrics": {"validation": metrics},
     }
     save_checkpoint(folder / f"{OPTIMIZER}.safetensors", training.optimizer, OPTIMIZER, world.name, details)

@@ -161,7 +161,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     with torch.no_grad():
         figures = [training(batch, augment=False) for batch in data.fixed]
     metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]}
-    details = {"training": runs.record(arguments), "metrics": {"validation": metrics}}
+    details = {"training": runs.record("train_place", arguments), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{PLACE}.safetensors", training.networks, PLACE, world.name, details)
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics
