@@ -112,7 +112,7 @@ def test_a_refused_frame_leaves_no_trace(what: str) -> None:
         core.update(0, images[0], None)
         core.update(PERIOD_NS, images[1], 1)
     if what in WRONG:
-        with pytest.raises(UnusableImage, match="expected|not finite"):
+        with pytest.raises(UnusableImage, match=r"expected|not finite"):
             odometry.update(2 * PERIOD_NS, *WRONG[what])
     else:
         with pytest.raises(RejectedFrame):

@@ -12,6 +12,15 @@ from ngo_estimator.checkpoint import CheckpointError, load_optimizer, load_place
 from ngo_estimator.local_odometry import RESTART_AFTER_NS
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
 from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.planar_covariance import propagate
+
+LARGEST_VALUE = 1e4
+"""Largest size of a coordinate (m, rad), feature or code: beyond it the optimizer's float32 has no room to compute."""
+
+LARGEST_ODOMETRY = 1e9
+"""Largest size of a coordinate (m, rad) of the pose in ``odom``, which enters in float64 only."""
+
+_VARIANCES = (1e-12, 1e4)  # what lies below or above is as good as exact or unknown, and float32 has no room for it
 
 
 class RejectedStep(ValueError):
@@ -39,9 +48,9 @@ class TrajectoryUpdate:
     ``stamps_ns`` (n,) int64; ``poses_xyyaw`` (n, 3) corrected, in ``map``; ``odometry_xyyaw`` (n, 3) as the local
     odometry has it; ``moved_m`` (n,) how far this update moved each pose; ``loops`` (e, 2) frame indices, earlier
     first, with ``loop_weights`` (e,) of zero to one; ``map_from_odom_xyyaw`` (3,); ``covariance`` (3, 3) of the last
-    pose in ``map``. ``optimized`` says whether this step ran the optimizer, ``restarted`` whether it began a new
-    trajectory, ``gap`` whether steps before it were lost and composed from the odometry. The arrays are read-only and
-    stay as they are.
+    pose in ``map``, as if the pose where the window begins were exact. ``optimized`` says whether this step ran the
+    optimizer, ``restarted`` whether it began a new trajectory, ``gap`` whether steps before it were lost and composed
+    from the odometry. The arrays are read-only and stay as they are.
     """
 
     stamps_ns: np.ndarray
@@ -69,6 +78,8 @@ class OnlineTrajectory:
         block = optimizer.config.aggregation.block
         if window_frames < 2 * block:
             raise ValueError(f"window_frames is {window_frames}; expected at least {2 * block}, two meta-poses")
+        if optimizer.config.loops and pair_head is None:
+            raise ValueError("an optimizer with loops needs a pair head")
         self._optimizer, self._pair_head = optimizer.eval(), pair_head
         self._block = block
         self._window = window_frames // block * block
@@ -102,7 +113,6 @@ class OnlineTrajectory:
         """Forget everything: the next step begins a new trajectory."""
         self._count = 0  # steps
         self._window_start = 0  # first step in the window, at a boundary of blocks
-        self._done = 0  # steps that the last optimisation covered
         self._stamps = _Rows((), np.int64)
         self._poses = _Rows((3,), np.float64)
         self._odometry = _Rows((3,), np.float64)
@@ -114,7 +124,7 @@ class OnlineTrajectory:
         self._last_odom = np.zeros(3)
         self._loops = np.zeros((0, 2), np.int64)
         self._loop_weights = np.zeros(0)
-        self._block_covariance = np.zeros((3, 3))
+        self._covariance = np.zeros((3, 3))
 
     def update(self, step: RelativeStep) -> TrajectoryUpdate:
         """Take the next step and give the whole trajectory.
@@ -124,11 +134,12 @@ class OnlineTrajectory:
         so does one that lies ``RESTART_AFTER_NS`` or more in the past.
 
         Raises:
-            RejectedStep: values that are not finite or of the wrong size, a stamp that came already, or a little late.
+            RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
+                that is a little late. The trajectory is as it was before.
         """
         self._check(step)
         restarted, gap = False, False
-        relative, log_std = step.relative_xyyaw, 0.5 * np.log(np.diagonal(step.covariance))
+        relative, variance = step.relative_xyyaw, np.diagonal(step.covariance)
         if self._count:
             last = int(self._stamps.values[-1])
             if step.stamp_ns <= last - RESTART_AFTER_NS or step.origin_stamp_ns != self._origin_stamp_ns:
@@ -137,11 +148,11 @@ class OnlineTrajectory:
             elif step.stamp_ns <= last:
                 raise RejectedStep(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
             elif step.from_stamp_ns != last:
-                relative, log_std = self._over_gap(step, log_std, last)
+                relative, variance = self._over_gap(step, last)
                 gap = True
         if self._count == 0:
             self._begin(step)
-        self._append(step, relative, log_std)
+        self._append(step, relative, np.clip(variance, *_VARIANCES))
         optimized = self._count % self._block == 0
         moved = np.zeros(self._count + 1)
         if optimized:
@@ -163,6 +174,8 @@ class OnlineTrajectory:
                 raise RejectedStep(f"{name} is of shape {value.shape}; expected {shape}")
             if not np.isfinite(value).all():
                 raise RejectedStep(f"{name} has values that are not finite")
+            if name != "covariance":
+                _check_size(name, value, LARGEST_ODOMETRY if name == "odom_xyyaw" else LARGEST_VALUE)
         if not (np.diagonal(step.covariance) > 0.0).all():
             raise RejectedStep(
                 f"covariance has the variances {np.diagonal(step.covariance).tolist()}; expected positive ones"
@@ -170,15 +183,16 @@ class OnlineTrajectory:
         if step.from_stamp_ns >= step.stamp_ns:
             raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")
 
-    def _over_gap(self, step: RelativeStep, log_std: np.ndarray, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Relative pose and deviations from the last frame that is known to the one of ``step``.
+    def _over_gap(self, step: RelativeStep, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Relative pose and variances from the last frame that is known to the one of ``step``.
 
         The variance of the step stands for all that were lost, in proportion to the time that they took.
         """
         odom = torch.from_numpy(np.stack((self._last_odom, step.odom_xyyaw)))
         relative = se2.between(odom[0], odom[1]).numpy()
+        _check_size("the motion over lost steps", relative, LARGEST_VALUE)
         longer = (step.stamp_ns - last_ns) / (step.stamp_ns - step.from_stamp_ns)
-        return relative, log_std + 0.5 * np.log(max(longer, 1.0))
+        return relative, np.diagonal(step.covariance) * max(longer, 1.0)
 
     def _begin(self, step: RelativeStep) -> None:
         self._origin_stamp_ns = step.origin_stamp_ns
@@ -188,18 +202,19 @@ class OnlineTrajectory:
         self._poses.append(np.zeros(3))
         self._odometry.append(before.numpy())
         self._motion = _Rows(step.motion_feature.shape, np.float32)
-        self._codes = _Rows(step.place_code.shape, np.float32)
+        self._codes = _Rows((0,) if self._pair_head is None else step.place_code.shape, np.float32)
 
-    def _append(self, step: RelativeStep, relative: np.ndarray, log_std: np.ndarray) -> None:
+    def _append(self, step: RelativeStep, relative: np.ndarray, variance: np.ndarray) -> None:
         assert self._motion is not None and self._codes is not None
         pose = se2.compose(torch.from_numpy(self._poses.values[-1]), torch.from_numpy(relative.astype(np.float64)))
         self._stamps.append(step.stamp_ns)
         self._poses.append(pose.numpy())
         self._odometry.append(step.odom_xyyaw)
         self._relative.append(relative)
-        self._log_std.append(log_std)
+        self._log_std.append(0.5 * np.log(variance))
         self._motion.append(step.motion_feature)
-        self._codes.append(step.place_code)
+        self._codes.append(step.place_code if self._pair_head is not None else ())
+        self._covariance = propagate(self._covariance, pose.numpy(), relative, np.diag(variance))
         self._last_odom = np.array(step.odom_xyyaw)
         self._count += 1
 
@@ -220,12 +235,10 @@ class OnlineTrajectory:
         start = torch.from_numpy(before[self._window_start])
         poses = se2.compose(start, result.poses[0].double())
         self._poses.replace(self._window_start + 1, poses.numpy())
-        self._done = self._count
         rotation = se2.rotate(start[2].expand(2), torch.eye(2, dtype=torch.float64)).mT
-        covariance = result.end_covariance()[0].double()
-        covariance[:2] = rotation @ covariance[:2]
-        covariance[:, :2] = covariance[:, :2] @ rotation.mT
-        self._block_covariance = covariance.numpy()
+        map_from_window = torch.block_diag(rotation, torch.ones(1, 1, dtype=torch.float64))
+        covariance = map_from_window @ result.end_covariance()[0] @ map_from_window.mT
+        self._covariance = covariance.numpy()
         if result.loops is not None and result.loop_weights is not None:
             valid = result.loops.valid[0]
             ends = (result.loops.end[0][valid] + 1) * self._block
@@ -237,16 +250,15 @@ class OnlineTrajectory:
     def _result(self, moved: np.ndarray, optimized: bool, restarted: bool, gap: bool) -> TrajectoryUpdate:
         corrected = torch.from_numpy(self._poses.values[-1].copy())
         odom = torch.from_numpy(self._last_odom)
-        tail = np.exp(2.0 * self._log_std.values[self._done :].astype(np.float64)).sum(axis=0)
         return TrajectoryUpdate(
             stamps_ns=self._stamps.frozen(),
             poses_xyyaw=self._poses.frozen(),
             odometry_xyyaw=self._odometry.frozen(),
-            moved_m=moved,
-            loops=self._loops,
-            loop_weights=self._loop_weights,
-            map_from_odom_xyyaw=se2.compose(corrected, se2.inverse(odom)).numpy(),
-            covariance=self._block_covariance + np.diag(tail),
+            moved_m=_read_only(moved),
+            loops=_read_only(self._loops),
+            loop_weights=_read_only(self._loop_weights),
+            map_from_odom_xyyaw=_read_only(se2.compose(corrected, se2.inverse(odom)).numpy()),
+            covariance=_read_only(0.5 * (self._covariance + self._covariance.T)),
             optimized=optimized,
             restarted=restarted,
             gap=gap,
@@ -284,7 +296,7 @@ class _Rows:
     """A growing array of equal rows; earlier views stay valid and unchanged unless ``replace`` copies."""
 
     def __init__(self, shape: tuple[int, ...], dtype: type) -> None:
-        self._buffer = np.zeros((256, *shape), dtype)
+        self._buffer: np.ndarray = np.zeros((256, *shape), dtype)
         self._used = 0
 
     @property
@@ -304,6 +316,15 @@ class _Rows:
 
     def frozen(self) -> np.ndarray:
         """A read-only view of all rows."""
-        view = self.values
-        view.flags.writeable = False
-        return view
+        return _read_only(self.values)
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _check_size(name: str, value: np.ndarray, limit: float) -> None:
+    if (largest := np.abs(value).max(initial=0.0)) > limit:
+        raise RejectedStep(f"{name} has values as large as {largest:g}; expected at most {limit:g}")
