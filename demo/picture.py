@@ -21,53 +21,47 @@ TRUTH, ODOMETRY, CORRECTED = "#1f6fd6", "#2ca02c", "#ff7f0e"
 
 def save_picture(path: Path, maze: Maze, trajectories: Trajectories, result: dict[str, Any]) -> None:
     """Write a PNG: odometry beside the corrected path, each over the truth and the maze."""
-    figure, panels = plt.subplots(1, 2, figsize=(13, 6.8), sharex=True, sharey=True, layout="constrained")
-    shown = (
-        (panels[0], "odometry", trajectories.odometry, ODOMETRY),
-        (panels[1], "corrected", trajectories.corrected, CORRECTED),
-    )
-    for axes, name, estimate, color in shown:
+    shown = (("odometry", trajectories.odometry, ODOMETRY), ("corrected", trajectories.corrected, CORRECTED))
+    low, high = _view(maze, [trajectories.in_maze(poses) for _, poses, _ in shown])
+    width = 6.2
+    height = width * float(np.clip((high - low)[1] / (high - low)[0], 0.4, 2.0))
+    figure, panels = plt.subplots(1, 2, figsize=(2 * width, height + 1.7), sharex=True, sharey=True)
+    for axes, (name, estimate, color) in zip(panels, shown, strict=True):
         draw_maze(axes, maze)
-        _line(axes, trajectories.truth, TRUTH, "truth", 1.6)
         placed = trajectories.in_maze(estimate)
+        _line(axes, trajectories.truth, TRUTH, "truth", 1.6)
         _line(axes, placed, color, name, 1.3)
-        axes.plot(*trajectories.truth[0, :2], "o", color="black", markersize=7, label="start", zorder=5)
-        axes.plot(
-            *placed[-1, :2], "X", color=color, markeredgecolor="black", markersize=10, label=f"end ({name})", zorder=6
-        )
-        axes.plot(
-            *trajectories.truth[-1, :2],
-            "X",
-            color=TRUTH,
-            markeredgecolor="black",
-            markersize=10,
-            label="end (truth)",
-            zorder=5,
-        )
+        _mark(axes, trajectories.truth[0], "o", "black", "start")
+        _mark(axes, placed[-1], "X", color, f"end ({name})")
+        _mark(axes, trajectories.truth[-1], "X", TRUTH, "end (truth)")
         errors = result[name]
         axes.set_title(
-            f"{name}: position RMSE {errors['position_rmse_m']:.2f} m, end {errors['final_percent']:.2f} % "
-            f"of the path off, heading RMSE {errors['heading_rmse_deg']:.1f}°",
+            f"{name}: position RMSE {errors['position_rmse_m']:.2f} m, end off by {errors['final_percent']:.2f} % of "
+            f"the path,\nheading RMSE {errors['heading_rmse_deg']:.1f}°",
             fontsize=10,
         )
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=5, frameon=False, fontsize=9)
-    _show_everything(panels[0], maze, [trajectories.in_maze(poses) for _, _, poses, _ in shown])
-    figure.suptitle(
-        f"{result['world']}, seed {result['seed']}: {result['frames']} frames, {result['path_m']:.0f} m", fontsize=13
-    )
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.55 / height), ncols=5, frameon=False, fontsize=8)
+    panels[1].set_ylabel("")
+    total = height + 1.7
+    figure.subplots_adjust(left=0.05, right=0.99, wspace=0.06, bottom=0.85 / total, top=1 - 0.85 / total)
+    title = f"{result['world']}, seed {result['seed']}: {result['frames']} frames, {result['path_m']:.0f} m"
+    figure.suptitle(title, fontsize=13, y=1 - 0.12 / total, va="top")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def _mark(axes: Axes, pose: Poses, marker: str, color: str, label: str) -> None:
+    axes.plot(*pose[:2], marker, color=color, markeredgecolor="black", markersize=9, label=label, zorder=5)
 
 
 def _line(axes: Axes, poses: Poses, color: str, label: str, width: float) -> None:
     axes.plot(poses[:, 0], poses[:, 1], color=color, linewidth=width, label=label, alpha=0.9, zorder=3)
 
 
-def _show_everything(axes: Axes, maze: Maze, estimates: list[Poses]) -> None:
-    """Widen the view where an estimate left the maze."""
+def _view(maze: Maze, estimates: list[Poses]) -> tuple[Poses, Poses]:
+    """Lower left and upper right (2,) of what to show: the maze, and more where an estimate left it."""
     margin = 0.3 * maze.block_m
     points = np.concatenate([poses[:, :2] for poses in estimates])
-    low = np.minimum(points.min(axis=0) - margin, 0.0)
-    high = np.maximum(points.max(axis=0) + margin, maze.size_m)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    return np.minimum(points.min(axis=0) - margin, 0.0), np.maximum(points.max(axis=0) + margin, maze.size_m)
