@@ -89,7 +89,7 @@ def unusable_images() -> list[tuple[Image, str]]:
 
 @pytest.mark.parametrize(("message", "reason"), unusable_images(), ids=[reason for _, reason in unusable_images()])
 def test_what_is_wrong_with_an_image_is_named(message: Image, reason: str) -> None:
-    with pytest.raises(ValueError, match="^image .*") as error:
+    with pytest.raises(ValueError, match="image") as error:
         messages.image_array(message, SCAN_SHAPE, "float32")
     assert str(error.value) == f"image {reason}"
 
