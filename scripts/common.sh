@@ -78,14 +78,13 @@ find_python() {
 # step NAME COMMAND...: runs the command with its output in a log; shows that it goes on; on failure names the step, the
 # log and the log's last lines. V=1 shows everything.
 step() {
-    local name="$1" log seconds=0 pid
+    local name="$1" log began=$SECONDS shown=0 seconds pid
     shift
     mkdir -p "$LOGS"
     log="$LOGS/$(echo "$name" | tr -cs 'a-zA-Z0-9\n' '-').log"
     say "$name ..."
     if [ -n "${V-}" ]; then
-        "$@" 2>&1 | tee "$log"
-        [ "${PIPESTATUS[0]}" = 0 ] || die "$name (log: $log)"
+        if ! "$@" 2>&1 | tee "$log"; then die "$name; the whole log: $log"; fi
         return
     fi
     "$@" >"$log" 2>&1 &
@@ -94,15 +93,17 @@ step() {
     trap 'kill "$pid" 2>/dev/null; exit 130' INT TERM
     while kill -0 "$pid" 2>/dev/null; do
         sleep 1
-        seconds=$((seconds + 1))
+        seconds=$((SECONDS - began))
         if [ -t 1 ]; then
             printf '\r\033[K[ngo]   %3d s  %s' "$seconds" "$(tail -n 1 "$log" | tr -d '\r' | cut -c 1-90)"
-        elif [ $((seconds % 20)) = 0 ]; then
+        elif [ $((seconds - shown)) -ge 20 ]; then
+            shown=$seconds
             say "  $seconds s  $(tail -n 1 "$log" | tr -d '\r' | cut -c 1-90)"
         fi
     done
     if [ -t 1 ]; then printf '\r\033[K'; fi
     trap - INT TERM
+    seconds=$((SECONDS - began))
     if ! wait "$pid"; then
         tail -n 25 "$log" | sed 's/^/    /' >&2
         die "$name, after $seconds s; the whole log: $log"

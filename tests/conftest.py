@@ -1,7 +1,10 @@
-"""Gives each test run a ROS 2 domain of its own, and removes what its killed processes leave in shared memory."""
+"""Gives each test run a ROS 2 domain of its own, and removes what its killed processes leave behind."""
 
+import contextlib
+import ctypes
 import fcntl
 import os
+import signal
 import tempfile
 import time
 from collections.abc import Iterator
@@ -35,9 +38,32 @@ os.environ["ROS_DOMAIN_ID"] = str(_domain)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
-def transport_files() -> set[Path]:
-    """Fast DDS's files in shared memory."""
-    return {*SHARED_MEMORY.glob("fastrtps_*"), *SHARED_MEMORY.glob("sem.fastrtps_*")}
+# Linux's prctl: a grandchild whose parent has died becomes this process's child, so that it can be ended. A killed
+# maze3d leaves the ViZDoom that it started, which keeps the locks on Fast DDS's ports that it has inherited.
+PR_SET_CHILD_SUBREAPER = 36
+ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def children() -> set[int]:
+    """Process ids of this process's children, adopted ones included."""
+    found: set[int] = set()
+    for task in Path("/proc/self/task").iterdir():
+        found.update(int(pid) for pid in (task / "children").read_text().split())
+    return found
+
+
+def end_leftover_children(before: set[int]) -> None:
+    """Kill and collect every child that has come since `before`."""
+    for pid in children() - before:
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+
+
+def shared_memory_files() -> set[Path]:
+    """Files of Fast DDS and of ViZDoom in shared memory."""
+    patterns = ("fastrtps_*", "sem.fastrtps_*", "ViZDoom*")
+    return {path for pattern in patterns for path in SHARED_MEMORY.glob(pattern)}
 
 
 def files_in_use() -> set[str]:
@@ -56,11 +82,11 @@ def files_in_use() -> set[str]:
 
 
 def remove_orphans(before: set[Path]) -> list[Path]:
-    """Remove the transport files that came since `before` and that no living process uses."""
+    """Remove the shared memory files that came since `before` and that no living process uses."""
     now = time.time()
     used = files_in_use()
     removed = []
-    for path in transport_files() - before:
+    for path in shared_memory_files() - before:
         try:
             status = path.stat()
             # A file this young may belong to a process that has not mapped it yet.
@@ -74,8 +100,9 @@ def remove_orphans(before: set[Path]) -> list[Path]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def clean_shared_memory() -> Iterator[None]:
-    """`kill -9` leaves Fast DDS's files behind, and tests kill processes: remove what this run's have left."""
-    before = transport_files()
+def leave_nothing_behind() -> Iterator[None]:
+    """Remove what the killed processes of this run leave: their own children, and files in shared memory."""
+    files, processes = shared_memory_files(), children()
     yield
-    remove_orphans(before)
+    end_leftover_children(processes)
+    remove_orphans(files)

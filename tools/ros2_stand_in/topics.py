@@ -136,7 +136,7 @@ def hz(topic: str, window: int) -> int:
     """`ros2 topic hz TOPIC`."""
     with command_node() as node:
         name = full_topic_name(node, topic)
-        found = poll(lambda: published_type(node, name), timeout_s=1.0)
+        found = poll(lambda: published_type(node, name))
         if found is None:
             print(f"WARNING: topic [{topic}] does not appear to be published yet", flush=True)
             found = poll(lambda: published_type(node, name), timeout_s=math.inf)
