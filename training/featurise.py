@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from training.streams import images_of, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 
 _GROUP = 8  # mazes of one size
+_MADE_WITH = "networks.json"
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def main(arguments: Arguments) -> None:
     """Make the arrays ``WORLD/features/{train,validation}/NAME.npy`` of shape ``(trajectories, steps, ...)``."""
     world = world_named(arguments.world)
     folder = arguments.weights / world.name
-    networks = (load_local(folder, world.name)[0], load_place(folder, world.name)[0])
+    local, local_description = load_local(folder, world.name)
+    place, place_description = load_place(folder, world.name)
     splits = {
         "train": list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories]),
         "validation": list(VALIDATION_SEEDS[-arguments.validation_trajectories :]),
@@ -86,6 +89,8 @@ def main(arguments: Arguments) -> None:
     for split, seeds in splits.items():
         store = arguments.out / world.name / "features" / split
         store.mkdir(parents=True, exist_ok=True)
+        check_networks(store, local_description, place_description)
+        (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
         progress = store / f"done.{arguments.part}of{arguments.parts}.json"
         done = set(json.loads(progress.read_text())) if progress.exists() else set()
         bar = tqdm(
@@ -95,12 +100,33 @@ def main(arguments: Arguments) -> None:
         for first, group in _groups(seeds, arguments.part, arguments.parts):
             if first not in done:
                 for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1)):
-                    for name, value in features_of(world, episode, folder, networks).items():
+                    for name, value in features_of(world, episode, folder, (local, place)).items():
                         _array(store / f"{name}.npy", (len(seeds), *value.shape), value.dtype)[first + offset] = value
                 done.add(first)
                 progress.write_text(json.dumps(sorted(done)))
             bar.update()
         bar.close()
+
+
+def check_networks(store: Path, local_description: dict[str, Any], place_description: dict[str, Any]) -> None:
+    """Raise ``ValueError`` if what is in ``store`` was made with other networks than those described."""
+    path, networks = store / _MADE_WITH, [local_description["sha256"], place_description["sha256"]]
+    if path.exists() and json.loads(path.read_text()) != networks:
+        raise ValueError(f"{store} was made with other networks than the present ones; remove it to make it anew")
+
+
+def open_store(store: Path) -> dict[str, np.ndarray]:
+    """The arrays of a whole feature store, memory-mapped; raises ``ValueError`` if it is not whole."""
+    names = ("relative", "log_std", "motion", "codes", "truth")
+    hint = "run `python -m training.featurise` first"
+    if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
+        raise ValueError(f"{store} lacks {missing}; expected a feature store: {hint}")
+    arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in names}
+    count = len(arrays["relative"])
+    done = {first for path in store.glob("done.*.json") for first in json.loads(path.read_text())}
+    if left := set(range(0, count, _GROUP)) - done:
+        raise ValueError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
+    return arrays
 
 
 def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:

@@ -107,9 +107,13 @@ class _Data(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
+
+    def validation(self) -> list[Batch]:
+        """The batches of the validation split, made when they are first needed."""
         if not self.fixed:
             self.fixed = episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
-        return DataLoader(self.fixed, batch_size=None)  # type: ignore[arg-type]
+        return self.fixed
 
 
 def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
@@ -149,7 +153,9 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
     truth = torch.cat([p["relative"] for p in pairs]).double()
     mean, std = list(network.config.relative_mean), list(network.config.relative_std)
     for i in range(3):
-        scale, bias = np.polyfit(estimates[:, i].numpy(), truth[:, i].numpy(), 1)
+        fitted, _ = np.polyfit(estimates[:, i].numpy(), truth[:, i].numpy(), 1)
+        scale = max(fitted, 0.01)  # what was not learned at all may fit best mirrored; a deviation stays positive
+        bias = float((truth[:, i] - scale * estimates[:, i]).mean())
         mean[i], std[i] = float(scale * mean[i] + bias), float(scale * std[i])
     return dataclasses.replace(
         network.config, relative_mean=(mean[0], mean[1], mean[2]), relative_std=(std[0], std[1], std[2])
@@ -177,7 +183,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     unseen = episode_pairs(world, list(OPTIMIZER_TRAIN_SEEDS[-32:]))
     final = LocalPoseNetwork(calibrated(training.network, unseen)).eval()
     final.load_state_dict(training.network.state_dict())
-    metrics = measure(final, data.fixed)
+    metrics = measure(final, data.validation())
     details = {"training": runs.record("train_local", arguments), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{LOCAL}.safetensors", final, LOCAL, world.name, details)
     print("validation", {name: round(value, 5) for name, value in metrics.items()})

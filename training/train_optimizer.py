@@ -25,6 +25,7 @@ from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGra
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import PoseAggregationConfig, poses_in_blocks
 from training import runs
+from training.featurise import check_networks, open_store
 from training.streams import Batch
 from training.worlds import world_named
 
@@ -78,14 +79,6 @@ class Trajectories(IterableDataset[Batch]):
             chosen = np.sort(rng.choice(trajectories, self.arguments.batch_size, replace=False))
             start = int(rng.integers(0, steps - length + 1))
             yield crop(self.arrays, chosen, start, length)
-
-
-def open_store(store: Path) -> dict[str, np.ndarray]:
-    """The arrays of a feature store, memory-mapped."""
-    names = ("relative", "log_std", "motion", "codes", "truth")
-    if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
-        raise ValueError(f"{store} lacks {missing}; expected a feature store: run `python -m training.featurise` first")
-    return {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in names}
 
 
 def crop(arrays: dict[str, np.ndarray], chosen: np.ndarray, start: int, length: int) -> Batch:
@@ -191,7 +184,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics."""
     world = world_named(arguments.world)
     folder = arguments.weights / world.name
-    local, _ = load_local(folder, world.name)
+    local, local_description = load_local(folder, world.name)
     place, place_description = load_place(folder, world.name)
     store = arguments.runs / world.name / "features"
     run = arguments.runs / world.name / f"optimizer-{arguments.form}-{arguments.iterations}-seed{arguments.seed}"
@@ -201,6 +194,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         width=arguments.width,
         relative_std=local.config.relative_std,
     )
+    for split in ("train", "validation"):
+        check_networks(store / split, local_description, place_description)
     scale = correction_scale(store / "validation", aggregation.block)
     make = NeuralGraphOptimizerConfig if arguments.form == "loops" else NeuralGraphOptimizerConfig.paper_form
     config = make(

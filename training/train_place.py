@@ -109,6 +109,10 @@ class PlaceTraining(lightning.LightningModule):
             "other_rejected": (other < 0).float().mean(),
         }
 
+    def on_train_epoch_start(self) -> None:
+        # The brightness of the pictures is random: a resumed training must draw what an unbroken one would have drawn.
+        torch.manual_seed(self.arguments.seed * 1_000_003 + self.current_epoch)
+
     def training_step(self, batch: Batch, _: int) -> Tensor:
         figures = self(batch, augment=True)
         self.log_dict(figures, on_step=False, on_epoch=True, prog_bar=True)
@@ -142,10 +146,14 @@ class _Data(lightning.LightningDataModule):
         return loader(PlaceStream(self.world, seeds, self.trainer.current_epoch, a.batches, a.pairs_a_maze), a.workers)
 
     def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
+
+    def validation(self) -> list[Batch]:
+        """The batches of the validation split, made when they are first needed."""
         if not self.fixed:
             a = self.arguments
             self.fixed = list(PlaceStream(self.world, VALIDATION_SEEDS, 0, a.validation_batches, a.pairs_a_maze))
-        return DataLoader(self.fixed, batch_size=None)  # type: ignore[arg-type]
+        return self.fixed
 
 
 def main(arguments: Arguments) -> dict[str, float]:
@@ -159,7 +167,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     trainer.fit(training, datamodule=data, ckpt_path=runs.resume_from(run))
     training.eval()
     with torch.no_grad():
-        figures = [training(batch, augment=False) for batch in data.fixed]
+        figures = [training(batch, augment=False) for batch in data.validation()]
     metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]}
     details = {"training": runs.record("train_place", arguments), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{PLACE}.safetensors", training.networks, PLACE, world.name, details)

@@ -1,0 +1,73 @@
+"""The training scripts at toy size: short episodes, few mazes, thin networks."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from training import evaluate, featurise, streams, train_local, train_optimizer, train_place, worlds
+
+
+def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:
+    """Episodes of ``frames`` frames (``place_frames`` where places must be seen again), two mazes at a time."""
+    simulate = streams.simulate
+    monkeypatch.setattr(train_local, "simulate", lambda world, seeds, _: simulate(world, seeds[:2], frames))
+    monkeypatch.setattr(streams, "_GROUP", 2)
+    monkeypatch.setattr(featurise, "_GROUP", 2)
+    monkeypatch.setattr(streams.PairStream, "FRAMES", frames)
+    monkeypatch.setattr(streams.PlaceStream, "FRAMES", place_frames)
+    for name, world in worlds.WORLDS.items():
+        monkeypatch.setitem(worlds.WORLDS, name, dataclasses.replace(world, episode_frames=frames - 1, rows=(4, 4)))
+
+
+def local(world: str, folder: Path, epochs: int = 1) -> train_local.Arguments:
+    return train_local.Arguments(
+        world=world,
+        width=0.03,
+        epochs=epochs,
+        datapoints=1,
+        batch_size=32,
+        validation_mazes=1,
+        workers=0,
+        out=folder / "weights",
+        runs=folder / "runs",
+    )
+
+
+def place(world: str, folder: Path, epochs: int = 1) -> train_place.Arguments:
+    return train_place.Arguments(
+        world=world,
+        width=0.03,
+        epochs=epochs,
+        batches=1,
+        pairs_a_maze=4,
+        validation_batches=1,
+        workers=0,
+        out=folder / "weights",
+        runs=folder / "runs",
+    )
+
+
+def features(world: str, folder: Path) -> featurise.Arguments:
+    return featurise.Arguments(
+        world=world, trajectories=4, validation_trajectories=2, weights=folder / "weights", out=folder / "runs"
+    )
+
+
+def optimizer(world: str, folder: Path, epochs: int = 1, form: str = "loops") -> train_optimizer.Arguments:
+    return train_optimizer.Arguments(
+        world=world,
+        form=form,  # type: ignore[arg-type]
+        iterations=2,
+        width=16,
+        max_loops=8,
+        epochs=epochs,
+        steps=3,
+        batch_size=2,
+        weights=folder / "weights",
+        runs=folder / "runs",
+    )
+
+
+def evaluation(world: str, folder: Path) -> evaluate.Arguments:
+    return evaluate.Arguments(world=world, trajectories=2, frames=60, weights=folder / "weights")

@@ -1,0 +1,121 @@
+"""The feature store and what the optimizer's training takes from it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import load_local, load_place, write_untrained
+from training import featurise
+from training.featurise import check_networks, features_of, open_store
+from training.streams import simulate
+from training.train_optimizer import Arguments, Trajectories, correction_scale, crop
+from training.worlds import WORLDS
+
+SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "truth": 3}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """Ten trajectories of 40 steps, of a robot that turns round and round, and an odometry that turns too little."""
+    rng = np.random.default_rng(0)
+    truth_steps = torch.tensor([0.1, 0.0, 0.3], dtype=torch.float64).expand(10, 40, 3)
+    truth = se2.r2g(truth_steps)
+    truth[..., 2] = se2.wrap(truth[..., 2])
+    arrays = {name: rng.random((10, 40, size)).astype(np.float16) for name, size in SHAPES.items()}
+    arrays["relative"] = (truth_steps - torch.tensor([0.0, 0.0, 0.01])).numpy().astype(np.float32)
+    arrays["truth"] = truth.numpy()
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    (tmp_path / "done.0of2.json").write_text("[0]")
+    (tmp_path / "done.1of2.json").write_text("[8]")
+    return tmp_path
+
+
+def test_a_store_that_lacks_an_array_or_a_trajectory_is_refused(store: Path) -> None:
+    assert set(open_store(store)) == set(SHAPES)
+    (store / "done.1of2.json").write_text("[]")
+    with pytest.raises(ValueError, match=r"lacks 1 of 2 groups.*featurise"):
+        open_store(store)
+    (store / "codes.npy").unlink()
+    with pytest.raises(ValueError, match=r"lacks \['codes'\].*featurise"):
+        open_store(store)
+
+
+def test_features_of_other_networks_are_refused(store: Path) -> None:
+    first, second = {"sha256": "a"}, {"sha256": "b"}
+    check_networks(store, first, second)
+    (store / "networks.json").write_text(json.dumps(["a", "b"]))
+    check_networks(store, first, second)
+    with pytest.raises(ValueError, match="made with other networks"):
+        check_networks(store, first, first)
+
+
+def test_arrays_are_made_once_and_their_size_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "relative.npy"
+    featurise._array(path, (3, 4), np.dtype(np.float32))[1] = 7.0
+    again = featurise._array(path, (3, 4), np.dtype(np.float32))
+    assert again[1].tolist() == [7.0] * 4 and not again[0].any()
+    with pytest.raises(ValueError, match="expected"):
+        featurise._array(path, (4, 4), np.dtype(np.float32))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["relative.npy"]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+def test_parts_share_the_groups_without_overlap(parts: int) -> None:
+    seeds = list(range(45))
+    groups = [group for part in range(parts) for group in featurise._groups(seeds, part, parts)]
+    assert sorted(first for first, _ in groups) == list(range(0, 45, 8))
+    assert sorted(seed for _, group in groups for seed in group) == seeds
+    assert all(group[0] == first for first, group in groups)
+
+
+@pytest.mark.parametrize("start", [0, 8, 24])
+def test_a_crop_is_seen_from_the_frame_before_it_with_a_continuous_heading(store: Path, start: int) -> None:
+    arrays = open_store(store)
+    batch = crop(arrays, np.array([1, 4]), start, 16)
+    assert {name: value.shape for name, value in batch.items()} == {n: (2, 16, size) for n, size in SHAPES.items()}
+    assert all(value.dtype == torch.float32 for value in batch.values())
+    expected = se2.r2g(torch.tensor([0.1, 0.0, 0.3]).expand(2, 16, 3))
+    assert torch.allclose(batch["truth"], expected, atol=1e-4)
+
+
+def test_the_scale_of_corrections_is_the_error_of_the_odometry_over_a_meta_pose(store: Path) -> None:
+    x, y, yaw = correction_scale(store, 8)
+    odometry, truth = (se2.r2g(torch.tensor([0.1, 0.0, turn]).expand(8, 3))[-1] for turn in (0.29, 0.3))
+    assert (x, y, yaw) == pytest.approx((odometry - truth).abs().tolist(), rel=1e-2)
+    assert yaw == pytest.approx(0.08, rel=1e-3)
+
+
+def test_batches_of_trajectories_are_a_function_of_seed_and_epoch(store: Path) -> None:
+    arguments = Arguments("maze2d", steps=6, batch_size=4)
+    epochs = [list(Trajectories(store, arguments, epoch, 8)) for epoch in (2, 2, 3)]
+    assert [len(epoch) for epoch in epochs] == [6, 6, 6]
+    lengths = {batch["relative"].shape for epoch in epochs for batch in epoch}
+    assert lengths <= {(4, 40, 3), (4, 16, 3), (4, 8, 3)} and len(lengths) > 1
+    first, again, other = epochs
+    assert all(torch.equal(a["codes"], b["codes"]) for a, b in zip(first, again, strict=True))
+    assert not all(a["codes"].equal(b["codes"]) for a, b in zip(first, other, strict=True))
+
+
+def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> None:
+    world = WORLDS["maze2d"]
+    write_untrained(tmp_path, world.name)
+    local, place = load_local(tmp_path)[0], load_place(tmp_path)[0]
+    (episode,) = simulate(world, [3], 300)  # more than one chunk
+    arrays = features_of(world, episode, tmp_path, (local, place))
+    assert {name: value.shape[0] for name, value in arrays.items()} == dict.fromkeys(SHAPES, 299)
+    images = torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
+    for k in (0, 255, 256, 298):
+        relative, log_std, motion = local(
+            images[k : k + 1], images[k + 1 : k + 2], torch.tensor([int(episode.actions[k])])
+        )
+        np.testing.assert_allclose(arrays["relative"][k], relative[0], atol=1e-5)
+        np.testing.assert_allclose(arrays["log_std"][k], log_std[0], atol=1e-4)
+        np.testing.assert_allclose(arrays["motion"][k], motion[0], atol=2e-3, rtol=2e-3)
+        np.testing.assert_allclose(arrays["codes"][k], place.encoder(images[k + 1 : k + 2])[0], atol=1e-2, rtol=1e-2)
+    truth = se2.between(torch.from_numpy(episode.poses_xyyaw[:1]), torch.from_numpy(episode.poses_xyyaw[1:]))
+    np.testing.assert_allclose(arrays["truth"], truth, atol=1e-12)

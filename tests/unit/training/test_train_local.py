@@ -1,0 +1,78 @@
+"""The local network's training: metrics on paper, and a calibration that removes bias and scale."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from training.streams import Batch
+from training.train_local import calibrated, measure, step_metrics
+from training.worlds import WORLDS
+
+
+@pytest.fixture
+def network() -> LocalPoseNetwork:
+    torch.manual_seed(0)
+    return LocalPoseNetwork(LocalPoseConfig(WORLDS["maze2d"].image, width=0.03, actions=3, period_s=0.1)).eval()
+
+
+def pairs_with_truth(network: LocalPoseNetwork, scale: Tensor, bias: Tensor) -> list[Batch]:
+    """Frames whose true motion is the network's estimate, scaled and shifted."""
+    generator = torch.Generator().manual_seed(1)
+    images = torch.rand(201, 1, 241, 4, generator=generator)
+    batch = {"earlier": images[:-1], "later": images[1:], "action": torch.arange(200) % 3}
+    with torch.no_grad():
+        batch["relative"] = network(*batch.values())[0] * scale + bias
+    return [batch]
+
+
+def test_metrics_on_paper() -> None:
+    truth = torch.zeros(2, 3)
+    mean = torch.tensor([[0.3, 0.4, 0.0], [0.1, 0.0, np.radians(2.0)]])
+    log_std = torch.log(torch.tensor([[0.3, 0.2, 1.0], [0.1, 1.0, np.radians(1.0)]]))
+    metrics = step_metrics(mean, log_std, truth)
+    assert metrics["rmse_m"] == pytest.approx(np.sqrt((0.25 + 0.01) / 2))
+    assert metrics["rmse_deg"] == pytest.approx(np.sqrt(2.0))
+    assert metrics["bias_forward_m"] == pytest.approx(0.2)
+    assert metrics["bias_deg"] == pytest.approx(1.0)
+    # Errors in deviations: 1, 2, 0, 1, 0, 2.
+    assert metrics["normalized_error"] == pytest.approx(np.sqrt((1 + 4 + 0 + 1 + 0 + 4) / 6))
+
+
+def test_heading_errors_are_wrapped() -> None:
+    metrics = step_metrics(torch.tensor([[0.0, 0.0, 3.1]]), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, -3.1]]))
+    assert metrics["rmse_deg"] == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-4)
+
+
+def test_calibration_removes_bias_and_scale(network: LocalPoseNetwork) -> None:
+    scale, bias = torch.tensor([1.3, 0.8, 0.5]), torch.tensor([0.1, -0.02, 0.01])
+    pairs = pairs_with_truth(network, scale, bias)
+    assert measure(network, pairs)["rmse_m"] > 0.05
+    config = calibrated(network, pairs)
+    assert config.relative_mean == pytest.approx(tuple(bias.tolist()), abs=1e-4)
+    assert config.relative_std == pytest.approx(tuple(scale.tolist()), rel=1e-3)
+    better = LocalPoseNetwork(config).eval()
+    better.load_state_dict(network.state_dict())
+    metrics = measure(better, pairs)
+    assert metrics["rmse_m"] < 1e-4 and metrics["rmse_deg"] < 1e-2
+
+
+def test_calibration_of_a_calibrated_network_changes_nothing(network: LocalPoseNetwork) -> None:
+    config = dataclasses.replace(network.config, relative_mean=(0.2, 0.0, 0.1), relative_std=(0.5, 0.2, 0.3))
+    other = LocalPoseNetwork(config).eval()
+    other.load_state_dict(network.state_dict())
+    again = calibrated(other, pairs_with_truth(other, torch.ones(3), torch.zeros(3)))
+    assert again.relative_mean == pytest.approx(config.relative_mean, abs=1e-5)
+    assert again.relative_std == pytest.approx(config.relative_std, rel=1e-4)
+
+
+def test_a_component_that_was_not_learned_keeps_a_positive_deviation(network: LocalPoseNetwork) -> None:
+    pairs = pairs_with_truth(network, torch.tensor([-1.0, 1.0, 1.0]), torch.tensor([0.4, 0.0, 0.0]))
+    config = calibrated(network, pairs)
+    assert min(config.relative_std) > 0.0
+    better = LocalPoseNetwork(config).eval()
+    better.load_state_dict(network.state_dict())
+    assert abs(measure(better, pairs)["bias_forward_m"]) < 1e-4
