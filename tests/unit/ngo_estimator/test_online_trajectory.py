@@ -450,6 +450,30 @@ def test_no_sequence_of_steps_breaks_it(plans: list[dict[str, object]], form: st
 CORES = {form: make(form, window_frames=40) for form in FORMS}
 
 
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("variance", [1e-300, 1e-6, 1e300])
+@pytest.mark.parametrize("motion", [0.0, 1e4])
+@pytest.mark.parametrize("feature", [0.0, -1e4, 1e4])
+def test_the_largest_values_that_are_taken_leave_it_finite(
+    form: str, variance: float, motion: float, feature: float
+) -> None:
+    core = make(form, window_frames=40)
+    for k, step in enumerate(make_steps(56)):
+        signs = np.array([1.0, -1.0, 1.0]) * (-1.0) ** (k // 3)
+        update = core.update(
+            replace(
+                step,
+                relative_xyyaw=motion * signs + step.relative_xyyaw * (motion == 0.0),
+                covariance=variance * np.eye(3),
+                motion_feature=np.full(6, feature, np.float32),
+                place_code=np.full(12, feature, np.float32) if feature else step.place_code,
+            )
+        )
+        # The odometry that is given does not fit the motion: what is checked is that all stays finite.
+        assert_sound(update)
+    assert update.optimized
+
+
 # ---- construction and loading
 
 
