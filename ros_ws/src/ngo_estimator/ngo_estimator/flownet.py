@@ -1,5 +1,7 @@
 """The convolutions of FlowNetS, for images and for row scans."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -45,7 +47,7 @@ class FlowNetConvolutions(nn.Module):
         sizes = list(image_size[1:]) if self.is_scan else list(image_size)
         for _, _, stride in _LAYERS:
             sizes = [-(-size // stride) for size in sizes]
-        self.output_size = channels * int(torch.tensor(sizes).prod())
+        self.output_size = channels * math.prod(sizes)
 
     def forward(self, image: Tensor) -> Tensor:
         if self.is_scan:

@@ -151,7 +151,8 @@ class NeuralGraphOptimizer(nn.Module):
     Each iteration attends over all meta-poses, passes features and attention through the convolutions, and adds gated
     adjustments to the relative meta-poses. With ``loops`` the convolutions also see the loops' residuals, spread over
     their spans, and say how far each meta-step may bend; a Gauss-Newton step then closes the gated loops.
-    A freshly initialised optimizer returns its input exactly.
+    A freshly initialised optimizer returns its input exactly. Unlike in the paper, features, adjustments and gates are
+    read from the last convolution by three layers of kernel 1, and only the features pass through a ReLU.
     """
 
     def __init__(self, config: NeuralGraphOptimizerConfig) -> None:

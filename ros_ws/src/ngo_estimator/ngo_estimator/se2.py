@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Map angles (rad, any shape) into ``(-pi, pi]``; the gradient is one everywhere."""
+    """Map angles (rad, any shape) into ``(-pi, pi]``, to their own rounding; the gradient is one everywhere."""
     turns = torch.ceil((angle.detach() - math.pi) / (2.0 * math.pi))
     return angle - 2.0 * math.pi * turns
 
