@@ -36,8 +36,8 @@ train: build ## every network of a world, from simulated data, into the estimato
 	@$(OPEN) && for script in train_local train_place featurise train_optimizer evaluate; do \
 		python -m training.$$script --world $(WORLD) || exit; done
 
-test: build ## every test below tests/: ARGS='-k name' passes on to pytest
-	@$(OPEN) && exec python -m pytest tests $(ARGS)
+test: build ## every test below tests/: ARGS="tests/unit -k name" goes to pytest
+	@$(OPEN) && exec python -m pytest $(ARGS)
 
 lint: venv ## ruff and mypy
 	@.venv/bin/ruff check . && .venv/bin/mypy $(foreach folder,$(TYPED),$(if $(wildcard $(folder)/*.py),$(folder)))
