@@ -26,12 +26,13 @@ else
     requirements=(-r requirements/build.txt)
 fi
 
-# Another interpreter or another underlay needs another environment; changed pins alone only need an update.
+# Another interpreter or another underlay needs another environment, and so does one whose making was interrupted; changed
+# pins alone only need an update.
 if [ -x "$VENV/bin/python" ]; then
-    was="$("$VENV/bin/python" -c 'import sys; print(*sys.version_info[:2])' 2>/dev/null || echo broken)"
+    was="$("$VENV/bin/python" -c 'import sys, pip; print(*sys.version_info[:2])' 2>/dev/null || echo broken)"
     now="$("$python" -c 'import sys; print(*sys.version_info[:2])')"
     if [ "$was" != "$now" ] || [ "$(cat "$VENV/ngo_underlay" 2>/dev/null || echo "$underlay")" != "$underlay" ]; then
-        say "the environment was made for another Python or another ROS 2: making it anew"
+        say ".venv is incomplete, or made for another Python or another ROS 2: making it anew"
         rm -rf "$VENV"
     fi
 fi
