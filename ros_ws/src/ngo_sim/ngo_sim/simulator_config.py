@@ -78,7 +78,7 @@ class SimulatorConfig:
     use_wall_stamps: bool = _setting(False, "Stamp every frame with the wall clock instead of simulated time.")
     publish_clock: bool = _setting(False, "Publish /clock with the stamp of every frame; not with use_wall_stamps.")
     ground_truth_frame: str = _setting(
-        "map", "Frame of the ground truth: origin at the maze's corner, x along columns."
+        "maze", "Frame of the ground truth: origin at the maze's corner, x along columns."
     )
     base_frame: str = _setting("base_link", "Frame that moves: child of the ground truth, frame of actions and scan.")
     camera_frame: str = _setting("base_link", "Frame of the image and of camera_info.")
