@@ -38,6 +38,9 @@ os.environ["ROS_DOMAIN_ID"] = str(_domain)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
+# A shell that runs this in the background hands over an ignored SIGINT, which children would inherit.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # Linux's prctl: a grandchild whose parent has died becomes this process's child, so that it can be ended. A killed
 # maze3d leaves the ViZDoom that it started, which keeps the locks on Fast DDS's ports that it has inherited.
 PR_SET_CHILD_SUBREAPER = 36

@@ -28,8 +28,13 @@ def command_node() -> Iterator[Node]:
     rclpy.init(args=[])
     try:
         node = rclpy.create_node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
-        with contextlib.suppress(ExternalShutdownException):
-            yield node
+        yield node
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A signal may shut down between a look at rclpy.ok() and the next call, which then fails in whatever way.
+        if rclpy.ok():
+            raise
     finally:
         rclpy.try_shutdown()
 
@@ -88,6 +93,7 @@ def require_node(node: Node, node_name: str) -> str:
 
 def print_nodes(include_hidden: bool) -> int:
     """`ros2 node list`."""
+    names: list[str] = []
     with command_node() as node:
         names = settle(node, lambda: node_names(node, include_hidden))
     if len(set(names)) < len(names):

@@ -22,6 +22,7 @@ REPORT_PERIOD_NS = 1_000_000_000
 
 def print_list(show_types: bool) -> int:
     """`ros2 topic list [-t]`."""
+    topics: list[tuple[str, tuple[str, ...]]] = []
     with command_node() as node:
         topics = settle(node, lambda: sorted((name, tuple(types)) for name, types in node.get_topic_names_and_types()))
     for name, types in topics:
