@@ -44,7 +44,7 @@ class Arguments:
     """Channels of aggregation and optimizer."""
     max_loops: int = 96
     """Loop candidates of a trajectory."""
-    epochs: int = 15
+    epochs: int = 20
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
     """Steps of the optimiser in an epoch."""

@@ -43,7 +43,7 @@ def test_poses_are_those_of_the_last_meta_poses() -> None:
 
 def test_paper_form_is_that_of_the_paper() -> None:
     config = NeuralGraphOptimizerConfig.paper_form(AGGREGATION)
-    assert (config.attention, config.loops, config.skip_connections) == ("sum", False, False)
+    assert (config.attention, config.loops, config.residual) == ("sum", False, False)
     assert config.dilations == (1,) * 9
     optimizer = small_optimizer("paper")
     convolutions = list(optimizer.convolutions)

@@ -31,8 +31,10 @@ class NeuralGraphOptimizerConfig:
     """What the optimizer is made of; ``paper_form`` gives the paper's.
 
     ``iterations`` attend-optimise iterations share their weights. ``attention`` is ``softmax``, or ``sum``, the
-    paper's C / sum(C). With ``loops`` every iteration sees the residuals of the loop candidates under the current
-    poses and takes a step that reduces them. ``dilations`` holds one number a convolution. ``correction_std`` (m, m,
+    paper's C / sum(C). ``dilations`` holds one number a convolution; with ``residual`` each is added to its input, and
+    normalised over its channels. With ``loops`` every iteration sees the residuals of the loop candidates under the
+    current poses and takes a step that reduces them: ``loops_per_pose`` candidates for each meta-pose, at least
+    ``min_loop_separation`` meta-poses older, and the best ``max_loops`` of the trajectory. ``correction_std`` (m, m,
     rad), the typical error of a relative meta-pose, is the unit of the adjustments.
     """
 
@@ -40,7 +42,7 @@ class NeuralGraphOptimizerConfig:
     iterations: int = 5
     attention: str = "softmax"
     dilations: tuple[int, ...] = (1, 1, 2, 4, 8, 4, 2, 1, 1)
-    skip_connections: bool = True
+    residual: bool = True
     loops: bool = True
     loops_per_pose: int = 2
     max_loops: int = 96
@@ -66,7 +68,7 @@ class NeuralGraphOptimizerConfig:
         form: dict[str, object] = {
             "attention": "sum",
             "dilations": (1,) * 9,
-            "skip_connections": False,
+            "residual": False,
             "loops": False,
         }
         return cls(aggregation=aggregation, **{**form, **changes})  # type: ignore[arg-type]
@@ -139,7 +141,7 @@ class LoopGate(nn.Module):
         )
         out = self.head(self.layers(inputs))
         gate = torch.sigmoid(loops.logit + 4.0 * out[..., 0]) * loops.valid
-        scale = torch.exp(out[..., 1:].clamp(-2.0, 2.0) * 2.0)
+        scale = torch.exp(4.0 * torch.tanh(out[..., 1:] / 2.0))
         position = gate * scale[..., 0] / position_variance
         heading = gate * scale[..., 1] / heading_variance
         return gate, torch.stack((position, position, heading), dim=-1)
@@ -162,9 +164,10 @@ class NeuralGraphOptimizer(nn.Module):
         self.aggregation = PoseAggregation(config.aggregation)
         self.query = nn.Linear(width, width)
         channels = 2 * width + (7 if config.loops else 0)
-        self.convolutions = nn.ModuleList()
+        self.convolutions, self.norms = nn.ModuleList(), nn.ModuleList()
         for dilation in config.dilations:
             self.convolutions.append(nn.Conv1d(channels, width, 3, 1, dilation, dilation))
+            self.norms.append(_ChannelNorm(width) if config.residual else nn.Identity())
             channels = width
         self.feature = nn.Conv1d(width, width, 1)
         self.adjustment = nn.Conv1d(width, 3, 1)
@@ -195,11 +198,13 @@ class NeuralGraphOptimizer(nn.Module):
 
     def convolve(self, inputs: Tensor) -> Tensor:
         """The optimisation phase's convolutions: ``(batch, poses, channels)`` to ``(batch, width, poses)``."""
-        hidden = inputs.mT
-        for layer in self.convolutions:
-            out = torch.relu(layer(hidden))
-            hidden = out + hidden if self.config.skip_connections and out.shape == hidden.shape else out
-        return hidden
+        hidden = normed = inputs.mT
+        for layer, norm in zip(self.convolutions, self.norms, strict=True):
+            out = torch.relu(layer(normed))
+            hidden = out + hidden if self.config.residual and out.shape == hidden.shape else out
+            # Without it nine layers, run five times, let the features grow until gates and stiffness saturate.
+            normed = norm(hidden)
+        return normed
 
     def forward(
         self,
@@ -252,17 +257,26 @@ class NeuralGraphOptimizer(nn.Module):
                 weights, information = self.loop_gate(loops, residuals, expected)
                 spread, support = spread_over_span(loops, residuals, weights, blocks)
                 local = torch.cat((se2.rotate(-poses[:, :-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
-                inputs += [local / self.correction_std, torch.log1p(support), deviation / self.correction_std]
+                # Residuals of many standard deviations are the rule at first: they enter by their logarithm.
+                inputs.append(torch.asinh(torch.cat((local, deviation), dim=-1) / self.correction_std.repeat(2)))
+                inputs.append(torch.log1p(support))
             hidden = self.convolve(torch.cat(inputs, dim=-1))
             beta = torch.sigmoid(self.gate(hidden)).mT
             adjusted = adjusted + beta * self.adjustment(hidden).mT * self.correction_std
             features = torch.relu(self.feature(hidden)).mT
             if loops is not None and information is not None:
-                step_std = base_std * torch.exp(self.stiffness(hidden).mT.clamp(-3.0, 3.0))
+                step_std = base_std * torch.exp(3.0 * torch.tanh(self.stiffness(hidden).mT / 3.0))
                 total = gauss_newton_correction(jacobian, residuals, step_std, information, deviation)
                 deviation = deviation + self.loop_gain * (total - deviation)
             results.append(adjusted + deviation)
         return OptimizedTrajectory(frame_poses(in_blocks, results[-1]), results, loops, weights, information, step_std)
+
+
+class _ChannelNorm(nn.LayerNorm):
+    """Layer normalisation over the channels of ``(batch, channels, poses)``."""
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 (the name that torch uses)
+        return super().forward(input.mT).mT
 
 
 def _with_origin(poses: Tensor) -> Tensor:
