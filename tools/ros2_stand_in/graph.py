@@ -15,9 +15,10 @@ from ros2_stand_in.errors import CommandError
 
 # The real command asks a daemon that knows the graph already; here every call discovers it anew.
 DISCOVERY_TIMEOUT_S = 5.0
-LIST_STABLE_S = 1.0
-# Participants announce themselves every 3 s after their start: an empty graph is only believed after that.
-LIST_ALONE_S = 4.0
+LIST_STABLE_S = 0.5
+# Participants answer a newcomer at once, but where an answer comes late or is lost (a busy machine) they announce
+# themselves every 3 s: what is seen before that may lack some of them.
+LIST_LEAST_S = 3.5
 
 Found = TypeVar("Found")
 
@@ -48,12 +49,11 @@ def poll(find: Callable[[], Found | None], timeout_s: float = DISCOVERY_TIMEOUT_
 
 
 def settle(node: Node, look: Callable[[], Found]) -> Found:
-    """What `look` sees once it no longer changes, and other nodes are seen or have had time to show themselves."""
+    """What `look` sees once every node has had time to show itself and nothing changes any more."""
     start = changed = time.monotonic()
     seen = look()
     while rclpy.ok() and (now := time.monotonic()) - start < DISCOVERY_TIMEOUT_S:
-        alone = len(node.get_node_names()) <= 1
-        if now - changed > (LIST_ALONE_S if alone else LIST_STABLE_S):
+        if now - start > LIST_LEAST_S and now - changed > LIST_STABLE_S:
             break
         time.sleep(0.1)
         current = look()

@@ -50,8 +50,11 @@ def parse_value(text: str) -> ParameterValue:
 def print_list(node_name: str | None) -> int:
     """`ros2 param list [NODE]`."""
     with command_node() as node:
-        names = [require_node(node, node_name)] if node_name else settle(node, lambda: node_names(node))
-        services = dict(node.get_service_names_and_types())
+        names, services = (
+            ([require_node(node, node_name)], {})
+            if node_name
+            else settle(node, lambda: (node_names(node), dict(node.get_service_names_and_types())))
+        )
         for name in names:
             service = f"{name}/list_parameters"
             # A node may do without parameter services; one that was asked for by name is waited for.
