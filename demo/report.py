@@ -57,13 +57,13 @@ def summary_table(summary: dict[str, Any]) -> Table:
     for name, footer in (
         ("seed", "median"),
         ("path [m]", ""),
-        ("odometry RMSE [m]", f"{medians['odometry']:.3f}"),
-        ("corrected RMSE [m]", f"{medians['corrected']:.3f}"),
+        ("odom. RMSE [m]", f"{medians['odometry']:.3f}"),
+        ("corr. RMSE [m]", f"{medians['corrected']:.3f}"),
         ("change [%]", f"{-summary['median_reduction_percent']:+.1f}"),
-        ("odometry end [%]", ""),
-        ("corrected end [%]", ""),
-        ("odometry heading [deg]", ""),
-        ("corrected heading [deg]", ""),
+        ("odom. end [%]", ""),
+        ("corr. end [%]", ""),
+        ("odom. head. [deg]", ""),
+        ("corr. head. [deg]", ""),
     ):
         table.add_column(escape(name), footer=footer, justify="right")
     for result in summary["results"]:
