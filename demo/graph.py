@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -18,6 +19,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 _LOG_TAIL_LINES = 15
 _POLL_S = 0.05
+_END_S = 5.0
 
 
 class GraphError(RuntimeError):
@@ -64,10 +66,20 @@ class Graph:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for process in self._processes.values():
-            if process.poll() is None:
-                process.kill()
-            process.wait()
+        # A node that is told to end takes its own children along (maze3d its engine); one that is killed cannot.
+        try:
+            for process in self._processes.values():
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+            deadline = time.monotonic() + _END_S
+            for process in self._processes.values():
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(0.0, deadline - time.monotonic()))
+        finally:
+            for process in self._processes.values():
+                if process.poll() is None:
+                    process.kill()
+                process.wait()
 
     def start(self, spec: NodeSpec) -> None:
         """Start a node; its executable's name is its name here."""
