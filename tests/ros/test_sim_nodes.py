@@ -94,7 +94,7 @@ class Run:
         steps = np.linalg.norm(np.diff(episode.poses_xyyaw[:, :2], axis=0), axis=1)
         assert speeds[0] == 0.0
         np.testing.assert_allclose(np.array(speeds[1:]) * period_s, steps, rtol=0.02, atol=1e-9)
-        assert {m.header.frame_id for m in self.truth} == {"map"}
+        assert {m.header.frame_id for m in self.truth} == {"maze"}
         assert {m.child_frame_id for m in self.truth} == {"base_link"}
         assert "/tf" not in self.topics
 
