@@ -2,19 +2,22 @@
 
 import contextlib
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any, TypeVar
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from ros2_stand_in.errors import CommandError
 
 # The real command asks a daemon that knows the graph already; here every call discovers it anew.
 DISCOVERY_TIMEOUT_S = 5.0
+WAIT_S = 0.1
 LIST_STABLE_S = 0.5
 # Participants answer a newcomer at once, but where an answer comes late or is lost (a busy machine) they announce
 # themselves every 3 s: what is seen before that may lack some of them.
@@ -23,27 +26,58 @@ LIST_LEAST_S = 3.5
 Found = TypeVar("Found")
 
 
+class _Signals:
+    """Notes SIGINT and SIGTERM instead of raising at once.
+
+    rclpy's own handlers shut down from another thread while the main one is about to wait, which now and then ends in a
+    traceback or worse; so they are switched off, every wait is short, and the loops look here.
+    """
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+
+    def install(self) -> None:
+        """Handle both signals from now on."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self.received = number
+
+
+_signals = _Signals()
+
+
+def running() -> bool:
+    """Whether no signal has told the command to end."""
+    return _signals.received is None
+
+
 @contextlib.contextmanager
 def command_node() -> Iterator[Node]:
-    """A node of the same hidden name as the real command's; ends quietly when the process is told to end."""
-    rclpy.init(args=[])
+    """A node of the same hidden name as the real command's; raises KeyboardInterrupt after it if there was a SIGINT."""
+    _signals.install()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
     try:
-        node = rclpy.create_node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
         yield node
-    except ExternalShutdownException:
-        pass
-    except Exception:
-        # A signal may shut down between a look at rclpy.ok() and the next call, which then fails in whatever way.
-        if rclpy.ok():
-            raise
     finally:
-        rclpy.try_shutdown()
+        node.destroy_node()
+        rclpy.shutdown()
+    if _signals.received == signal.SIGINT:
+        raise KeyboardInterrupt
+
+
+def spin_while(node: Node, condition: Callable[[], bool]) -> None:
+    """Take messages while the condition holds and nothing has told the command to end."""
+    while running() and condition():
+        rclpy.spin_once(node, timeout_sec=WAIT_S)
 
 
 def poll(find: Callable[[], Found | None], timeout_s: float = DISCOVERY_TIMEOUT_S) -> Found | None:
     """The first result of `find` that is not None, or None after the timeout."""
     deadline = time.monotonic() + timeout_s
-    while (found := find()) is None and time.monotonic() < deadline and rclpy.ok():
+    while (found := find()) is None and time.monotonic() < deadline and running():
         time.sleep(0.05)
     return found
 
@@ -52,10 +86,10 @@ def settle(node: Node, look: Callable[[], Found]) -> Found:
     """What `look` sees once every node has had time to show itself and nothing changes any more."""
     start = changed = time.monotonic()
     seen = look()
-    while rclpy.ok() and (now := time.monotonic()) - start < DISCOVERY_TIMEOUT_S:
+    while running() and (now := time.monotonic()) - start < DISCOVERY_TIMEOUT_S:
         if now - start > LIST_LEAST_S and now - changed > LIST_STABLE_S:
             break
-        time.sleep(0.1)
+        time.sleep(WAIT_S)
         current = look()
         if current != seen:
             seen, changed = current, time.monotonic()
@@ -93,7 +127,6 @@ def require_node(node: Node, node_name: str) -> str:
 
 def print_nodes(include_hidden: bool) -> int:
     """`ros2 node list`."""
-    names: list[str] = []
     with command_node() as node:
         names = settle(node, lambda: node_names(node, include_hidden))
     if len(set(names)) < len(names):
@@ -110,10 +143,13 @@ def print_nodes(include_hidden: bool) -> int:
 def call(node: Node, service_type: Any, service: str, request: Any) -> Any:
     """A service's response; CommandError where the service does not come up or does not answer."""
     client = node.create_client(service_type, service)
-    if not client.wait_for_service(timeout_sec=DISCOVERY_TIMEOUT_S):
+    if poll(lambda: client.service_is_ready() or None) is None:
         raise CommandError("Wait for service timed out")
     future = client.call_async(request)
-    rclpy.spin_until_future_complete(node, future, timeout_sec=DISCOVERY_TIMEOUT_S)
+    deadline = time.monotonic() + DISCOVERY_TIMEOUT_S
+    spin_while(node, lambda: not future.done() and time.monotonic() < deadline)
+    if not future.done():
+        raise CommandError(f"Service '{service}' did not answer")
     if future.result() is None:
-        raise CommandError(f"Exception while calling service '{service}': {future.exception() or 'no answer'}")
+        raise CommandError(f"Exception while calling service '{service}': {future.exception()}")
     return future.result()

@@ -5,7 +5,6 @@ import math
 import time
 from typing import Any
 
-import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
@@ -13,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from ros2_stand_in.errors import CommandError
-from ros2_stand_in.graph import command_node, is_hidden, poll, settle
+from ros2_stand_in.graph import command_node, is_hidden, poll, settle, spin_while
 from ros2_stand_in.message_text import echo_text, message_class
 
 ECHO_DEPTH = 10
@@ -22,7 +21,6 @@ REPORT_PERIOD_NS = 1_000_000_000
 
 def print_list(show_types: bool) -> int:
     """`ros2 topic list [-t]`."""
-    topics: list[tuple[str, tuple[str, ...]]] = []
     with command_node() as node:
         topics = settle(node, lambda: sorted((name, tuple(types)) for name, types in node.get_topic_names_and_types()))
     for name, types in topics:
@@ -94,8 +92,7 @@ def echo(topic: str, type_name: str | None, once: bool, field: str | None, trunc
             done = True
 
         node.create_subscription(kind, name, show, matching_qos(node, name))
-        while rclpy.ok() and not (done and once):
-            rclpy.spin_once(node, timeout_sec=1.0)
+        spin_while(node, lambda: not (done and once))
     return 0
 
 
@@ -141,16 +138,19 @@ def hz(topic: str, window: int) -> int:
         if found is None:
             print(f"WARNING: topic [{topic}] does not appear to be published yet", flush=True)
             found = poll(lambda: published_type(node, name), timeout_s=math.inf)
-        if found is None:
+        if found is None:  # told to end before anybody published
             return 0
         rate = RateWindow(window)
         # Only the arrival counts, so the message is not converted (raw).
         node.create_subscription(
             message_class(found), name, lambda _: rate.add(time.time_ns()), matching_qos(node, name), raw=True
         )
-        while rclpy.ok():
-            rclpy.spin_once(node, timeout_sec=1.0)
+
+        def show() -> bool:
             report = rate.report()
             if report is not None:
                 print(report, flush=True)
+            return True
+
+        spin_while(node, show)
     return 0
