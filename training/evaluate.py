@@ -34,8 +34,8 @@ _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 class Arguments:
     """Settings of an evaluation."""
 
-    world: str
-    """maze2d or maze3d."""
+    world: Literal["maze2d", "maze3d"]
+    """World to measure in."""
     split: Literal["validation", "test"] = "validation"
     """Mazes to measure on."""
     trajectories: int = 20

@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -34,8 +34,8 @@ _MADE_WITH = "networks.json"
 class Arguments:
     """Settings of the feature store."""
 
-    world: str
-    """maze2d or maze3d."""
+    world: Literal["maze2d", "maze3d"]
+    """World to train for."""
     trajectories: int = 240
     """Trajectories for training, each in a maze of its own that the local network has not seen."""
     validation_trajectories: int = 32

@@ -9,7 +9,7 @@ Run again, it goes on where it was stopped. It ends with the network's output ca
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 import numpy as np
@@ -31,8 +31,8 @@ from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS
 class Arguments:
     """Settings of a training of the local pose network."""
 
-    world: str
-    """maze2d or maze3d."""
+    world: Literal["maze2d", "maze3d"]
+    """World to train for."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8

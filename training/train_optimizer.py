@@ -34,8 +34,8 @@ from training.worlds import world_named
 class Arguments:
     """Settings of a training of the optimizer."""
 
-    world: str
-    """maze2d or maze3d."""
+    world: Literal["maze2d", "maze3d"]
+    """World to train for."""
     form: Literal["loops", "paper"] = "loops"
     """With loop closures, or the paper's form."""
     iterations: int = 5

@@ -7,7 +7,7 @@ Run again, it goes on where it was stopped. It ends with the weights written int
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 import torch
@@ -28,8 +28,8 @@ from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 class Arguments:
     """Settings of a training of the place encoder."""
 
-    world: str
-    """maze2d or maze3d."""
+    world: Literal["maze2d", "maze3d"]
+    """World to train for."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 10

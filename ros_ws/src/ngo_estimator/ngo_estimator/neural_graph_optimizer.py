@@ -64,7 +64,7 @@ class NeuralGraphOptimizerConfig:
 
     @classmethod
     def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> "NeuralGraphOptimizerConfig":
-        """Nine plain convolutions of kernel 3 over features and attention; nothing but motion features goes in."""
+        """Nine plain convolutions of kernel 3 over features and attention; no place codes and no loops."""
         form: dict[str, object] = {
             "attention": "sum",
             "dilations": (1,) * 9,

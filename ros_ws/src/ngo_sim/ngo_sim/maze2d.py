@@ -45,8 +45,8 @@ class Maze2DConfig:
     def __post_init__(self) -> None:
         _check_number("block_m", self.block_m, 0.01, 100.0)
         check_maze_size(self.rows, self.cols, self.extra_openings)
-        if isinstance(self.rays, bool) or not isinstance(self.rays, int) or self.rays < 2:
-            raise ValueError(f"rays is {self.rays!r}; it must be an integer of at least 2")
+        if isinstance(self.rays, bool) or not isinstance(self.rays, int) or not 2 <= self.rays <= 10_000:
+            raise ValueError(f"rays is {self.rays!r}; it must be an integer from 2 to 10000")
         _check_number("actuation_noise", self.actuation_noise, 0.0, 1.0)
         _check_number("period_s", self.period_s, 0.001, 10.0)
         _check_number("thrust_m", self.thrust_m, 0.0, self.block_m)

@@ -104,11 +104,16 @@ class Maze:
             raise ValueError(f"no path joins block {start} and block {goal}") from error
 
 
+MOST_CELLS = 200
+"""Rows or columns of the largest maze: a mistyped size is said at once, not met as minutes of waiting."""
+
+
 def check_maze_size(rows: int, cols: int, extra_openings: int) -> None:
     """Raise a ValueError that names the field, the value and what is allowed, where no such maze exists."""
     for name, value in (("rows", rows), ("cols", cols)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 2:
-            raise ValueError(f"{name} is {value!r}; it must be an integer of at least 2")
+        integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        if not (integer and 2 <= value <= MOST_CELLS):
+            raise ValueError(f"{name} is {value!r}; it must be an integer from 2 to {MOST_CELLS}")
     # Cells have rows (cols - 1) + cols (rows - 1) walls between them and a spanning tree opens rows cols - 1.
     most = (rows - 1) * (cols - 1)
     integer = isinstance(extra_openings, (int, np.integer)) and not isinstance(extra_openings, bool)

@@ -81,7 +81,7 @@ class SimulatorConfig:
         "maze", "Frame of the ground truth: origin at the maze's corner, x along columns."
     )
     base_frame: str = _setting("base_link", "Frame that moves: child of the ground truth, frame of actions and scan.")
-    camera_frame: str = _setting("base_link", "Frame of the image and of camera_info.")
+    camera_frame: str = _setting("base_link", "Frame of the image, and of camera_info where there is one.")
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):

@@ -66,7 +66,9 @@ class NgoNode(Node):
         self._status.received(step.stamp_ns)
         if update.restarted:
             self.get_logger().info(
-                "the relative poses have a new origin: their source restarted, so the map starts anew"
+                "the relative poses have a new origin: their source restarted, so the map starts anew (where this comes "
+                "again and again, two local estimators publish on one topic)",
+                throttle_duration_sec=5.0,
             )
         self._gaps += update.gap
         self._latest = update

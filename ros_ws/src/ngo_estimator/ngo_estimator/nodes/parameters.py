@@ -76,6 +76,9 @@ def declare_settings(node: Node, settings_type: type[SettingsType]) -> SettingsT
     values that are not allowed.
     """
     known = {entry.name: entry for entry in fields(settings_type)}
+    simulated = node.get_parameter("use_sim_time").value
+    if not isinstance(simulated, bool):
+        raise BadParameter(f"parameter 'use_sim_time' is {simulated!r}; allowed: true or false")
     given = {
         name: parameter.value
         for name, parameter in node.get_parameters_by_prefix("").items()
