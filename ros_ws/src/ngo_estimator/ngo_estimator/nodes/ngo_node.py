@@ -66,8 +66,8 @@ class NgoNode(Node):
         self._status.received(step.stamp_ns)
         if update.restarted:
             self.get_logger().info(
-                "the relative poses have a new origin: their source restarted, so the map starts anew (where this comes "
-                "again and again, two local estimators publish on one topic)",
+                "the relative poses have a new origin: their source restarted, so the map starts anew "
+                "(again and again: two local estimators publish on one topic)",
                 throttle_duration_sec=5.0,
             )
         self._gaps += update.gap
