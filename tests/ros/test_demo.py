@@ -1,9 +1,14 @@
 """The demo as a person starts it, with untrained weights: then the corrected path is the odometry."""
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -55,3 +60,44 @@ def test_says_which_node_failed_and_why(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "ended with exit code 2; it wrote last:" in done.stderr and "nowhere" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def descendants(pid: int) -> set[int]:
+    """Processes that ``pid`` started, and those that they started."""
+    parents = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            # The name, in brackets, may hold blanks; the parent is the second field behind it.
+            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+    found = {pid}
+    while new := {child for child, parent in parents.items() if parent in found} - found:
+        found |= new
+    return found - {pid}
+
+
+def running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, f"waited {timeout_s} s in vain until {what}"
+        threading.Event().wait(0.05)
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_interrupted_it_leaves_no_node_behind(signal_number: int, weights: Path, tmp_path: Path) -> None:
+    command = [sys.executable, str(DEMO), "--world", "maze2d", "--rate", "20", "--weights", str(weights)]
+    with (tmp_path / "log").open("w") as log:
+        demo = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stdout=log, stderr=log)
+        wait_until(lambda: demo.poll() is not None or len(descendants(demo.pid)) >= 3, "the nodes run")
+        started = descendants(demo.pid)
+        demo.send_signal(signal_number)
+        code = demo.wait(60)
+    assert code == 130, (tmp_path / "log").read_text()
+    assert len(started) >= 3
+    wait_until(lambda: not any(map(running, started)), "no process is left", 10.0)
