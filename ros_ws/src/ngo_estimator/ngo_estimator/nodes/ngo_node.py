@@ -67,8 +67,7 @@ class NgoNode(Node):
         if update.restarted:
             self.get_logger().info(
                 "the relative poses have a new origin: their source restarted, so the map starts anew "
-                "(again and again: two local estimators publish on one topic)",
-                throttle_duration_sec=5.0,
+                "(again and again: two local estimators publish on one topic)"
             )
         self._gaps += update.gap
         self._latest = update
