@@ -276,7 +276,7 @@ def test_bad_parameters_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text("maze2d:\n  ros__parameters:\n    rowz: 3\n")
     cases: list[tuple[tuple[str, ...], dict[str, Any], str]] = [
-        ((), {"rows": 1}, "rows is 1; it must be an integer from 2 to 200"),
+        ((), {"rows": 1}, "rows is 1; it must be an integer from 2 to 100"),
         ((), {"flow_control_topics": ["a b"]}, "flow_control_topics has 'a b'; allowed: names of topics"),
         (("--params-file", str(file)), {}, "rowz is 3, but there is no parameter of this name; did you mean rows?"),
         (("-p", "rows"), {}, "-p rows"),

@@ -152,8 +152,8 @@ def test_a_maze_cannot_be_changed() -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((1, 7), "rows is 1; it must be an integer from 2 to 200"),
-    ((7, 2.5), "cols is 2.5; it must be an integer from 2 to 200"),
+    ((1, 7), "rows is 1; it must be an integer from 2 to 100"),
+    ((7, 2.5), "cols is 2.5; it must be an integer from 2 to 100"),
     ((7, True), "cols is True; "),
     ((3, 4, 7), "extra_openings is 7; it must be an integer from 0 to 6 in a maze of 3 x 4 cells"),
     ((3, 4, -1), "extra_openings is -1; "),

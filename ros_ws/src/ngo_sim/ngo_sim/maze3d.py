@@ -64,8 +64,6 @@ class Maze3DConfig:
     def __post_init__(self) -> None:
         check_maze_size(self.rows, self.cols, self.extra_openings)
         # Doom's coordinates end at 32767 units, its player is a square of 1 m.
-        _check_integer("rows", self.rows, 2, 100)
-        _check_integer("cols", self.cols, 2, 100)
         _check_number("block_m", self.block_m, 4 * PLAYER_RADIUS_UNITS / UNITS_PER_M, 5.0)
         _check_number("actuation_noise", self.actuation_noise, 0.0, 1.0)
         if (self.width, self.height) not in _RESOLUTIONS:

@@ -104,7 +104,7 @@ class Maze:
             raise ValueError(f"no path joins block {start} and block {goal}") from error
 
 
-MOST_CELLS = 200
+MOST_CELLS = 100
 """Rows or columns of the largest maze: a mistyped size is said at once, not met as minutes of waiting."""
 
 
