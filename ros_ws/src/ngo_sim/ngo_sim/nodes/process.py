@@ -6,11 +6,13 @@ import signal
 import sys
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
+from rclpy.signals import SignalHandlerOptions
 
 from ngo_sim.nodes.parameters import BadParameter
 from ngo_sim.nodes.simulator_node import SimulatorNode
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | None = None) -> int:
@@ -18,25 +20,29 @@ def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | N
 
     0 in both cases, 2 after a bad parameter, which one line on stderr names.
     """
+    # rclpy's own handlers shut down from another thread while this one publishes, which now and then ends in a crash.
+    # These raise in this thread, between two calls; the node waits for short times only, so they are never late.
+    for number in _SIGNALS:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        return _run(node_type, name, args)
+    except KeyboardInterrupt:
+        return 0
+
+
+def _run(node_type: type[SimulatorNode], name: str, args: list[str] | None) -> int:
     node = None
     try:
         _initialise(args)
         node = node_type(name)
         node.run()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     except BadParameter as error:
         print(f"{name}: bad parameter: {error}", file=sys.stderr)
         return 2
-    except Exception:
-        # A signal invalidates everything of ROS at once, and also ends the engine of the 3D world: what was going on
-        # then fails for that reason alone.
-        if rclpy.ok():
-            raise
     finally:
         # A second signal, as from a terminal and a launcher together, must not interrupt the cleaning up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
@@ -48,7 +54,7 @@ def _initialise(args: list[str] | None) -> None:
     level = get_logger_level("rcl")
     set_logger_level("rcl", LoggingSeverity.FATAL)
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # the common base of rclpy's errors about arguments
         raise BadParameter(" ".join(str(error).split())) from None
     finally:

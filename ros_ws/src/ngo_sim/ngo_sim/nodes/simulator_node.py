@@ -6,7 +6,6 @@ import time
 from abc import abstractmethod
 from typing import Any, ClassVar
 
-import rclpy.signals
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
@@ -55,9 +54,6 @@ class SimulatorNode(Node):
         self._clock_out = self.create_publisher(Clock, "/clock", self.qos) if self.config.publish_clock else None
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
-        # The engine of a world may have installed signal handlers of its own: ours go on top again, and call them.
-        rclpy.signals.uninstall_signal_handlers()
-        rclpy.signals.install_signal_handlers()
         self._pacer = Pacer()
         self._published = 0
         self._looked_s = 0.0
