@@ -73,7 +73,7 @@ class SimulatorNode(Node):
         """Publish what the robot sees."""
 
     def run(self) -> None:
-        """Publish frames until there are enough and all are taken; ExternalShutdownException ends it earlier."""
+        """Publish frames until there are enough and all are taken; a KeyboardInterrupt ends it earlier."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         while True:
