@@ -5,6 +5,7 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.local_pose_network import LocalPoseConfig
+from ngo_estimator.loop_closure import Loops
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 from ngo_estimator.place_encoder import PairHead, PlaceConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
@@ -61,3 +62,24 @@ def trajectory_inputs(batch: int, steps: int, seed: int = 0) -> tuple[Tensor, Te
     log_std = 0.3 * torch.randn(batch, steps, 3, generator=generator) + (0.1 * std).log()
     motion = torch.rand(batch, steps, 6, generator=generator)
     return relative, log_std, motion, torch.randn(batch, steps, 12, generator=generator)
+
+
+def make_loops(start: list[int], end: list[int], measured: Tensor | None = None) -> Loops:
+    """One trajectory's loops, in float64."""
+    count = len(start)
+    indices = torch.tensor([start]), torch.tensor([end]), torch.tensor([start])
+    measured = torch.zeros(1, count, 3, dtype=torch.float64) if measured is None else measured
+    number = torch.zeros(1, count, dtype=torch.float64)
+    return Loops(*indices, measured, torch.zeros(1, count, 2, dtype=torch.float64), number, number, number == 0.0)
+
+
+def with_origin(poses: Tensor) -> Tensor:
+    """Global poses with the origin in front."""
+    return torch.cat((torch.zeros_like(poses[:, :1]), poses), dim=1)
+
+
+def meta_steps(blocks: int, seed: int = 0) -> Tensor:
+    """Relative meta-poses of a robot that drives on and turns here and there ``(1, blocks, 3)``, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.randn(1, blocks, 3, generator=generator, dtype=torch.float64)
+    return values * torch.tensor([0.3, 0.1, 0.4]) + torch.tensor([0.8, 0.0, 0.1])

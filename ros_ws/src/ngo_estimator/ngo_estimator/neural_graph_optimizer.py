@@ -7,15 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from ngo_estimator import se2
-from ngo_estimator.loop_closure import (
-    Loops,
-    end_covariance,
-    find_loops,
-    gauss_newton_correction,
-    loop_jacobian,
-    loop_residuals,
-    spread_over_span,
-)
+from ngo_estimator.loop_closure import Loops, find_loops, loop_residuals, spread_over_span
+from ngo_estimator.loop_system import LoopSystem, end_covariance, gauss_newton_correction
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import (
     PoseAggregation,
@@ -94,13 +87,8 @@ class OptimizedTrajectory:
     def end_covariance(self) -> Tensor:
         """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
         poses = _with_origin(se2.r2g(self.meta_relative[-1].double()))
-        step_std = self.step_std.double()
-        batch, blocks = step_std.shape[:2]
-        if self.loops is None or self.loop_information is None:
-            return end_covariance(
-                poses, poses.new_zeros(batch, 0, 3, blocks, 3), step_std, poses.new_zeros(batch, 0, 3)
-            )
-        return end_covariance(poses, loop_jacobian(self.loops, poses), step_std, self.loop_information.double())
+        loops = None if self.loops is None else (self.loops.start, self.loops.end)
+        return end_covariance(loops, poses, self.step_std.double(), self.loop_information)
 
 
 class LoopGate(nn.Module):
@@ -252,8 +240,8 @@ class NeuralGraphOptimizer(nn.Module):
             if loops is not None:
                 poses = _with_origin(se2.r2g(adjusted + deviation))
                 residuals = loop_residuals(loops, poses)
-                jacobian = loop_jacobian(loops, poses)
-                expected = (jacobian * step_std[:, None, None]).square().sum((-2, -1))
+                system = LoopSystem(loops.start, loops.end, poses)
+                expected = system.variances(step_std.square()).to(poses.dtype)
                 weights, information = self.loop_gate(loops, residuals, expected)
                 spread, support = spread_over_span(loops, residuals, weights, blocks)
                 local = torch.cat((se2.rotate(-poses[:, :-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
@@ -266,8 +254,8 @@ class NeuralGraphOptimizer(nn.Module):
             features = torch.relu(self.feature(hidden)).mT
             if loops is not None and information is not None:
                 step_std = base_std * torch.exp(3.0 * torch.tanh(self.stiffness(hidden).mT / 3.0))
-                total = gauss_newton_correction(jacobian, residuals, step_std, information, deviation)
-                deviation = deviation + self.loop_gain * (total - deviation)
+                total = gauss_newton_correction(system, residuals, step_std, information, deviation)
+                deviation = deviation + self.loop_gain * (total.to(deviation.dtype) - deviation)
             results.append(adjusted + deviation)
         return OptimizedTrajectory(frame_poses(in_blocks, results[-1]), results, loops, weights, information, step_std)
 
