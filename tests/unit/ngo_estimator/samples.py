@@ -5,8 +5,8 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.local_pose_network import LocalPoseConfig
-from ngo_estimator.loop_closure import Loops
-from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.loop_closure import Loops, LoopSearch
+from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig, OptimizedTrajectory
 from ngo_estimator.place_encoder import PairHead, PlaceConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 
@@ -33,10 +33,10 @@ def small_optimizer(
     """An optimizer for 6 motion features, fresh or with random weights that close loops and move every pose."""
     torch.manual_seed(0)
     aggregation = PoseAggregationConfig(motion_feature_size=6, width=16, relative_std=(0.1, 0.02, 0.05))
-    make = NeuralGraphOptimizerConfig if form == "loops" else NeuralGraphOptimizerConfig.paper_form
+    make = NeuralGraphOptimizerConfig.paper_form if form == "paper" else NeuralGraphOptimizerConfig
     settings = {"aggregation": aggregation, "iterations": 3, **changes}
-    if form == "loops":
-        settings = {"max_loops": 8, "min_loop_separation": 2, **settings}
+    if form != "paper":
+        settings = {"network": form == "loops", "search": LoopSearch(2, 8, 2, 0), **settings}
     optimizer = NeuralGraphOptimizer(make(**settings)).eval()  # type: ignore[arg-type]
     if trained:
         with torch.no_grad():
@@ -64,13 +64,22 @@ def trajectory_inputs(batch: int, steps: int, seed: int = 0) -> tuple[Tensor, Te
     return relative, log_std, motion, torch.randn(batch, steps, 12, generator=generator)
 
 
+def optimized(optimizer: NeuralGraphOptimizer, inputs: tuple[Tensor, ...]) -> OptimizedTrajectory:
+    """What an optimizer makes of ``trajectory_inputs``, with loops that ``small_pair_head`` sees if it takes any."""
+    relative, log_std, motion, codes = inputs
+    loops = optimizer.find_loops(relative, codes, small_pair_head()) if optimizer.config.loops else None
+    result: OptimizedTrajectory = optimizer(relative, log_std, motion, loops)
+    return result
+
+
 def make_loops(start: list[int], end: list[int], measured: Tensor | None = None) -> Loops:
     """One trajectory's loops, in float64."""
     count = len(start)
     indices = torch.tensor([start]), torch.tensor([end]), torch.tensor([start])
     measured = torch.zeros(1, count, 3, dtype=torch.float64) if measured is None else measured
     number = torch.zeros(1, count, dtype=torch.float64)
-    return Loops(*indices, measured, torch.zeros(1, count, 2, dtype=torch.float64), number, number, number == 0.0)
+    scale, embeddings = number.unsqueeze(-1).expand(-1, -1, 2), torch.zeros(1, 1, 1, dtype=torch.float64)
+    return Loops(*indices, measured, scale, number, number, number == 0.0, embeddings)
 
 
 def with_origin(poses: Tensor) -> Tensor:

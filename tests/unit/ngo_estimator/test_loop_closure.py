@@ -5,7 +5,14 @@ import torch
 from torch import Tensor, nn
 
 from ngo_estimator import se2
-from ngo_estimator.loop_closure import Loops, find_loops, loop_residuals, spread_over_span
+from ngo_estimator.loop_closure import (
+    Loops,
+    LoopSearch,
+    find_loops,
+    loop_residuals,
+    odometry_variances,
+    spread_over_span,
+)
 from ngo_estimator.place_encoder import PairHead, PlaceConfig
 from ngo_estimator.pose_aggregation import poses_in_blocks
 from tests.unit.ngo_estimator.samples import make_loops, meta_steps, place_config, with_origin
@@ -82,8 +89,8 @@ def planted(pairs: list[tuple[int, int]], steps: int = 96) -> tuple[Tensor, Tens
 
 
 def search(relative: Tensor, codes: Tensor, block: int = 8, **changes: int) -> Loops:
-    limits = {"per_pose": 2, "most": 6, "min_separation": 3, **changes}
-    return find_loops(Identity(place_config("maze2d")), codes, poses_in_blocks(relative, block), **limits)
+    limits = LoopSearch(**{"per_pose": 2, "most": 6, "min_separation": 3, "min_apart": 0, **changes})
+    return find_loops(Identity(place_config("maze2d")), codes, poses_in_blocks(relative, block), limits)
 
 
 def test_planted_duplicates_are_found_and_measured_from_the_start_of_their_block() -> None:
@@ -120,6 +127,49 @@ def test_each_pose_takes_its_candidates_from_different_blocks() -> None:
     loops = search(relative, codes, most=50)
     blocks = (loops.frame[0] // 8)[(loops.end[0] == 11) & loops.valid[0]].tolist()
     assert sorted(blocks) == [0, 2]
+
+
+@pytest.mark.parametrize(("apart", "expected"), [(0, [0, 1]), (1, [0, 3]), (3, [0, 5])])
+def test_candidates_of_a_pose_keep_their_distance(apart: int, expected: list[int]) -> None:
+    relative, codes = planted([])
+    # The last pose looks most like a frame in block 0, then 1, 3 and 5.
+    for block, share in ((0, 1.0), (1, 0.9), (3, 0.8), (5, 0.7)):
+        codes[0, 8 * block] = share * codes[0, 95] + (1.0 - share) * codes[0, 8 * block]
+    loops = search(relative, codes, min_apart=apart, most=50)
+    blocks = (loops.frame[0] // 8)[(loops.end[0] == 11) & loops.valid[0]]
+    assert sorted(blocks.tolist()) == expected
+
+
+def test_measurements_have_gradients_and_the_choice_has_none() -> None:
+    relative, codes = planted([(2, 47), (13, 71)])
+    codes.requires_grad_()
+    pair_head = PairHead(place_config("maze2d"))
+    loops = find_loops(pair_head, codes, poses_in_blocks(relative, 8), LoopSearch(per_pose=2, most=6, min_separation=3))
+    (loops.measured.sum() + loops.logit.sum() + loops.log_scale.sum()).backward()
+    assert codes.grad is not None and codes.grad.abs().sum(-1).count_nonzero() >= 6
+    assert not loops.similarity.requires_grad and loops.embeddings.requires_grad
+
+
+@pytest.mark.parametrize("change", [{"per_pose": 0}, {"most": 0}, {"min_separation": 0}, {"min_apart": -1}])
+def test_impossible_searches_are_refused(change: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="expected at least 1, 1, 1, 0"):
+        LoopSearch(**change)
+
+
+def test_odometry_variances_are_the_diagonal_of_the_propagated_covariance() -> None:
+    relative = meta_steps(9)
+    loops = make_loops([0, 2, 1, 4], [8, 6, 8, 4])
+    variance = 0.1 * torch.rand(1, 9, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+
+    def ends(steps: Tensor) -> Tensor:
+        return with_origin(se2.r2g(steps[None]))[0, loops.end[0] + 1]
+
+    jacobian = torch.autograd.functional.jacobian(ends, relative[0])
+    index = torch.arange(9)
+    on_loop = (index >= loops.start[0, :, None]) & (index <= loops.end[0, :, None])
+    expected = ((jacobian * on_loop[:, None, :, None]).square() * variance[0]).sum((-2, -1))
+    result = odometry_variances(loops, with_origin(se2.r2g(relative)), variance)[0]
+    assert torch.allclose(result, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("steps", [8, 24, 40])

@@ -10,7 +10,29 @@ import torch
 from torch import Tensor
 
 from ngo_estimator import se2
+from ngo_estimator.gauss_newton import pick
 from ngo_estimator.place_encoder import PairHead
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """Which pairs of frames become loop candidates.
+
+    ``per_pose`` candidates for each meta-pose, at least ``min_separation`` meta-poses older and more than
+    ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief.
+    """
+
+    per_pose: int = 4
+    most: int = 512
+    min_separation: int = 6
+    min_apart: int = 1
+
+    def __post_init__(self) -> None:
+        if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
+            raise ValueError(
+                f"per_pose, most, min_separation, min_apart are {self.per_pose}, {self.most}, {self.min_separation}, "
+                f"{self.min_apart}; expected at least 1, 1, 1, 0"
+            )
 
 
 @dataclass(frozen=True)
@@ -22,7 +44,7 @@ class Loops:
     loop. ``measured`` ``(batch, loops, 3)`` is the end's pose in the frame of the start, ``log_scale`` ``(batch,
     loops, 2)`` the logarithm of its scale (position in m, heading in rad), ``logit`` the belief that it is the same
     place, ``similarity`` the inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false
-    for fill.
+    for fill. ``embeddings`` ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
     """
 
     start: Tensor
@@ -33,63 +55,68 @@ class Loops:
     logit: Tensor
     similarity: Tensor
     valid: Tensor
+    embeddings: Tensor
+
+    @property
+    def nodes(self) -> Tensor:
+        """The two poses of each loop ``(batch, loops, 2)``, as indices of the meta-poses with the origin in front."""
+        return torch.stack((self.start, self.end + 1), dim=-1)
 
 
-@torch.no_grad()
-def find_loops(
-    pair_head: PairHead, codes: Tensor, in_blocks: Tensor, per_pose: int, most: int, min_separation: int
-) -> Loops:
+def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: LoopSearch) -> Loops:
     """For each meta-pose the most similar earlier frames, measured by the pair head.
+
+    The choice has no gradient, what is measured has.
 
     Args:
         codes: place codes ``(batch, steps, code_size)`` of the frame after each step.
         in_blocks: poses within blocks ``(batch, blocks, block, 3)``.
-        per_pose: candidates for each meta-pose, each from another block.
-        most: candidates kept for the trajectory, those with the highest belief.
-        min_separation: meta-steps that lie at least between a meta-pose and its candidate.
     """
-    batch, blocks, block, _ = in_blocks.shape
+    block = in_blocks.shape[2]
     embeddings = pair_head.embed(codes)
-    ends = embeddings[:, block - 1 :: block]
-    similarity = (ends @ embeddings.mT).reshape(batch, blocks, blocks, block)
-    best, best_step = similarity.max(dim=-1)
-    index = torch.arange(blocks, device=codes.device)
-    allowed = index[:, None] - index[None, :] >= min_separation
-    best = best.masked_fill(~allowed, -2.0)
-    per_pose = min(per_pose, blocks)
-    top, top_block = best.topk(per_pose, dim=-1)
-    top_step = best_step.gather(-1, top_block)
-
-    flat_similarity = top.reshape(batch, -1)
-    start = top_block.reshape(batch, -1)
-    frame = start * block + top_step.reshape(batch, -1)
-    end = index[None, :, None].expand(batch, blocks, per_pose).reshape(batch, -1)
-    # The pair head is the costly part: it sees only what is most similar, twice as many as can be kept.
-    keep = flat_similarity.topk(min(2 * most, flat_similarity.shape[1]), dim=-1).indices
-    similarity_kept, start, frame, end = (value.gather(1, keep) for value in (flat_similarity, start, frame, end))
-    earlier = codes.gather(1, frame.unsqueeze(-1).expand(-1, -1, codes.shape[-1]))
-    later = codes[:, block - 1 :: block].gather(1, end.unsqueeze(-1).expand(-1, -1, codes.shape[-1]))
-    measured, log_scale, logit = pair_head(earlier, later)
-    logit = logit.masked_fill(similarity_kept < -1.5, -1e4)
-    keep = logit.topk(min(most, logit.shape[1]), dim=-1).indices
-    keep = keep.sort(dim=-1).values
-    start, frame, end, logit, similarity_kept = (v.gather(1, keep) for v in (start, frame, end, logit, similarity_kept))
-    measured = measured.gather(1, keep.unsqueeze(-1).expand(-1, -1, 3))
-    log_scale = log_scale.gather(1, keep.unsqueeze(-1).expand(-1, -1, 2))
-    frame_in_block = in_blocks.reshape(batch, blocks * block, 3).gather(1, frame.unsqueeze(-1).expand(-1, -1, 3))
-    valid = logit > -1e3
-    # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
-    start = torch.minimum(start, end)
+    at_ends = embeddings[:, block - 1 :: block]
+    with torch.no_grad():
+        similarity, frame, end = _most_similar(at_ends, embeddings, block, search)
+        # The pair head is the costly part: it sees only what is most similar, twice as many as can be kept.
+        keep = similarity.topk(min(2 * search.most, similarity.shape[1]), dim=-1).indices
+        similarity, frame, end = (value.gather(1, keep) for value in (similarity, frame, end))
+    measured, log_scale, logit = pair_head(pick(codes, frame), pick(codes[:, block - 1 :: block], end))
+    logit = logit.masked_fill(similarity < _NONE / 2.0, -1e4)
+    keep = logit.topk(min(search.most, logit.shape[1]), dim=-1).indices.sort(dim=-1).values
+    frame, end, logit, similarity = (value.gather(1, keep) for value in (frame, end, logit, similarity))
+    frame_in_block = pick(in_blocks.flatten(1, 2), frame)
     return Loops(
-        start,
-        end,
-        frame,
-        se2.compose(frame_in_block, measured),
-        log_scale,
-        logit.clamp(min=-20.0),
-        similarity_kept,
-        valid,
+        # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
+        start=torch.minimum(frame // block, end),
+        end=end,
+        frame=frame,
+        measured=se2.compose(frame_in_block, pick(measured, keep)),
+        log_scale=pick(log_scale, keep),
+        logit=logit.clamp(min=-20.0),
+        similarity=similarity,
+        valid=logit > -1e3,
+        embeddings=at_ends,
     )
+
+
+_NONE = -4.0  # the similarity of what is no candidate
+
+
+def _most_similar(at_ends: Tensor, embeddings: Tensor, block: int, search: LoopSearch) -> tuple[Tensor, Tensor, Tensor]:
+    """Similarity, earlier frame and later meta-pose ``(batch, blocks * per_pose)`` of the candidates."""
+    batch, blocks = at_ends.shape[:2]
+    similarity = (at_ends @ embeddings.mT).unflatten(-1, (blocks, block))
+    best, best_step = similarity.max(dim=-1)
+    index = torch.arange(blocks, device=at_ends.device)
+    best = best.masked_fill(index[:, None] - index < search.min_separation, _NONE)
+    chosen = []
+    for _ in range(min(search.per_pose, blocks)):
+        # Neighbours of a candidate would say the same again: the next one comes from elsewhere.
+        top = best.max(dim=-1, keepdim=True)
+        chosen.append((top.values, top.indices * block + best_step.gather(-1, top.indices)))
+        best = best.masked_fill((index - top.indices).abs() <= search.min_apart, _NONE)
+    values, frames = (torch.cat(parts, dim=-1).flatten(1) for parts in zip(*chosen, strict=True))
+    return values, frames, index.repeat_interleave(len(chosen)).expand(batch, -1)
 
 
 def loop_residuals(loops: Loops, poses: Tensor) -> Tensor:
@@ -98,11 +125,34 @@ def loop_residuals(loops: Loops, poses: Tensor) -> Tensor:
     Args:
         poses: global meta-poses with the origin in front ``(batch, blocks + 1, 3)``.
     """
-    start = poses.gather(1, loops.start.unsqueeze(-1).expand(-1, -1, 3))
-    end = poses.gather(1, (loops.end + 1).unsqueeze(-1).expand(-1, -1, 3))
+    start, end = pick(poses, loops.start), pick(poses, loops.end + 1)
     xy = start[..., :2] + se2.rotate(start[..., 2], loops.measured[..., :2]) - end[..., :2]
     yaw = se2.wrap(start[..., 2] + loops.measured[..., 2] - end[..., 2])
     return torch.cat((xy, yaw.unsqueeze(-1)), dim=-1)
+
+
+def odometry_variances(loops: Loops, poses: Tensor, step_variance: Tensor) -> Tensor:
+    """Variances ``(batch, loops, 3)``, float64, of the loops' ends as seen from their starts by odometry alone.
+
+    A turn of a meta-step swings the end about the pose behind that step; cross-correlations are dropped.
+
+    Args:
+        poses: global meta-poses with the origin in front ``(batch, blocks + 1, 3)``.
+        step_variance: of the relative meta-poses ``(batch, blocks, 3)``, along the axes of the earlier pose.
+    """
+    # Sums over a loop are differences of prefix sums, of which float32 would leave too few digits.
+    poses, step_variance = poses.double(), step_variance.double()
+    along, aside, turn = step_variance.unbind(-1)
+    cos, sin = torch.cos(poses[:, :-1, 2]).square(), torch.sin(poses[:, :-1, 2]).square()
+    x, y = poses[:, 1:, 0], poses[:, 1:, 1]
+    terms = (cos * along + sin * aside, sin * along + cos * aside, turn, turn * x, turn * y, turn * x * x, turn * y * y)
+    prefix = torch.stack(terms, dim=-1).cumsum(1)
+    prefix = torch.cat((torch.zeros_like(prefix[:, :1]), prefix), dim=1)
+    xx, yy, one, t_x, t_y, t_xx, t_yy = (pick(prefix, loops.end + 1) - pick(prefix, loops.start)).unbind(-1)
+    end_x, end_y, _ = pick(poses, loops.end + 1).unbind(-1)
+    across_x = xx + end_y * (end_y * one - 2.0 * t_y) + t_yy
+    across_y = yy + end_x * (end_x * one - 2.0 * t_x) + t_xx
+    return torch.stack((across_x, across_y, one), dim=-1).clamp(min=0.0)
 
 
 def spread_over_span(loops: Loops, values: Tensor, weights: Tensor, blocks: int) -> tuple[Tensor, Tensor]:

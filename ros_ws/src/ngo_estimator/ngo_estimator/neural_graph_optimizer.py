@@ -1,14 +1,21 @@
 """The Neural Graph Optimizer (paper, section "Neural Graph Optimization"), with and without loop closures."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 
 from ngo_estimator import se2
-from ngo_estimator.loop_closure import Loops, find_loops, loop_residuals, spread_over_span
-from ngo_estimator.loop_system import LoopSystem, end_covariance, gauss_newton_correction
+from ngo_estimator.gauss_newton import Factors, chain_factors, gauss_newton_step, node_covariance, pair_factors
+from ngo_estimator.loop_closure import (
+    Loops,
+    LoopSearch,
+    find_loops,
+    loop_residuals,
+    odometry_variances,
+    spread_over_span,
+)
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import (
     PoseAggregation,
@@ -26,9 +33,10 @@ class NeuralGraphOptimizerConfig:
     ``iterations`` attend-optimise iterations share their weights. ``attention`` is ``softmax``, or ``sum``, the
     paper's C / sum(C). ``dilations`` holds one number a convolution; with ``residual`` each is added to its input, and
     normalised over its channels. With ``loops`` every iteration sees the residuals of the loop candidates under the
-    current poses and takes a step that reduces them: ``loops_per_pose`` candidates for each meta-pose, at least
-    ``min_loop_separation`` meta-poses older, and the best ``max_loops`` of the trajectory. ``correction_std`` (m, m,
-    rad), the typical error of a relative meta-pose, is the unit of the adjustments.
+    current poses and takes a Gauss-Newton step that reduces them; ``search`` says which candidates there are. Without
+    ``network`` this step is all there is: no attention and no convolutions, one learned factor for the odometry's
+    deviations.
+    ``correction_std`` (m, m, rad), the typical error of a relative meta-pose, is the unit of the adjustments.
     """
 
     aggregation: PoseAggregationConfig
@@ -37,9 +45,8 @@ class NeuralGraphOptimizerConfig:
     dilations: tuple[int, ...] = (1, 1, 2, 4, 8, 4, 2, 1, 1)
     residual: bool = True
     loops: bool = True
-    loops_per_pose: int = 2
-    max_loops: int = 96
-    min_loop_separation: int = 6
+    network: bool = True
+    search: LoopSearch = field(default_factory=LoopSearch)
     correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
 
     def __post_init__(self) -> None:
@@ -50,8 +57,8 @@ class NeuralGraphOptimizerConfig:
                 f"iterations, dilations are {self.iterations}, {self.dilations}; expected at least 1, and a positive "
                 "number for each convolution"
             )
-        if min(self.loops_per_pose, self.max_loops, self.min_loop_separation) < 1:
-            raise ValueError("loops_per_pose, max_loops and min_loop_separation must be at least 1")
+        if not (self.loops or self.network):
+            raise ValueError("loops and network are both false; expected at least one of them")
         if min(self.correction_std) <= 0.0:
             raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
 
@@ -87,8 +94,12 @@ class OptimizedTrajectory:
     def end_covariance(self) -> Tensor:
         """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
         poses = _with_origin(se2.r2g(self.meta_relative[-1].double()))
-        loops = None if self.loops is None else (self.loops.start, self.loops.end)
-        return end_covariance(loops, poses, self.step_std.double(), self.loop_information)
+        step_std = self.step_std.double()
+        factors = [chain_factors(poses, torch.zeros_like(step_std), step_std)]
+        if self.loops is not None and self.loop_information is not None:
+            residual = torch.zeros_like(self.loop_information)
+            factors.append(pair_factors(self.loops.nodes, poses, residual, self.loop_information))
+        return node_covariance(factors, poses.shape[1], poses.shape[1] - 1)
 
 
 class LoopGate(nn.Module):
@@ -148,6 +159,17 @@ class NeuralGraphOptimizer(nn.Module):
     def __init__(self, config: NeuralGraphOptimizerConfig) -> None:
         super().__init__()
         self.config = config
+        self.register_buffer("correction_std", torch.tensor(config.correction_std), persistent=False)
+        self.correction_std: Tensor
+        if config.network:
+            self._build_network(config)
+        if config.loops:
+            self.loop_gate = LoopGate()
+            self.loop_gain = nn.Parameter(torch.tensor(0.0))
+            if not config.network:
+                self.log_scale = nn.Parameter(torch.zeros(3))
+
+    def _build_network(self, config: NeuralGraphOptimizerConfig) -> None:
         width = config.aggregation.width
         self.aggregation = PoseAggregation(config.aggregation)
         self.query = nn.Linear(width, width)
@@ -158,19 +180,11 @@ class NeuralGraphOptimizer(nn.Module):
             self.norms.append(_ChannelNorm(width) if config.residual else nn.Identity())
             channels = width
         self.feature = nn.Conv1d(width, width, 1)
-        self.adjustment = nn.Conv1d(width, 3, 1)
         self.gate = nn.Conv1d(width, 1, 1)
-        nn.init.zeros_(self.adjustment.weight)
-        nn.init.zeros_(self.adjustment.bias)  # type: ignore[arg-type]
-        self.register_buffer("correction_std", torch.tensor(config.correction_std), persistent=False)
-        self.correction_std: Tensor
+        self.adjustment = _zero(nn.Conv1d(width, 3, 1))
         if config.loops:
             self.place_gain = nn.Parameter(torch.tensor(0.0))
-            self.stiffness = nn.Conv1d(width, 3, 1)
-            nn.init.zeros_(self.stiffness.weight)
-            nn.init.zeros_(self.stiffness.bias)  # type: ignore[arg-type]
-            self.loop_gate = LoopGate()
-            self.loop_gain = nn.Parameter(torch.tensor(0.0))
+            self.stiffness = _zero(nn.Conv1d(width, 3, 1))
 
     def attend(self, features: Tensor, place_similarity: Tensor | None) -> Tensor:
         """Attention weights ``(batch, poses, poses)`` of features ``(batch, poses, width)`` ("Attention Phase")."""
@@ -194,70 +208,83 @@ class NeuralGraphOptimizer(nn.Module):
             normed = norm(hidden)
         return normed
 
+    @property
+    def block(self) -> int:
+        """Steps in a meta-pose."""
+        return self.config.aggregation.block
+
+    def find_loops(self, relative: Tensor, place_codes: Tensor, pair_head: PairHead) -> Loops:
+        """Loop candidates of trajectories; ``place_codes`` ``(batch, steps, code_size)`` are of each step's end."""
+        return find_loops(pair_head, place_codes, poses_in_blocks(relative, self.block), self.config.search)
+
     def forward(
-        self,
-        relative: Tensor,
-        log_std: Tensor,
-        motion_features: Tensor,
-        place_codes: Tensor | None = None,
-        pair_head: PairHead | None = None,
+        self, relative: Tensor, log_std: Tensor, motion_features: Tensor, loops: Loops | None = None
     ) -> OptimizedTrajectory:
         """Optimise trajectories whose number of steps is a multiple of the block.
 
         Args:
             relative: relative poses ``(batch, steps, 3)`` (m, m, rad); log_std: logarithm of their deviations.
             motion_features: ``(batch, steps, motion_feature_size)``.
-            place_codes: ``(batch, steps, code_size)`` of the newer frame of each step, with loops only.
-            pair_head: measures pairs of place codes, with loops only.
+            loops: what ``find_loops`` found, for an optimizer with loops.
         """
-        config = self.config
-        in_blocks = poses_in_blocks(relative, config.aggregation.block)
+        if self.config.loops != (loops is not None):
+            given = "none were given" if loops is None else "loops were given"
+            raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
+        in_blocks = poses_in_blocks(relative, self.block)
         odometry = in_blocks[..., -1, :]
-        blocks = odometry.shape[1]
-        features = self.aggregation(relative, log_std, motion_features)
         base_std = block_variances(in_blocks, log_std).sqrt()
-        loops, similarity = None, None
-        if config.loops:
-            if place_codes is None or pair_head is None:
-                raise ValueError("an optimizer with loops needs place codes and a pair head")
-            loops = find_loops(
-                pair_head,
-                place_codes,
-                in_blocks,
-                config.loops_per_pose,
-                config.max_loops,
-                config.min_loop_separation,
-            )
-            embeddings = pair_head.embed(place_codes[:, config.aggregation.block - 1 :: config.aggregation.block])
-            similarity = embeddings @ embeddings.mT
+        features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
+        similarity = None if loops is None or features is None else loops.embeddings @ loops.embeddings.mT
         adjusted, deviation, step_std = odometry, torch.zeros_like(odometry), base_std
         results: list[Tensor] = []
         weights: Tensor | None = None
         information: Tensor | None = None
-        for _ in range(config.iterations):
-            attended = self.attend(features, similarity) @ features
-            inputs = [features, attended]
+        for _ in range(self.config.iterations):
+            poses = _with_origin(se2.r2g(adjusted + deviation))
+            inputs: list[Tensor] = []
             if loops is not None:
-                poses = _with_origin(se2.r2g(adjusted + deviation))
                 residuals = loop_residuals(loops, poses)
-                system = LoopSystem(loops.start, loops.end, poses)
-                expected = system.variances(step_std.square()).to(poses.dtype)
+                expected = odometry_variances(loops, poses, step_std.square()).to(poses.dtype)
                 weights, information = self.loop_gate(loops, residuals, expected)
-                spread, support = spread_over_span(loops, residuals, weights, blocks)
+                spread, support = spread_over_span(loops, residuals, weights, odometry.shape[1])
                 local = torch.cat((se2.rotate(-poses[:, :-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
                 # Residuals of many standard deviations are the rule at first: they enter by their logarithm.
                 inputs.append(torch.asinh(torch.cat((local, deviation), dim=-1) / self.correction_std.repeat(2)))
                 inputs.append(torch.log1p(support))
-            hidden = self.convolve(torch.cat(inputs, dim=-1))
-            beta = torch.sigmoid(self.gate(hidden)).mT
-            adjusted = adjusted + beta * self.adjustment(hidden).mT * self.correction_std
-            features = torch.relu(self.feature(hidden)).mT
-            if loops is not None and information is not None:
-                step_std = base_std * torch.exp(3.0 * torch.tanh(self.stiffness(hidden).mT / 3.0))
-                total = gauss_newton_correction(system, residuals, step_std, information, deviation)
-                deviation = deviation + self.loop_gain * (total.to(deviation.dtype) - deviation)
+            log_scale: Tensor | None = None
+            if features is not None:
+                attended = self.attend(features, similarity) @ features
+                hidden = self.convolve(torch.cat([features, attended, *inputs], dim=-1))
+                beta = torch.sigmoid(self.gate(hidden)).mT
+                adjusted = adjusted + beta * self.adjustment(hidden).mT * self.correction_std
+                features = torch.relu(self.feature(hidden)).mT
+                log_scale = self.stiffness(hidden).mT if loops is not None else None
+            elif loops is not None:
+                log_scale = self.log_scale
+            if loops is not None and information is not None and log_scale is not None:
+                step_std = base_std * torch.exp(3.0 * torch.tanh(log_scale / 3.0))
+                deviation = deviation + self._closing(loops, residuals, information, poses, deviation, step_std)
             results.append(adjusted + deviation)
         return OptimizedTrajectory(frame_poses(in_blocks, results[-1]), results, loops, weights, information, step_std)
+
+    def _closing(
+        self, loops: Loops, residuals: Tensor, information: Tensor, poses: Tensor, deviation: Tensor, step_std: Tensor
+    ) -> Tensor:
+        """What a Gauss-Newton step at ``poses`` adds to the relative meta-poses ``(batch, blocks, 3)``."""
+        exact = poses.double()
+        factors: list[Factors] = [
+            chain_factors(exact, deviation.double(), step_std.double()),
+            pair_factors(loops.nodes, exact, residuals.double(), information.double()),
+        ]
+        step = gauss_newton_step(factors, exact.shape[1])
+        change = se2.g2r((exact + self.loop_gain * step)[:, 1:]) - se2.g2r(exact[:, 1:])
+        return torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1).to(poses.dtype)
+
+
+def _zero(layer: nn.Conv1d) -> nn.Conv1d:
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
 
 
 class _ChannelNorm(nn.LayerNorm):

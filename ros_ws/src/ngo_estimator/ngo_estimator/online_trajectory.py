@@ -276,7 +276,8 @@ def optimize_offline(
 ) -> OptimizedTrajectory:
     """Optimise one trajectory ``(steps, ...)`` of any number of steps; those after the last whole block follow it.
 
-    Arguments as in ``NeuralGraphOptimizer.forward``, without the batch. ``poses`` of the result is ``(1, steps, 3)``.
+    Arguments as in ``NeuralGraphOptimizer``, without the batch; ``pair_head`` with loops only.
+    ``poses`` of the result is ``(1, steps, 3)``.
     """
     steps = relative.shape[0]
     block = optimizer.config.aggregation.block
@@ -284,8 +285,12 @@ def optimize_offline(
     if whole == 0:
         raise ValueError(f"{steps} steps make no meta-pose; expected at least {block}")
     inputs = [value[:whole].unsqueeze(0).float() for value in (relative, log_std, motion_features, place_codes)]
-    codes = inputs[3] if optimizer.config.loops else None
-    result: OptimizedTrajectory = optimizer(*inputs[:3], codes, pair_head)
+    loops = None
+    if optimizer.config.loops:
+        if pair_head is None:
+            raise ValueError("an optimizer with loops needs a pair head")
+        loops = optimizer.find_loops(inputs[0], inputs[3], pair_head)
+    result: OptimizedTrajectory = optimizer(*inputs[:3], loops)
     if whole == steps:
         return result
     tail = se2.compose(result.poses[:, -1:], se2.r2g(relative[whole:].unsqueeze(0).float()))
