@@ -57,10 +57,42 @@ def test_the_action_matters_and_must_be_given_exactly_when_it_was_in_training() 
         without(images[:1], images[1:], torch.tensor([1]))
 
 
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_symmetric_network_sees_the_mirror_image_as_the_mirrored_motion(world: str) -> None:
+    torch.manual_seed(0)
+    config = local_config(world, symmetric=True, mirrored_actions=(0, 2, 1))
+    network = LocalPoseNetwork(config).eval()
+    images, actions = observations(world, 4), torch.tensor([0, 1, 2])
+    mean, log_std, feature = network(images[:3], images[1:], actions)
+    mirrored = images.flip(-2)
+    other, other_log_std, _ = network(mirrored[:3], mirrored[1:], torch.tensor([0, 2, 1]))
+    assert torch.allclose(other, mean * torch.tensor([1.0, -1.0, -1.0]), atol=1e-6)
+    assert torch.allclose(other_log_std, log_std, atol=1e-6)
+    # Training sees each picture once: there the network is the plain one.
+    plain = LocalPoseNetwork(local_config(world)).eval()
+    plain.load_state_dict(network.state_dict())
+    once = plain(images[:3], images[1:], actions)
+    assert all(torch.equal(a, b) for a, b in zip(network.train()(images[:3], images[1:], actions), once, strict=True))
+    assert torch.equal(feature, once[2]) and not torch.allclose(mean, once[0], atol=1e-4)
+
+
+def test_the_scale_of_deviations_is_a_factor() -> None:
+    torch.manual_seed(0)
+    plain = LocalPoseNetwork(local_config("maze2d")).eval()
+    scaled = LocalPoseNetwork(dataclasses.replace(plain.config, deviation_scale=(2.0, 3.0, 0.5))).eval()
+    scaled.load_state_dict(plain.state_dict())
+    images, actions = observations("maze2d", 4), torch.tensor([0, 1, 2])
+    mean, log_std, _ = plain(images[:3], images[1:], actions)
+    scaled_mean, scaled_log_std, _ = scaled(images[:3], images[1:], actions)
+    assert torch.equal(mean, scaled_mean)
+    assert torch.allclose(scaled_log_std.exp(), log_std.exp() * torch.tensor([2.0, 3.0, 0.5]), rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     "change",
     [{"width": 0.0}, {"width": 2.1}, {"actions": -1}, {"feature_size": 0}, {"hidden_size": 0}, {"period_s": 0.0}]
-    + [{"period_s": float("nan")}, {"relative_std": (1.0, 0.0, 1.0)}],
+    + [{"period_s": float("nan")}, {"relative_std": (1.0, 0.0, 1.0)}]
+    + [{"deviation_scale": (1.0, 1.0, 0.0)}, {"symmetric": True}, {"symmetric": True, "mirrored_actions": (0, 1, 1)}],
 )
 def test_impossible_local_configurations_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="expected"):

@@ -17,6 +17,8 @@ class LocalPoseConfig:
     ``relative_mean`` and ``relative_std`` (m, m, rad) normalise the output: the network works on poses of mean 0 and
     deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of
     discrete actions, 0 for a network that sees images alone; ``period_s`` is the time between frames in training.
+    With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror images, in which action
+    ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard deviations that the heads give.
     """
 
     image: ImageFormat
@@ -27,6 +29,9 @@ class LocalPoseConfig:
     hidden_size: int = 256
     relative_mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     relative_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    symmetric: bool = False
+    mirrored_actions: tuple[int, ...] = ()
+    deviation_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -40,6 +45,12 @@ class LocalPoseConfig:
             raise ValueError(f"period_s is {self.period_s}; expected a positive time")
         if min(self.relative_std) <= 0.0:
             raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
+        if min(self.deviation_scale) <= 0.0:
+            raise ValueError(f"deviation_scale is {self.deviation_scale}; expected three positive numbers")
+        if self.symmetric and sorted(self.mirrored_actions) != list(range(self.actions)):
+            raise ValueError(
+                f"mirrored_actions is {self.mirrored_actions}; expected each of the {self.actions} actions once"
+            )
 
 
 class LocalPoseNetwork(nn.Module):
@@ -47,7 +58,9 @@ class LocalPoseNetwork(nn.Module):
 
     Two frames are stacked and passed through the convolutions of FlowNetS; one fully connected layer takes these and
     the action; a translational and a rotational head read it. Beyond the paper each head also gives the logarithm
-    of its standard deviation, and the input of the heads is the motion feature that the pose aggregation reads.
+    of its standard deviation, and the input of the heads is the motion feature that the pose aggregation reads. A
+    symmetric network estimates both the frames and their mirror image, in evaluation mode: errors to the left and to
+    the right then cancel wherever the two differ.
     """
 
     def __init__(self, config: LocalPoseConfig) -> None:
@@ -61,8 +74,12 @@ class LocalPoseNetwork(nn.Module):
         self.rotation = nn.Linear(config.feature_size + config.actions, 2)
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
+        self.register_buffer("log_deviation_scale", torch.tensor(config.deviation_scale).log(), persistent=False)
+        self.register_buffer("mirrored_actions", torch.tensor(config.mirrored_actions).long(), persistent=False)
         self.relative_mean: Tensor
         self.relative_std: Tensor
+        self.log_deviation_scale: Tensor
+        self.mirrored_actions: Tensor
 
     def forward(self, earlier: Tensor, later: Tensor, actions: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Estimate relative poses.
@@ -78,6 +95,15 @@ class LocalPoseNetwork(nn.Module):
         if (actions is None) != (self.config.actions == 0):
             given = "no actions were given" if actions is None else "actions were given"
             raise ValueError(f"{given} to a network trained with {self.config.actions} actions")
+        if self.training or not self.config.symmetric:
+            return self._estimate(earlier, later, actions)
+        both = [torch.cat((frames, frames.flip(-2))) for frames in (earlier, later)]
+        actions = actions if actions is None else torch.cat((actions, self.mirrored_actions[actions]))
+        mean, log_std, feature = (values.chunk(2) for values in self._estimate(both[0], both[1], actions))
+        flip = mean[0].new_tensor([1.0, -1.0, -1.0])
+        return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
+
+    def _estimate(self, earlier: Tensor, later: Tensor, actions: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         frames = torch.cat((to_network(earlier), to_network(later)), dim=1)
         inputs = [self.convolutions(frames)]
         action_codes = []
@@ -88,5 +114,5 @@ class LocalPoseNetwork(nn.Module):
         heads_input = torch.cat([feature, *action_codes], dim=1)
         translation, rotation = self.translation(heads_input).float(), self.rotation(heads_input).float()
         mean = torch.cat((translation[:, :2], rotation[:, :1]), dim=1) * self.relative_std + self.relative_mean
-        log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1).clamp(-7.0, 3.0) + self.relative_std.log()
-        return mean, log_std, feature
+        log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1).clamp(-7.0, 3.0)
+        return mean, log_std + self.relative_std.log() + self.log_deviation_scale, feature
