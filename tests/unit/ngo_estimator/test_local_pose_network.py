@@ -72,8 +72,9 @@ def test_a_symmetric_network_sees_the_mirror_image_as_the_mirrored_motion(world:
     plain = LocalPoseNetwork(local_config(world)).eval()
     plain.load_state_dict(network.state_dict())
     once = plain(images[:3], images[1:], actions)
-    assert all(torch.equal(a, b) for a, b in zip(network.train()(images[:3], images[1:], actions), once, strict=True))
-    assert torch.equal(feature, once[2]) and not torch.allclose(mean, once[0], atol=1e-4)
+    trained = network.train()(images[:3], images[1:], actions)
+    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(trained, once, strict=True))
+    assert torch.allclose(feature, once[2], atol=1e-6) and not torch.allclose(mean, once[0], atol=1e-4)
 
 
 def test_the_scale_of_deviations_is_a_factor() -> None:
