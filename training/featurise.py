@@ -24,7 +24,7 @@ from ngo_sim.episodes import Episode
 from training import runs
 from training.metrics import seen_from_first
 from training.streams import images_of, simulate
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, world_named
 
 _GROUP = 8  # mazes of one size
 _MADE_WITH = "networks.json"
@@ -36,10 +36,12 @@ class Arguments:
 
     world: Literal["maze2d", "maze3d"]
     """World to train for."""
-    trajectories: int = 240
+    trajectories: int = 960
     """Trajectories for training, each in a maze of its own that the local network has not seen."""
-    validation_trajectories: int = 32
-    """Trajectories of the validation split."""
+    validation_trajectories: int = 24
+    """Trajectories of the validation split for each table of results."""
+    test_trajectories: int = 0
+    """Trajectories of the test split for each table of results."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/local_pose_network.safetensors and WORLD/place_encoder.safetensors."""
     out: Path = runs.ROOT / "runs"
@@ -77,16 +79,21 @@ def _groups(seeds: list[int], part: int, parts: int) -> Iterator[tuple[int, list
 
 
 def main(arguments: Arguments) -> None:
-    """Make the arrays ``WORLD/features/{train,validation}/NAME.npy`` of shape ``(trajectories, steps, ...)``."""
+    """Make the arrays ``WORLD/features/STORE/NAME.npy`` of shape ``(trajectories, steps, ...)``.
+
+    The stores are ``train`` and, for each table of results, ``validation_TABLE`` and ``test_TABLE``.
+    """
     world = world_named(arguments.world)
     folder = arguments.weights / world.name
     local, local_description = load_local(folder, world.name)
     place, place_description = load_place(folder, world.name)
-    splits = {
-        "train": list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories]),
-        "validation": list(VALIDATION_SEEDS[-arguments.validation_trajectories :]),
-    }
-    for split, seeds in splits.items():
+    splits = {"train": (list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories]), DRAWN)}
+    for split, count in (("validation", arguments.validation_trajectories), ("test", arguments.test_trajectories)):
+        for table, size in world.tables.items():
+            splits[f"{split}_{table}"] = (list(world.table_seeds(table, split)[:count]), size)
+    for split, (seeds, size) in splits.items():
+        if not seeds:
+            continue
         store = arguments.out / world.name / "features" / split
         store.mkdir(parents=True, exist_ok=True)
         check_networks(store, local_description, place_description)
@@ -99,7 +106,7 @@ def main(arguments: Arguments) -> None:
         )
         for first, group in _groups(seeds, arguments.part, arguments.parts):
             if first not in done:
-                for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1)):
+                for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1, size)):
                     for name, value in features_of(world, episode, folder, (local, place)).items():
                         _array(store / f"{name}.npy", (len(seeds), *value.shape), value.dtype)[first + offset] = value
                 done.add(first)

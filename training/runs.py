@@ -1,18 +1,37 @@
-"""What all training scripts share: the trainer, the folder of a run, and the record of how a network was made."""
+"""What all training scripts share: the folder of a run with its record, and the trainer."""
 
 import dataclasses
+import json
 import shlex
 import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import CSVLogger
+
+from training.curves import Batch, Curves, rows, write_at_once
 
 ROOT = Path(__file__).resolve().parents[1]
 WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerArguments:
+    """Where and how a training computes: what the arguments of every training script begin with."""
+
+    accelerator: str = "auto"
+    """Kind of device by Lightning's name, as cpu or gpu; auto: a GPU where there is one."""
+    devices: str = "auto"
+    """Processes that train together, each on batches of its own; auto: one, or one a GPU."""
+    strategy: str = "auto"
+    """How they do so by Lightning's name, as ddp or ddp_find_unused_parameters_true; auto: ddp if several."""
+    precision: Literal["bf16-mixed", "32-true"] = "bf16-mixed"
+    """Arithmetic of the networks; 32-true where a device has no fast bfloat16."""
 
 
 def revision() -> str:
@@ -50,18 +69,98 @@ def record(script: str, arguments: Any) -> dict[str, Any]:
     return {"command": command, "arguments": values, "revision": revision()}
 
 
-def make_trainer(run: Path, epochs: int, seed: int, precision: str, **options: Any) -> lightning.Trainer:
-    """A trainer that logs to ``run/metrics.csv``, keeps ``run/last.ckpt`` after each epoch, and shows its progress."""
+class Run:
+    """A training in a folder of its own: ``run.json``, ``metrics.csv`` and ``last.ckpt``, and its trainer.
+
+    Begun again with the same arguments, it goes on after its last whole epoch and ends as if it had not been stopped.
+    Several processes hold the same run; only the one that ``is_first`` writes.
+
+    Raises:
+        ValueError: the folder holds a run that was begun with other arguments.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        script: str,
+        arguments: TrainerArguments,
+        epochs: int,
+        seed: int,
+        datapoints: Callable[[Batch], int] = rows,
+    ) -> None:
+        self.folder = folder
+        self.record = record(script, arguments)
+        self._description = {**self.record, "started": _now(), "resumed": [], "state": "running"}
+        self._check_arguments()
+        self.curves = Curves(folder / "metrics.csv", datapoints)
+        self.trainer = make_trainer(
+            folder,
+            epochs,
+            seed,
+            arguments.precision,
+            self.curves,
+            accelerator=arguments.accelerator,
+            devices=arguments.devices,
+            strategy=arguments.strategy,
+        )
+        self.is_first = bool(self.trainer.is_global_zero)
+
+    def _check_arguments(self) -> None:
+        path = self.folder / "run.json"
+        if not path.exists() or resume_from(self.folder) is None:
+            return
+        begun = json.loads(path.read_text())
+        now = json.loads(json.dumps(self.record["arguments"]))
+        then = begun["arguments"]
+        differing = sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name))
+        if differing:
+            given = ", ".join(f"{name} {now.get(name)}" for name in differing)
+            expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
+            raise ValueError(
+                f"{self.folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, "
+                "or the folder removed to begin anew"
+            )
+        self._description = {**begun, "state": "running"}
+        self._description["resumed"] = [*begun["resumed"], {"time": _now(), "revision": self.record["revision"]}]
+
+    def fit(self, training: lightning.LightningModule, data: lightning.LightningDataModule) -> None:
+        """Train to the last epoch, from the last one that was completed."""
+        if self.is_first:
+            self._write()
+        self.trainer.fit(training, datamodule=data, ckpt_path=resume_from(self.folder))
+
+    def finish(self, metrics: dict[str, Any]) -> dict[str, Any]:
+        """Complete ``run.json``; returns the ``training`` entry of the JSON beside the weights."""
+        training = {**self.record, "processes": self.trainer.world_size, **self.curves.figures()}
+        self._description = {**self._description, **training, "metrics": metrics, "ended": _now(), "state": "complete"}
+        self._write()
+        return training
+
+    def _write(self) -> None:
+        write_at_once(self.folder / "run.json", json.dumps(self._description, indent=2) + "\n")
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def make_trainer(
+    folder: Path, epochs: int, seed: int, precision: str, curves: Curves | None = None, **options: Any
+) -> lightning.Trainer:
+    """A trainer that keeps ``metrics.csv`` and ``last.ckpt`` in ``folder`` after each epoch, and shows its progress."""
     lightning.seed_everything(seed, workers=True)
     torch.set_float32_matmul_precision("high")
-    checkpoint = ModelCheckpoint(dirpath=run, filename="last", save_top_k=1, enable_version_counter=False)
+    checkpoint = ModelCheckpoint(dirpath=folder, filename="last", save_top_k=1, enable_version_counter=False)
     return lightning.Trainer(
         max_epochs=epochs,
         precision=precision,  # type: ignore[arg-type]
         gradient_clip_val=1.0,
-        callbacks=[checkpoint, TQDMProgressBar(refresh_rate=20, leave=True)],
-        logger=CSVLogger(run, name="", version=""),
+        callbacks=[checkpoint, curves or Curves(folder / "metrics.csv"), TQDMProgressBar(refresh_rate=20, leave=True)],
+        logger=False,
         reload_dataloaders_every_n_epochs=1,
+        # The streams deal the training data out themselves; every process measures all of the validation data, so that
+        # medians and other figures that cannot be averaged come out as with one.
+        use_distributed_sampler=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
         **options,

@@ -5,6 +5,7 @@ the data that an unbroken one would have met.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from ngo_estimator import se2
 from ngo_sim.drivers import Action
 from ngo_sim.episodes import Episode, record_episode
-from training.worlds import World
+from training.worlds import DRAWN, MazeSize, World
 
 Batch = dict[str, Tensor]
 
@@ -22,9 +23,9 @@ _GROUP = 8
 """Episodes simulated in mazes of one size before another size is drawn, and shuffled together."""
 
 
-def simulate(world: World, seeds: list[int], frames: int) -> Iterator[Episode]:
-    """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one size, a function of the first seed."""
-    env = world.make_random(np.random.default_rng(seeds[0]))
+def simulate(world: World, seeds: list[int], frames: int, size: MazeSize = DRAWN) -> Iterator[Episode]:
+    """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one size; what is drawn depends on the first."""
+    env = world.make_random(np.random.default_rng(seeds[0]), size)
     try:
         if hasattr(env, "preload"):
             env.preload(seeds)
@@ -47,28 +48,46 @@ def relative_poses(poses_xyyaw: np.ndarray) -> Tensor:
 
 def mirrored(batch: Batch) -> Batch:
     """The batch seen in a mirror: pictures flipped left to right, left and right actions and motions exchanged."""
-    flip = torch.tensor([1.0, -1.0, -1.0])
-    turned = torch.tensor([Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT])
     result = dict(batch)
     for name, value in batch.items():
-        if name in ("earlier", "later", "a", "b"):
+        if name in ("earlier", "later", "a", "b", "images"):
             result[name] = value.flip(-2)
         elif name in ("relative", "poses"):
-            result[name] = value * flip
+            result[name] = value * value.new_tensor([1.0, -1.0, -1.0])
         elif name == "action":
-            result[name] = turned[value]
+            result[name] = value.new_tensor([Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT])[value]
     return result
 
 
-class _Stream(IterableDataset[Batch]):
-    """The maze seeds of one epoch, dealt out to the workers in groups."""
+@dataclass(frozen=True)
+class Share:
+    """Which of the ``ranks`` processes that train together this is: each gets as many groups of mazes of its own."""
 
-    def __init__(self, world: World, seeds: range, epoch: int, groups: int, frames: int) -> None:
+    rank: int = 0
+    ranks: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rank < self.ranks:
+            raise ValueError(f"rank is {self.rank} of {self.ranks}; expected 0 to {self.ranks - 1}")
+
+
+ALL = Share()
+
+
+class _Stream(IterableDataset[Batch]):
+    """The maze seeds of one epoch, dealt out in groups to the processes that train together and to their workers.
+
+    An epoch has as many groups as it takes for all processes to have the same number of them.
+    """
+
+    def __init__(self, world: World, seeds: range, epoch: int, groups: int, frames: int, share: Share = ALL) -> None:
         self.world, self.frames = world, frames
-        first = epoch * groups * _GROUP
-        if first + groups * _GROUP > len(seeds):
+        mazes = -(-groups // share.ranks) * share.ranks * _GROUP
+        first = epoch * mazes
+        if first + mazes > len(seeds):
             raise ValueError(f"epoch {epoch} asks for more than the {len(seeds)} maze seeds")
-        self.groups = [list(seeds[i : i + _GROUP]) for i in range(first, first + groups * _GROUP, _GROUP)]
+        dealt = [list(seeds[i : i + _GROUP]) for i in range(first, first + mazes, _GROUP)]
+        self.groups = dealt[share.rank :: share.ranks]
 
     def __iter__(self) -> Iterator[Batch]:
         worker = get_worker_info()
@@ -99,8 +118,11 @@ class PairStream(_Stream):
 
     FRAMES = 401
 
-    def __init__(self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int) -> None:
-        super().__init__(world, seeds, epoch, max(1, round(datapoints / (_GROUP * (self.FRAMES - 1)))), self.FRAMES)
+    def __init__(
+        self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int, share: Share = ALL
+    ) -> None:
+        groups = max(1, round(datapoints / (_GROUP * (self.FRAMES - 1))))
+        super().__init__(world, seeds, epoch, groups, self.FRAMES, share)
         self.batch_size = batch_size
 
     @property
@@ -130,14 +152,17 @@ class PlaceStream(_Stream):
     """Batches of pairs of frames that show one place, from several mazes and well apart in time.
 
     A batch holds ``a``, ``b`` ``(batch, height, width, channels)``, their ``poses`` ``(batch, 2, 3)`` and the number of
-    their ``maze`` ``(batch,)``.
+    their ``maze`` ``(batch,)``. Mazes in which no place is seen twice give none; a group of such mazes alone raises
+    ``ValueError``.
     """
 
     MIN_STEPS_APART = 50
     FRAMES = 1000
 
-    def __init__(self, world: World, seeds: range, epoch: int, batches: int, pairs_a_maze: int) -> None:
-        super().__init__(world, seeds, epoch, max(1, round(batches / self.batches_a_group)), self.FRAMES)
+    def __init__(
+        self, world: World, seeds: range, epoch: int, batches: int, pairs_a_maze: int, share: Share = ALL
+    ) -> None:
+        super().__init__(world, seeds, epoch, max(1, round(batches / self.batches_a_group)), self.FRAMES, share)
         self.pairs_a_maze = pairs_a_maze
 
     @property
@@ -148,7 +173,10 @@ class PlaceStream(_Stream):
         pairs = [(episode, revisits(episode.poses_xyyaw, self.world, self.MIN_STEPS_APART)) for episode in episodes]
         usable = [(episode, found) for episode, found in pairs if len(found)]
         if not usable:
-            return
+            raise ValueError(
+                f"in none of {len(episodes)} mazes of {episodes[0].maze.walls.shape} blocks is a place seen twice in "
+                f"{self.frames} frames, {self.MIN_STEPS_APART} or more apart; expected longer episodes or smaller mazes"
+            )
         images = [images_of(self.world, episode) for episode, _ in usable]
         for count in range(self.batches_a_group):
             parts: list[Batch] = []
@@ -167,6 +195,36 @@ class PlaceStream(_Stream):
                     }
                 )
             batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+            yield mirrored(batch) if count % 2 else batch
+
+
+class TrajectoryStream(_Stream):
+    """Batches of whole short trajectories, each in a maze of its own; every second batch is mirrored.
+
+    A batch holds ``images`` ``(batch, steps + 1, height, width, channels)``, ``action`` ``(batch, steps)`` and
+    ``relative`` ``(batch, steps, 3)``.
+    """
+
+    def __init__(
+        self, world: World, seeds: range, epoch: int, batches: int, batch_size: int, steps: int, share: Share = ALL
+    ) -> None:
+        if not 1 <= batch_size <= _GROUP:
+            raise ValueError(f"batch_size is {batch_size}; expected 1 to {_GROUP}, the mazes of one size")
+        self.batch_size = batch_size
+        super().__init__(world, seeds, epoch, max(1, round(batches / self.batches_a_group)), steps + 1, share)
+
+    @property
+    def batches_a_group(self) -> int:
+        return _GROUP // self.batch_size
+
+    def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
+        for count in range(self.batches_a_group):
+            chosen = episodes[count * self.batch_size : (count + 1) * self.batch_size]
+            batch = {
+                "images": torch.stack([images_of(self.world, episode) for episode in chosen]),
+                "action": torch.stack([torch.from_numpy(episode.actions).long() for episode in chosen]),
+                "relative": torch.stack([relative_poses(episode.poses_xyyaw) for episode in chosen]),
+            }
             yield mirrored(batch) if count % 2 else batch
 
 

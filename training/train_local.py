@@ -7,6 +7,7 @@ Run again, it goes on where it was stopped. It ends with the network's output ca
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,12 +24,15 @@ from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from training import runs
-from training.streams import Batch, PairStream, images_of, loader, relative_poses, simulate
+from training.streams import Batch, PairStream, Share, images_of, loader, relative_poses, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+
+HEADING_WEIGHT = 3.0
+LIKELIHOOD_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(runs.TrainerArguments):
     """Settings of a training of the local pose network."""
 
     world: Literal["maze2d", "maze3d"]
@@ -38,15 +42,15 @@ class Arguments:
     epochs: int = 8
     """Passes of new data."""
     datapoints: int = 200_000
-    """Frame pairs in an epoch."""
+    """Frame pairs in an epoch, of all processes."""
     batch_size: int = 256
-    """Frame pairs in a step of the optimiser."""
+    """Frame pairs in a step of the optimiser, in each process."""
     learning_rate: float = 2e-3
     """Highest learning rate of the one-cycle schedule."""
     validation_mazes: int = 8
     """Mazes of the validation split that each epoch is measured on."""
     workers: int = 1
-    """Processes that simulate."""
+    """Processes that simulate for each one that trains."""
     seed: int = 0
     """Seed of the initial weights."""
     out: Path = runs.WEIGHTS
@@ -56,10 +60,7 @@ class Arguments:
 
 
 class LocalTraining(lightning.LightningModule):
-    """Smooth-L1 on normalised relative poses, and the likelihood of what the network says of its errors."""
-
-    HEADING_WEIGHT = 3.0
-    LIKELIHOOD_WEIGHT = 0.1
+    """The losses of single steps, ``step_losses``."""
 
     def __init__(self, arguments: Arguments, world: World, network: LocalPoseNetwork) -> None:
         super().__init__()
@@ -68,24 +69,26 @@ class LocalTraining(lightning.LightningModule):
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
-        std = self.network.relative_std
-        error = (mean - batch["relative"]) / std
-        weight = error.new_tensor([1.0, 1.0, self.HEADING_WEIGHT])
-        pose_loss = (smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.1) * weight).mean()
-        log_scale = log_std - std.log()
-        # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
-        likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
-        self.log_dict({"pose_loss": pose_loss, "likelihood": likelihood}, on_step=False, on_epoch=True, prog_bar=True)
-        return pose_loss + self.LIKELIHOOD_WEIGHT * likelihood
+        pose_loss, likelihood = step_losses(mean, log_std, batch["relative"], self.network.relative_std)
+        self.log_dict(
+            {"pose_loss": pose_loss, "likelihood": likelihood},
+            on_step=False,
+            on_epoch=True,
+            prog_bar=True,
+            sync_dist=True,
+        )
+        return pose_loss + LIKELIHOOD_WEIGHT * likelihood
 
     def validation_step(self, batch: Batch, _: int) -> None:
-        mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
-        self.validation.append((mean.float(), log_std.float(), batch["relative"]))
+        with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
+            mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
+        self.validation.append((mean, log_std, batch["relative"]))
 
     def on_validation_epoch_end(self) -> None:
         mean, log_std, truth = (torch.cat(parts) for parts in zip(*self.validation, strict=True))
         self.validation.clear()
-        self.log_dict({f"validation_{k}": v for k, v in step_metrics(mean, log_std, truth).items()}, prog_bar=True)
+        metrics = {f"validation_{k}": v for k, v in step_metrics(mean, log_std, truth).items()}
+        self.log_dict(metrics, prog_bar=True, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-4)
@@ -101,10 +104,8 @@ class _Data(lightning.LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         assert self.trainer is not None
         a = self.arguments
-        return loader(
-            PairStream(self.world, TRAIN_SEEDS, self.trainer.current_epoch, a.datapoints, a.batch_size),
-            a.workers,
-        )
+        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
+        return loader(PairStream(self.world, TRAIN_SEEDS, epoch, a.datapoints, a.batch_size, share), a.workers)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
@@ -132,6 +133,17 @@ def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
     return result
 
 
+def step_losses(mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+    """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says."""
+    error = (mean - truth) / std
+    weight = error.new_tensor([1.0, 1.0, HEADING_WEIGHT])
+    pose_loss = (smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.1) * weight).mean()
+    log_scale = log_std - std.log()
+    # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
+    likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
+    return pose_loss, likelihood
+
+
 def step_metrics(mean: Tensor, log_std: Tensor, truth: Tensor) -> dict[str, float]:
     """Errors a step: RMSE (m, deg), constant bias (m, deg) and how many predicted deviations the errors have."""
     error = mean - truth
@@ -147,26 +159,36 @@ def step_metrics(mean: Tensor, log_std: Tensor, truth: Tensor) -> dict[str, floa
 
 @torch.no_grad()
 def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig:
-    """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares)."""
+    """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares).
+
+    The deviations get a scale each that makes their mean square that of the errors.
+    """
     network = network.eval()
-    estimates = torch.cat([network(p["earlier"], p["later"], p["action"])[0] for p in pairs]).double()
+    parts = [network(p["earlier"], p["later"], p["action"]) for p in pairs]
+    estimates, log_std = (torch.cat([part[k] for part in parts]).double() for k in (0, 1))
     truth = torch.cat([p["relative"] for p in pairs]).double()
     mean, std = list(network.config.relative_mean), list(network.config.relative_std)
+    fits = torch.zeros_like(truth)
     for i in range(3):
         fitted, _ = np.polyfit(estimates[:, i].numpy(), truth[:, i].numpy(), 1)
         scale = max(fitted, 0.01)  # what was not learned at all may fit best mirrored; a deviation stays positive
         bias = float((truth[:, i] - scale * estimates[:, i]).mean())
         mean[i], std[i] = float(scale * mean[i] + bias), float(scale * std[i])
+        fits[:, i] = scale * estimates[:, i] + bias
+        log_std[:, i] += math.log(scale)
+    deviation = ((fits - truth) / log_std.exp()).square().mean(0).sqrt().clamp(min=0.01).tolist()
     return dataclasses.replace(
-        network.config, relative_mean=(mean[0], mean[1], mean[2]), relative_std=(std[0], std[1], std[2])
+        network.config,
+        relative_mean=(mean[0], mean[1], mean[2]),
+        relative_std=(std[0], std[1], std[2]),
+        deviation_scale=(deviation[0], deviation[1], deviation[2]),
     )
 
 
 def main(arguments: Arguments) -> dict[str, float]:
-    """Train, calibrate, write the weights, and return the validation metrics."""
+    """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
     world = world_named(arguments.world)
-    run = arguments.runs / world.name / "local"
-    trainer = runs.make_trainer(run, arguments.epochs, arguments.seed, "bf16-mixed")
+    run = runs.Run(arguments.runs / world.name / "local", "train_local", arguments, arguments.epochs, arguments.seed)
     some = torch.cat([p["relative"] for p in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
     config = LocalPoseConfig(
         image=world.image,
@@ -175,16 +197,20 @@ def main(arguments: Arguments) -> dict[str, float]:
         period_s=world.period_s,
         relative_mean=(float(some[:, 0].mean()), 0.0, 0.0),
         relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
+        symmetric=True,
+        mirrored_actions=world.mirrored_actions,
     )
     training = LocalTraining(arguments, world, LocalPoseNetwork(config))
     data = _Data(arguments, world)
-    trainer.fit(training, datamodule=data, ckpt_path=runs.resume_from(run))
-
-    unseen = episode_pairs(world, list(OPTIMIZER_TRAIN_SEEDS[-32:]))
+    run.fit(training, data)
+    if not run.is_first:
+        return {}
+    training.cpu()
+    unseen = episode_pairs(world, list(OPTIMIZER_TRAIN_SEEDS[-64:]))
     final = LocalPoseNetwork(calibrated(training.network, unseen)).eval()
     final.load_state_dict(training.network.state_dict())
     metrics = measure(final, data.validation())
-    details = {"training": runs.record("train_local", arguments), "metrics": {"validation": metrics}}
+    details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{LOCAL}.safetensors", final, LOCAL, world.name, details)
     print("validation", {name: round(value, 5) for name, value in metrics.items()})
     return metrics

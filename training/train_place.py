@@ -20,12 +20,12 @@ from ngo_estimator import se2
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, save_checkpoint
 from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
-from training.streams import Batch, PlaceStream, loader
+from training.streams import Batch, PlaceStream, Share, loader
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(runs.TrainerArguments):
     """Settings of a training of the place encoder."""
 
     world: Literal["maze2d", "maze3d"]
@@ -35,7 +35,7 @@ class Arguments:
     epochs: int = 10
     """Passes of new data."""
     batches: int = 256
-    """Steps of the optimiser in an epoch."""
+    """Batches in an epoch, of all processes."""
     pairs_a_maze: int = 24
     """Pairs of frames from each of the 8 mazes of a batch."""
     learning_rate: float = 1.5e-3
@@ -43,7 +43,7 @@ class Arguments:
     validation_batches: int = 16
     """Batches of the validation split that each epoch is measured on."""
     workers: int = 1
-    """Processes that simulate."""
+    """Processes that simulate for each one that trains."""
     seed: int = 0
     """Seed of the initial weights."""
     out: Path = runs.WEIGHTS
@@ -69,7 +69,7 @@ class PlaceTraining(lightning.LightningModule):
         """Losses and retrieval figures of a batch."""
         images = torch.cat((batch["a"], batch["b"]))
         if augment and images.dtype == torch.uint8:
-            gain = 1.0 + self.BRIGHTNESS * (2.0 * torch.rand(len(images), 1, 1, 1) - 1.0)
+            gain = 1.0 + self.BRIGHTNESS * (2.0 * torch.rand(len(images), 1, 1, 1, device=images.device) - 1.0)
             images = (images * gain).clamp(0, 255).to(torch.uint8)
         codes = self.networks.encoder(images)
         code_a, code_b = codes.chunk(2)
@@ -79,10 +79,10 @@ class PlaceTraining(lightning.LightningModule):
         ambiguous = (
             (batch["maze"][:, None] == batch["maze"])
             & (torch.cdist(pose_a[:, :2], pose_b[:, :2]) < 2.0 * self.world.place_radius_m)
-            & ~torch.eye(len(pose_a), dtype=torch.bool)
+            & ~torch.eye(len(pose_a), dtype=torch.bool, device=pose_a.device)
         )
         logits = (similarity * self.log_temperature.clamp(max=4.0).exp()).masked_fill(ambiguous, -1e4)
-        target = torch.arange(len(pose_a))
+        target = torch.arange(len(pose_a), device=pose_a.device)
         contrast = 0.5 * (cross_entropy(logits, target) + cross_entropy(logits.mT, target))
 
         truth = se2.between(pose_a, pose_b)
@@ -111,20 +111,22 @@ class PlaceTraining(lightning.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         # The brightness of the pictures is random: a resumed training must draw what an unbroken one would have drawn.
-        torch.manual_seed(self.arguments.seed * 1_000_003 + self.current_epoch)
+        torch.manual_seed((self.arguments.seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         figures = self(batch, augment=True)
-        self.log_dict(figures, on_step=False, on_epoch=True, prog_bar=True)
+        self.log_dict(figures, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
         return figures["loss"]
 
     def validation_step(self, batch: Batch, _: int) -> None:
-        figures = self(batch, augment=False)
+        with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
+            figures = self(batch, augment=False)
         self.log_dict(
             {f"validation_{k}": v for k, v in figures.items()},
             on_epoch=True,
             prog_bar=True,
             batch_size=len(batch["a"]),
+            sync_dist=True,
         )
 
     def configure_optimizers(self) -> Any:
@@ -143,7 +145,8 @@ class _Data(lightning.LightningDataModule):
         a = self.arguments
         # A stream of its own: the local network's mazes come from the front of the range.
         seeds = TRAIN_SEEDS[len(TRAIN_SEEDS) // 2 :]
-        return loader(PlaceStream(self.world, seeds, self.trainer.current_epoch, a.batches, a.pairs_a_maze), a.workers)
+        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
+        return loader(PlaceStream(self.world, seeds, epoch, a.batches, a.pairs_a_maze, share), a.workers)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
@@ -157,19 +160,20 @@ class _Data(lightning.LightningDataModule):
 
 
 def main(arguments: Arguments) -> dict[str, float]:
-    """Train, write the weights, and return the validation metrics."""
+    """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
     world = world_named(arguments.world)
-    run = arguments.runs / world.name / "place"
-    trainer = runs.make_trainer(run, arguments.epochs, arguments.seed, "bf16-mixed")
+    run = runs.Run(arguments.runs / world.name / "place", "train_place", arguments, arguments.epochs, arguments.seed)
     config = PlaceConfig(image=world.image, width=arguments.width, offset_scale_m=world.place_radius_m)
     training = PlaceTraining(arguments, world, PlaceNetworks(config))
     data = _Data(arguments, world)
-    trainer.fit(training, datamodule=data, ckpt_path=runs.resume_from(run))
-    training.eval()
+    run.fit(training, data)
+    if not run.is_first:
+        return {}
+    training.cpu().eval()
     with torch.no_grad():
         figures = [training(batch, augment=False) for batch in data.validation()]
     metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]}
-    details = {"training": runs.record("train_place", arguments), "metrics": {"validation": metrics}}
+    details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{PLACE}.safetensors", training.networks, PLACE, world.name, details)
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics

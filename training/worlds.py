@@ -8,6 +8,7 @@ import numpy as np
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.images import ImageFormat
+from ngo_sim.drivers import Action
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 
 # A maze is a function of its seed and size: these ranges never meet (tests/unit/training/test_worlds.py).
@@ -18,14 +19,30 @@ TRAIN_SEEDS = range(10_000, 2_000_000_000)
 # The optimizer learns on odometry of mazes that the local network has not seen, as it will meet it later.
 OPTIMIZER_TRAIN_SEEDS = range(2_000_000_000, 2**32)
 
+_SPLIT_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+_TABLE_SEEDS = 200
+
+
+@dataclass(frozen=True)
+class MazeSize:
+    """The mazes of a table of results; what is None is drawn as in training."""
+
+    rows: int | None = None
+    extra_openings: int | None = None
+
+
+DRAWN = MazeSize()
+
 
 @dataclass(frozen=True)
 class World:
     """A simulated world.
 
-    ``block_m`` is the corridor width, ``actions`` the number of discrete actions, ``episode_frames`` the length of the
+    ``block_m`` is the corridor width, ``actions`` the number of discrete actions,
+    ``mirrored_actions`` what each of them becomes in a mirror, ``episode_frames`` the length of the
     paper's trajectories, ``rows`` and ``extra_openings`` the ranges (both ends included) that training mazes are
-    drawn from, ``heading_limit_rad`` how far two frames of one place may be turned against each other.
+    drawn from, ``heading_limit_rad`` how far two frames of one place may be turned against each other. ``tables`` names
+    the kinds of mazes that results are given for.
     """
 
     name: str
@@ -38,7 +55,9 @@ class World:
     extra_openings: tuple[int, int]
     place_radius_m: float
     heading_limit_rad: float
+    tables: dict[str, MazeSize]
     actions: int = 3
+    mirrored_actions: tuple[int, ...] = (Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT)
 
     def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size, by default the simulator's own size."""
@@ -51,11 +70,25 @@ class World:
 
         return Maze3D(Maze3DConfig(**changes))
 
-    def make_random(self, rng: np.random.Generator) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of a random size and number of openings."""
+    def table_seeds(self, table: str, split: str) -> range:
+        """Maze seeds of a table in the ``validation`` or ``test`` split: a stretch of its own for each table."""
+        if table not in self.tables or split not in _SPLIT_SEEDS:
+            raise ValueError(
+                f"table, split are {table!r}, {split!r}; expected one of {', '.join(self.tables)} and one of "
+                f"{', '.join(_SPLIT_SEEDS)}"
+            )
+        seeds = _SPLIT_SEEDS[split]
+        first = len(seeds) // 2 + _TABLE_SEEDS * list(self.tables).index(table)
+        return seeds[first : first + _TABLE_SEEDS]
+
+    def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN) -> gymnasium.Env[Any, Any]:
+        """An environment with mazes of ``size``, a random size and number of openings where that has None."""
         rows = int(rng.integers(self.rows[0], self.rows[1] + 1))
         openings = int(rng.integers(self.extra_openings[0], self.extra_openings[1] + 1))
-        return self.make(rows, openings)
+        return self.make(
+            rows if size.rows is None else size.rows,
+            openings if size.extra_openings is None else size.extra_openings,
+        )
 
 
 WORLDS = {
@@ -67,9 +100,10 @@ WORLDS = {
         period_s=0.1,
         episode_frames=2000,
         rows=(5, 8),
-        extra_openings=(0, 6),
+        extra_openings=(0, 8),
         place_radius_m=0.5,
         heading_limit_rad=np.pi,
+        tables={"perfect": MazeSize(7, 0), "cycles": MazeSize(7, 8)},
     ),
     "maze3d": World(
         name="maze3d",
@@ -82,6 +116,7 @@ WORLDS = {
         extra_openings=(0, 3),
         place_radius_m=1.0,
         heading_limit_rad=np.radians(35.0),
+        tables={"unseen": MazeSize()},
     ),
 }
 

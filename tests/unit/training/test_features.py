@@ -12,7 +12,6 @@ from ngo_estimator.checkpoint import load_local, load_place, write_untrained
 from training import featurise
 from training.featurise import check_networks, features_of, open_store
 from training.streams import simulate
-from training.train_optimizer import Arguments, Trajectories, correction_scale, crop
 from training.worlds import WORLDS
 
 SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "truth": 3}
@@ -71,34 +70,6 @@ def test_parts_share_the_groups_without_overlap(parts: int) -> None:
     assert sorted(first for first, _ in groups) == list(range(0, 45, 8))
     assert sorted(seed for _, group in groups for seed in group) == seeds
     assert all(group[0] == first for first, group in groups)
-
-
-@pytest.mark.parametrize("start", [0, 8, 24])
-def test_a_crop_is_seen_from_the_frame_before_it_with_a_continuous_heading(store: Path, start: int) -> None:
-    arrays = open_store(store)
-    batch = crop(arrays, np.array([1, 4]), start, 16)
-    assert {name: value.shape for name, value in batch.items()} == {n: (2, 16, size) for n, size in SHAPES.items()}
-    assert all(value.dtype == torch.float32 for value in batch.values())
-    expected = se2.r2g(torch.tensor([0.1, 0.0, 0.3]).expand(2, 16, 3))
-    assert torch.allclose(batch["truth"], expected, atol=1e-4)
-
-
-def test_the_scale_of_corrections_is_the_error_of_the_odometry_over_a_meta_pose(store: Path) -> None:
-    x, y, yaw = correction_scale(store, 8)
-    odometry, truth = (se2.r2g(torch.tensor([0.1, 0.0, turn]).expand(8, 3))[-1] for turn in (0.29, 0.3))
-    assert (x, y, yaw) == pytest.approx((odometry - truth).abs().tolist(), rel=1e-2)
-    assert yaw == pytest.approx(0.08, rel=1e-3)
-
-
-def test_batches_of_trajectories_are_a_function_of_seed_and_epoch(store: Path) -> None:
-    arguments = Arguments("maze2d", steps=6, batch_size=4)
-    epochs = [list(Trajectories(store, arguments, epoch, 8)) for epoch in (2, 2, 3)]
-    assert [len(epoch) for epoch in epochs] == [6, 6, 6]
-    lengths = {batch["relative"].shape for epoch in epochs for batch in epoch}
-    assert lengths <= {(4, 40, 3), (4, 16, 3), (4, 8, 3)} and len(lengths) > 1
-    first, again, other = epochs
-    assert all(torch.equal(a["codes"], b["codes"]) for a, b in zip(first, again, strict=True))
-    assert not all(a["codes"].equal(b["codes"]) for a, b in zip(first, other, strict=True))
 
 
 def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> None:

@@ -1,0 +1,103 @@
+"""What the optimizer trains on: stretches of stored trajectories and their loop candidates."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.loop_closure import LoopSearch
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
+from training.streams import Share
+from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, loops_of
+
+SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "truth": 3}
+SEARCH = LoopSearch(per_pose=2, most=10, min_separation=1, min_apart=0)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """Ten trajectories of 40 steps, of a robot that turns round and round, and an odometry that turns too little."""
+    rng = np.random.default_rng(0)
+    truth_steps = torch.tensor([0.1, 0.0, 0.3], dtype=torch.float64).expand(10, 40, 3)
+    truth = se2.r2g(truth_steps)
+    truth[..., 2] = se2.wrap(truth[..., 2])
+    arrays = {name: rng.random((10, 40, size)).astype(np.float16) for name, size in SHAPES.items()}
+    arrays["relative"] = (truth_steps - torch.tensor([0.0, 0.0, 0.01])).numpy().astype(np.float32)
+    arrays["truth"] = truth.numpy()
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    (tmp_path / "done.0of2.json").write_text("[0]")
+    (tmp_path / "done.1of2.json").write_text("[8]")
+    return tmp_path
+
+
+def stored(store: Path, search: LoopSearch | None = SEARCH) -> StoredTrajectories:
+    return StoredTrajectories([store], search, small_pair_head(), 8)
+
+
+@pytest.mark.parametrize("start", [0, 8, 24])
+def test_a_stretch_is_seen_from_the_frame_before_it_with_a_continuous_heading(store: Path, start: int) -> None:
+    batch = stored(store, None).batch([1, 4], start, 16)
+    expected_shapes = {name: (2, 16, size) for name, size in SHAPES.items() if name != "codes"}
+    assert {name: value.shape for name, value in batch.items()} == expected_shapes
+    assert all(value.dtype == torch.float32 for value in batch.values())
+    expected = se2.r2g(torch.tensor([0.1, 0.0, 0.3]).expand(2, 16, 3))
+    assert torch.allclose(batch["truth"], expected, atol=1e-4)
+    assert loops_of(batch) is None
+
+
+def test_loops_are_those_that_the_optimizer_finds_and_are_found_once(store: Path) -> None:
+    data = stored(store)
+    loops = loops_of(data.batch([3, 7], 0, 40))
+    arrays = [torch.from_numpy(np.load(store / f"{name}.npy")[[3, 7]]).float() for name in ("relative", "codes")]
+    expected = small_optimizer(search=SEARCH).find_loops(*arrays, small_pair_head())
+    assert loops is not None
+    assert torch.equal(loops.valid, expected.valid) and torch.allclose(loops.embeddings, expected.embeddings, atol=1e-6)
+    for name in ("start", "end", "frame", "measured", "log_scale", "logit", "similarity"):
+        assert torch.allclose(getattr(loops, name)[loops.valid], getattr(expected, name)[loops.valid], atol=1e-5), name
+    (kept,) = (store / "loops").iterdir()
+    kept.write_bytes(kept.read_bytes())
+    changed = kept.stat().st_mtime_ns
+    stored(store)
+    assert kept.stat().st_mtime_ns == changed
+
+
+def test_a_stretch_keeps_the_loops_within_it_and_counts_from_its_start(store: Path) -> None:
+    data = stored(store)
+    whole, part = loops_of(data.batch([2], 0, 40)), loops_of(data.batch([2], 8, 24))
+    assert whole is not None and part is not None
+    inside = whole.valid & (whole.start >= 1) & (whole.end < 4)
+    assert inside.any() and not inside.all()
+    assert torch.equal(part.valid, inside)
+    assert torch.equal(part.start[inside], whole.start[inside] - 1)
+    assert torch.equal(part.end[inside], whole.end[inside] - 1)
+    assert torch.equal(part.frame[inside], whole.frame[inside] - 8)
+    assert part.end.max() < 3 and part.embeddings.shape[1] == 3
+
+
+def test_the_scale_of_corrections_is_the_error_of_the_odometry_over_a_meta_pose(store: Path) -> None:
+    x, y, yaw = correction_scale(stored(store, None))
+    odometry, truth = (se2.r2g(torch.tensor([0.1, 0.0, turn]).expand(8, 3))[-1] for turn in (0.29, 0.3))
+    assert (x, y, yaw) == pytest.approx((odometry - truth).abs().tolist(), rel=1e-2)
+    assert yaw == pytest.approx(0.08, rel=1e-3)
+
+
+def test_batches_are_a_function_of_seed_epoch_and_process(store: Path) -> None:
+    data = stored(store)
+    which = ((2, 0), (2, 0), (3, 0), (2, 1))
+    streams = [RandomStretches(data, 6, 4, 0, epoch, Share(rank, 2)) for epoch, rank in which]
+    epochs = [list(stream) for stream in streams]
+    assert [len(epoch) for epoch in epochs] == [len(stream) for stream in streams] == [6, 6, 6, 6]
+    lengths = {batch["relative"].shape for epoch in epochs for batch in epoch}
+    assert lengths <= {(4, 40, 3), (4, 16, 3), (4, 8, 3)} and len(lengths) > 1
+    first, again, *others = epochs
+    assert all(torch.equal(a["motion"], b["motion"]) for a, b in zip(first, again, strict=True))
+    for other in others:
+        assert not all(a["motion"].equal(b["motion"]) for a, b in zip(first, other, strict=True))
+
+
+def test_more_trajectories_than_there_are_cannot_be_drawn(store: Path) -> None:
+    with pytest.raises(ValueError, match="batch_size is 11; expected at most 10"):
+        RandomStretches(stored(store, None), 1, 11, 0, 0)

@@ -1,0 +1,151 @@
+"""What the optimizer trains on: stretches of the stored trajectories, with their loop candidates."""
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.data import IterableDataset
+
+from ngo_estimator import se2
+from ngo_estimator.loop_closure import Loops, LoopSearch, find_loops
+from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.pose_aggregation import poses_in_blocks
+from training.featurise import open_store
+from training.streams import ALL, Batch, Share
+
+_LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
+_TOGETHER = 8  # trajectories that are searched for loops at once
+_STEPWISE = ("relative", "log_std", "motion", "truth")
+
+
+class StoredTrajectories:
+    """The trajectories of one or more feature stores, memory-mapped, and the loop candidates of each.
+
+    The candidates do not depend on what is trained: they are found once, and kept in ``STORE/loops/``.
+    """
+
+    def __init__(self, stores: list[Path], search: LoopSearch | None, pair_head: PairHead, block: int) -> None:
+        self.parts = []
+        for store in stores:
+            arrays = open_store(store)
+            found = {} if search is None else found_loops(store, arrays, search, pair_head, block)
+            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found})
+        self.block = block
+        self.steps = min(part["relative"].shape[1] for part in self.parts) // block * block
+        self.index = [(p, row) for p, part in enumerate(self.parts) for row in range(len(part["relative"]))]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def batch(self, chosen: list[int], start: int, length: int) -> Batch:
+        """Trajectories from step ``start`` on, both multiples of the block; ``truth`` is seen from the frame before.
+
+        Holds ``relative``, ``log_std``, ``motion`` and ``truth`` ``(batch, length, ...)``, float32, and the fields of
+        ``Loops``, which ``loops_of`` puts together.
+        """
+        rows = [self._row(*self.index[k], start, length) for k in chosen]
+        return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+
+    def _row(self, part: int, row: int, start: int, length: int) -> Batch:
+        arrays = self.parts[part]
+        values = {name: torch.from_numpy(arrays[name][row, start : start + length].copy()) for name in _STEPWISE}
+        if start:
+            values["truth"] = se2.between(torch.from_numpy(arrays["truth"][row, start - 1].copy()), values["truth"])
+        # The continuous heading of a whole trajectory, which the network's sums of turns are compared with.
+        values["truth"][..., 2] = torch.from_numpy(np.unwrap(values["truth"][..., 2].numpy()))
+        values = {name: value.float() for name, value in values.items()}
+        loops = {name: torch.from_numpy(array[row].copy()) for name, array in arrays.items() if name.startswith(_LOOP)}
+        return {**values, **_cropped(loops, start // self.block, length // self.block, self.block)}
+
+
+def loops_of(batch: Batch) -> Loops | None:
+    """The loop candidates in a batch, None without."""
+    fields = {name.removeprefix(_LOOP): value for name, value in batch.items() if name.startswith(_LOOP)}
+    return Loops(**fields) if fields else None
+
+
+def found_loops(
+    store: Path, arrays: dict[str, np.ndarray], search: LoopSearch, pair_head: PairHead, block: int
+) -> dict[str, np.ndarray]:
+    """The fields of ``Loops`` for all trajectories of a store, found now or when they were first asked for."""
+    path = store / "loops" / ("-".join(str(value) for value in dataclasses.astuple(search)) + f"-{block}.npz")
+    if not path.exists():
+        path.parent.mkdir(exist_ok=True)
+        whole = arrays["relative"].shape[1] // block * block
+        parts: list[Loops] = []
+        with torch.inference_mode():
+            for rows in np.array_split(np.arange(len(arrays["relative"])), -(-len(arrays["relative"]) // _TOGETHER)):
+                relative, codes = (torch.from_numpy(arrays[n][rows, :whole]).float() for n in ("relative", "codes"))
+                parts.append(find_loops(pair_head, codes, poses_in_blocks(relative, block), search))
+        fields = [field.name for field in dataclasses.fields(Loops)]
+        values = {_LOOP + name: torch.cat([getattr(part, name) for part in parts]).numpy() for name in fields}
+        partial = path.with_name(f"{path.name}.{os.getpid()}.npz")
+        np.savez(partial, **values)  # type: ignore[arg-type]
+        with contextlib.suppress(FileExistsError):
+            os.link(partial, path)
+        partial.unlink()
+    with np.load(path) as found:
+        return dict(found)
+
+
+def _cropped(loops: Batch, first: int, blocks: int, block: int) -> Batch:
+    """Loops between the meta-poses ``first .. first + blocks - 1``, counted from ``first``; others become fill."""
+    if not loops:
+        return loops
+    start, end = loops[_LOOP + "start"], loops[_LOOP + "end"]
+    inside = loops[_LOOP + "valid"] & (start >= first) & (end < first + blocks)
+    return {
+        **loops,
+        _LOOP + "valid": inside,
+        _LOOP + "start": torch.where(inside, start - first, 0),
+        _LOOP + "end": torch.where(inside, end - first, 0),
+        _LOOP + "frame": torch.where(inside, loops[_LOOP + "frame"] - first * block, 0),
+        _LOOP + "embeddings": loops[_LOOP + "embeddings"][first : first + blocks],
+    }
+
+
+class RandomStretches(IterableDataset[Batch]):
+    """Batches of random stretches of random trajectories; an epoch is a function of its number and the seed.
+
+    Processes that train together each get batches of their own.
+    """
+
+    def __init__(
+        self, data: StoredTrajectories, batches: int, batch_size: int, seed: int, epoch: int, share: Share = ALL
+    ) -> None:
+        if batch_size > len(data):
+            raise ValueError(f"batch_size is {batch_size}; expected at most {len(data)}, the trajectories in the store")
+        self.data, self.batches, self.batch_size = data, batches, batch_size
+        self.seed, self.epoch, self.share = seed, epoch, share
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[Batch]:
+        rng = np.random.default_rng([self.seed, self.epoch, self.share.rank])
+        data = self.data
+        for _ in range(self.batches):
+            # Short ones too: online, every trajectory is short at first.
+            length = int(rng.choice([data.steps, data.steps, data.steps // 2, data.steps // 4]))
+            length = length // data.block * data.block
+            chosen = np.sort(rng.choice(len(data), self.batch_size, replace=False))
+            start = int(rng.integers(0, (data.steps - length) // data.block + 1)) * data.block
+            yield data.batch(chosen.tolist(), start, length)
+
+
+def correction_scale(data: StoredTrajectories) -> tuple[float, float, float]:
+    """Root mean square (m, m, rad) of the odometry's error over a meta-pose."""
+    total, count = torch.zeros(3), 0
+    for k in range(len(data)):
+        batch = data.batch([k], 0, data.steps)
+        error = poses_in_blocks(batch["relative"], data.block)[..., -1, :] - se2.g2r(
+            batch["truth"][:, data.block - 1 :: data.block]
+        )
+        error = torch.cat((error[..., :2], se2.wrap(error[..., 2:])), dim=-1).square()
+        total, count = total + error.sum(dim=(0, 1)), count + error.shape[1]
+    x, y, yaw = (total / count).sqrt().tolist()
+    return x, y, yaw
