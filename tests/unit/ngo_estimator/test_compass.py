@@ -21,7 +21,7 @@ def small(**changes: object) -> Compass:
 
 def constant(wall: float, first: tuple[float, float], second: tuple[float, float]) -> Compass:
     """A compass that sees these phases in every scan: four times the heading, and (u, v) in both charts."""
-    network = small()
+    network = small().train()  # as it is, without the mirror image
     phases = torch.tensor([wall, *first, *second])
     network.phases.weight.zero_()
     network.phases.bias.copy_(torch.stack((phases.cos(), phases.sin()), dim=1).flatten())
@@ -45,6 +45,17 @@ def test_batch_is_as_many_singles() -> None:
         for single, batched in ((reading, readings), (scale, log_scale)):
             assert torch.allclose(single[0], batched[k], atol=1e-5)
     assert torch.allclose(in_parts[0], readings, atol=1e-5) and torch.allclose(in_parts[1], log_scale, atol=1e-5)
+
+
+def test_the_mirror_image_of_a_scan_reads_as_the_mirror_image_of_its_pose() -> None:
+    network, images = small(), observations("maze2d", 50)
+    pose = torch.tensor([2.0, 3.0, 1.0])
+    (readings, log_scale), (mirrored, mirrored_scale) = network(images), network(images.flip(-2))
+    flip = torch.tensor([1.0, -1.0, -1.0])
+    poses = snapped(readings, pose, 1.0)
+    assert torch.allclose(snapped(mirrored * flip, poses, 1.0), poses, atol=1e-5)
+    assert torch.allclose(mirrored_scale, log_scale, atol=1e-6)
+    assert not torch.allclose(network.train()(images)[0], readings, atol=1e-3)
 
 
 def test_positions_scale_with_the_block() -> None:
@@ -74,7 +85,7 @@ def test_a_heading_on_either_side_of_45_degrees_means_one_pose() -> None:
 
 
 def test_gradients_are_finite_where_a_vector_is_zero() -> None:
-    network = small().requires_grad_(True)
+    network = small().requires_grad_(True).train()
     with torch.no_grad():
         network.phases.weight.zero_()
         network.phases.bias.zero_()

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from ngo_estimator.checkpoint import load_network
 from ngo_estimator.images import ImageFormat, to_network
-from ngo_estimator.lattice import quarter_turned
+from ngo_estimator.lattice import quarter_turned, reading_of, snapped
 
 COMPASS = "compass"
 
@@ -47,7 +47,8 @@ class Compass(nn.Module):
 
     Convolutions, flattened, and a linear layer give heading and position as vectors of their phases. (u, v) jumps
     where psi does: it is predicted for two charts of the heading, -45 to 45 and 0 to 90 degrees, and taken from the one
-    whose seam is far from the predicted heading.
+    whose seam is far from the predicted heading. In evaluation mode a reading is the mean of those of the scan and of
+    its mirror image, which obeys the same lattice.
     """
 
     MIN_LOG_SCALE, MAX_LOG_SCALE = -8.0, 1.0
@@ -79,6 +80,14 @@ class Compass(nn.Module):
             Readings ``(batch, 3)``: u and v (m, at most half a block from 0) and psi (rad, at most pi/4 from 0). The
             logarithm of their scales ``(batch, 2)``, of Laplace distributions: position in m, heading in rad.
         """
+        if self.training:
+            return self._read(images)
+        readings, log_scale = (values.chunk(2) for values in self._read(torch.cat((images, images.flip(-2)))))
+        mirrored = readings[1] * readings[1].new_tensor([1.0, -1.0, -1.0])
+        both = 0.5 * (readings[0] + snapped(mirrored, readings[0], self.config.block_m))
+        return reading_of(both, self.config.block_m), 0.5 * (log_scale[0] + log_scale[1])
+
+    def _read(self, images: Tensor) -> tuple[Tensor, Tensor]:
         hidden = torch.relu(self.hidden(self.convolutions(_inputs(images)).flatten(1)))
         with torch.autocast(images.device.type, enabled=False):
             hidden = hidden.float()
