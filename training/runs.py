@@ -170,6 +170,8 @@ def make_trainer(
 def one_cycle(optimizer: torch.optim.Optimizer, trainer: lightning.Trainer) -> dict[str, Any]:
     """Warm-up over a tenth of the training, then a cosine to zero, in the form that Lightning takes."""
     steps = int(trainer.estimated_stepping_batches)
+    if steps < 3:
+        raise ValueError(f"the training has {steps} step(s) of the optimiser; expected at least 3, to warm up and cool")
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer,
         [group["lr"] for group in optimizer.param_groups],

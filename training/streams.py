@@ -121,7 +121,10 @@ class PairStream(_Stream):
     def __init__(
         self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int, share: Share = ALL
     ) -> None:
-        groups = max(1, round(datapoints / (_GROUP * (self.FRAMES - 1))))
+        pairs = _GROUP * (self.FRAMES - 1)
+        if not 1 <= batch_size <= pairs:
+            raise ValueError(f"batch_size is {batch_size}; expected 1 to {pairs}, the frame pairs of a group of mazes")
+        groups = max(1, round(datapoints / pairs))
         super().__init__(world, seeds, epoch, groups, self.FRAMES, share)
         self.batch_size = batch_size
 
@@ -135,9 +138,7 @@ class PairStream(_Stream):
         relative = torch.stack([relative_poses(episode.poses_xyyaw) for episode in episodes]).flatten(0, 1)
         steps = self.frames - 1
         order = torch.from_numpy(rng.permutation(len(actions)))
-        for count, chosen in enumerate(order.split(self.batch_size)):
-            if count == self.batches_a_group:
-                break
+        for count, chosen in enumerate(order.split(self.batch_size)[: self.batches_a_group]):
             episode, step = chosen // steps, chosen % steps
             batch = {
                 "earlier": images[episode, step],
@@ -185,12 +186,11 @@ class PlaceStream(_Stream):
                 swap = rng.random(len(chosen)) < 0.5
                 chosen[swap] = chosen[swap, ::-1]
                 index = torch.from_numpy(chosen)
-                poses = torch.from_numpy(episode.poses_xyyaw[chosen])
                 parts.append(
                     {
                         "a": images[maze][index[:, 0]],
                         "b": images[maze][index[:, 1]],
-                        "poses": poses.float(),
+                        "poses": torch.from_numpy(episode.poses_xyyaw[chosen]).float(),
                         "maze": torch.full((len(chosen),), maze),
                     }
                 )
@@ -242,6 +242,6 @@ def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.
     return np.argwhere(apart & (distance < world.place_radius_m) & (turn <= world.heading_limit_rad))
 
 
-def loader(stream: _Stream, workers: int) -> DataLoader[Batch]:
+def loader(stream: IterableDataset[Batch], workers: int) -> DataLoader[Batch]:
     """The stream, made by ``workers`` processes beside the training (0: within it)."""
     return DataLoader(stream, batch_size=None, num_workers=workers, prefetch_factor=8 if workers else None)

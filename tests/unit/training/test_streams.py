@@ -13,6 +13,8 @@ from training.streams import (
     Batch,
     PairStream,
     PlaceStream,
+    Share,
+    TrajectoryStream,
     images_of,
     loader,
     mirrored,
@@ -68,6 +70,25 @@ def test_workers_share_the_groups_without_overlap() -> None:
         assert len(match) == 1
         rest.pop(match[0])
     assert not rest
+
+
+@pytest.mark.parametrize("groups", [4, 5])
+def test_processes_that_train_together_get_as_many_mazes_of_their_own(groups: int) -> None:
+    def dealt(epoch: int, share: Share) -> PairStream:
+        return PairStream(WORLD, TRAIN_SEEDS, epoch, groups * 2 * 40, 16, share)
+
+    shares = [[dealt(epoch, Share(rank, 2)) for rank in range(2)] for epoch in range(2)]
+    assert all(len(first) == len(second) == len(list(first)) for first, second in shares)
+    seen = [seed for streams_ in shares for stream in streams_ for group in stream.groups for seed in group]
+    mazes_an_epoch = 2 * (4 if groups == 4 else 6)
+    assert len(seen) == len(set(seen)) == 2 * mazes_an_epoch
+    if groups == 4:  # what one process would have met, and nothing else
+        assert set(seen) == {seed for epoch in range(2) for group in dealt(epoch, Share()).groups for seed in group}
+
+
+def test_a_share_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ValueError, match="rank is 2 of 2; expected 0 to 1"):
+        Share(2, 2)
 
 
 def test_making_data_in_the_training_process_leaves_its_threads_alone() -> None:
@@ -174,6 +195,16 @@ def test_place_pairs_are_near_in_space_apart_in_time_and_from_both_mazes() -> No
     assert all(same(a, b) for a, b in zip(batches, again, strict=True))
 
 
+def test_mazes_without_any_place_seen_twice_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(PlaceStream, "FRAMES", 60)
+    monkeypatch.setattr(PlaceStream, "MIN_STEPS_APART", 55)
+    with pytest.raises(
+        ValueError,
+        match=r"in none of 2 mazes of .* is a place seen twice .*; expected longer episodes or smaller mazes",
+    ):
+        list(PlaceStream(WORLD, TRAIN_SEEDS, 0, 16, 12))
+
+
 def test_place_pairs_come_in_either_order() -> None:
     stream = PlaceStream(WORLD, TRAIN_SEEDS, 0, 16, 12)
     episodes = list(simulate(WORLD, stream.groups[0], 400))
@@ -184,3 +215,30 @@ def test_place_pairs_come_in_either_order() -> None:
     ]
     assert min(abs(apart) for apart in order) >= PlaceStream.MIN_STEPS_APART
     assert min(order) < 0 < max(order)
+
+
+# ---- whole trajectories
+
+
+def test_each_trajectory_is_met_once_whole_and_every_second_batch_in_a_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "_GROUP", 4)
+    stream = TrajectoryStream(WORLD, TRAIN_SEEDS, 0, 4, 2, 60)
+    batches = list(stream)
+    assert len(batches) == len(stream) == 4
+    for number, batch in enumerate(batches):
+        assert batch["images"].shape == (2, 61, 1, 241, 4)
+        plain = mirrored(batch) if number % 2 else batch
+        group = stream.groups[number // 2]
+        episodes = list(simulate(WORLD, group, 61))[number % 2 * 2 :][:2]
+        for k, episode in enumerate(episodes):
+            assert torch.equal(plain["images"][k], images_of(WORLD, episode))
+            assert plain["action"][k].tolist() == episode.actions.tolist()
+            again = se2.compose(torch.from_numpy(episode.poses_xyyaw[0]), se2.r2g(plain["relative"][k].double()))
+            assert torch.allclose(again[:, :2], torch.from_numpy(episode.poses_xyyaw[1:, :2]), atol=1e-4)
+
+
+def test_a_batch_that_no_group_holds_is_refused() -> None:
+    with pytest.raises(ValueError, match="batch_size is 81; expected 1 to 80"):
+        pair_stream(batch_size=81)
+    with pytest.raises(ValueError, match="batch_size is 3; expected 1 to 2"):
+        TrajectoryStream(WORLD, TRAIN_SEEDS, 0, 4, 3, 60)
