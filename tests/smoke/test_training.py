@@ -1,6 +1,12 @@
 """Every training script from end to end at toy size, and stopped trainings that go on as if they had not been."""
 
+import csv
+import dataclasses
+import hashlib
 import json
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,12 +14,22 @@ from typing import Any
 import lightning
 import numpy as np
 import pytest
+import torch
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, load_local, load_optimizer, load_place
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, load_local, load_optimizer, load_place, save_checkpoint
 from ngo_estimator.local_odometry import LocalOdometry
 from ngo_estimator.online_trajectory import OnlineTrajectory
 from tests.smoke import toy
-from training import evaluate, featurise, train_local, train_optimizer, train_place
+from training import (
+    evaluate,
+    featurise,
+    runs,
+    throughput,
+    train_end_to_end,
+    train_local,
+    train_optimizer,
+    train_place,
+)
 
 
 class Killed(RuntimeError):
@@ -55,6 +71,7 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
         _, description = load(weights, world)
         assert description["training"]["command"].startswith(f"python -m training.{script} --world {world} ")
         assert description["training"]["arguments"]["seed"] == 0
+        assert min(description["training"][name] for name in ("seconds", "datapoints_per_s", "peak_memory_mb")) > 0
         assert description["metrics"]["validation"]
         assert str(tmp_path) not in json.dumps(description)
     # A calibrated network has no constant error on what it was calibrated with: the normalisation was changed for it.
@@ -71,17 +88,18 @@ def test_the_papers_form_trains_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def prepare(folder: Path) -> None:
-    """The weights and features that the optimizer's training starts from, untrained."""
+    """The weights and features that the later stages start from, untrained; no optimizer yet."""
     from ngo_estimator.checkpoint import write_untrained
 
     write_untrained(folder / "weights" / "maze2d", "maze2d")
     featurise.main(toy.features("maze2d", folder))
 
 
-TRAININGS: dict[str, tuple[Callable[[Any], Any], Callable[..., Any], type[lightning.LightningModule], str]] = {
-    "local": (train_local.main, toy.local, train_local.LocalTraining, LOCAL),
-    "place": (train_place.main, toy.place, train_place.PlaceTraining, PLACE),
-    "optimizer": (train_optimizer.main, toy.optimizer, train_optimizer.OptimizerTraining, OPTIMIZER),
+TRAININGS: dict[str, tuple[Callable[[Any], Any], Callable[..., Any], type[lightning.LightningModule], str, str]] = {
+    "local": (train_local.main, toy.local, train_local.LocalTraining, "weights", LOCAL),
+    "place": (train_place.main, toy.place, train_place.PlaceTraining, "weights", PLACE),
+    "optimizer": (train_optimizer.main, toy.optimizer, train_optimizer.OptimizerTraining, "weights", OPTIMIZER),
+    "end_to_end": (train_end_to_end.main, toy.end_to_end, train_end_to_end.EndToEndTraining, "end_to_end", "*"),
 }
 
 
@@ -90,35 +108,104 @@ def test_a_stopped_training_ends_with_the_weights_of_an_unbroken_one(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     toy.shrink(monkeypatch, 97, 300)
-    main, arguments, module, kind = TRAININGS[name]
-    results = []
-    for folder in (tmp_path / "unbroken", tmp_path / "stopped"):
+    main, arguments, module, out, kind = TRAININGS[name]
+    unbroken, stopped = tmp_path / "unbroken", tmp_path / "stopped"
+    if name in ("optimizer", "end_to_end"):
+        prepare(unbroken)
         if name == "optimizer":
-            prepare(folder)
-            if results:  # the same features and the same other networks
-                import shutil
+            (unbroken / "weights" / "maze2d" / f"{OPTIMIZER}.safetensors").unlink()
+        shutil.copytree(unbroken, stopped)
 
-                shutil.rmtree(folder)
-                shutil.copytree(tmp_path / "unbroken", folder)
-                (folder / "weights" / "maze2d" / f"{OPTIMIZER}.safetensors").unlink()
-                for run in (folder / "runs" / "maze2d").glob("optimizer-*"):
-                    shutil.rmtree(run)
-        if results:
+    def weights(folder: Path) -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in (folder / out / "maze2d").glob(f"{kind}.safetensors")}
 
-            def stop(self: Any, batch: Any, index: int) -> None:
-                if self.current_epoch == 1 and index == 1:
-                    raise Killed
+    def stop(self: Any, batch: Any, index: int) -> None:
+        if self.current_epoch == 1 and index == 1:
+            raise Killed
 
-            with monkeypatch.context() as patch:
-                patch.setattr(module, "on_train_batch_start", stop)
-                with pytest.raises(Killed):
-                    main(arguments("maze2d", folder, epochs=3))
-            assert not (folder / "weights" / "maze2d" / f"{kind}.safetensors").exists()
-        metrics = main(arguments("maze2d", folder, epochs=3))
-        results.append(((folder / "weights" / "maze2d" / f"{kind}.safetensors").read_bytes(), metrics))
-    assert results[0][0] == results[1][0]
-    assert results[0][1] == results[1][1]
-    # Once more, when all is done: nothing changes.
-    metrics = main(arguments("maze2d", folder, epochs=3))
-    assert metrics == results[0][1]
-    assert (folder / "weights" / "maze2d" / f"{kind}.safetensors").read_bytes() == results[0][0]
+    metrics = main(arguments("maze2d", unbroken, epochs=3))
+    assert len(weights(unbroken)) == (3 if kind == "*" else 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "on_train_batch_start", stop)
+        with pytest.raises(Killed):
+            main(arguments("maze2d", stopped, epochs=3))
+    assert not weights(stopped)
+    assert [row["epoch"] for row in curve(stopped)] == ["0"] and story(stopped)["state"] == "running"
+    for _ in range(2):  # to the end; and once more, when all is done: nothing changes
+        assert main(arguments("maze2d", stopped, epochs=3)) == metrics
+        assert weights(stopped) == weights(unbroken)
+        assert curve(stopped) == curve(unbroken)
+    assert [row["epoch"] for row in curve(stopped)] == ["0", "1", "2"]
+    assert story(stopped)["state"] == "complete" and len(story(stopped)["resumed"]) == 2
+    assert story(stopped)["metrics"] == metrics
+
+
+def curve(folder: Path) -> list[dict[str, str]]:
+    """The learning curve of the one run in a folder, without its times."""
+    (path,) = (folder / "runs" / "maze2d").glob("*/metrics.csv")
+    with path.open() as file:
+        return [{name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+
+
+def story(folder: Path) -> dict[str, Any]:
+    """What the one run in a folder says of itself."""
+    (path,) = (folder / "runs" / "maze2d").glob("*/run.json")
+    described: dict[str, Any] = json.loads(path.read_text())
+    return described
+
+
+def test_all_networks_train_together_and_make_a_set_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy.shrink(monkeypatch, 97, 300)
+    prepare(tmp_path)
+    staged = tmp_path / "weights" / "maze2d"
+    # An untrained optimizer passes its input on: nothing would reach the place encoder.
+    optimizer, description = load_optimizer(staged)
+    optimizer.loop_gain.data.fill_(0.5)
+    save_checkpoint(staged / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, "maze2d", {})
+    metrics = train_end_to_end.main(toy.end_to_end("maze2d", tmp_path))
+    assert np.isfinite(list(metrics.values())).all()
+
+    trained = tmp_path / "end_to_end" / "maze2d"
+    assert LocalOdometry.load(trained, "maze2d").world == "maze2d"
+    OnlineTrajectory.load(trained, world="maze2d")
+    for load in (load_local, load_place, load_optimizer):
+        (before, start), (after, description) = load(staged), load(trained)
+        assert description["config"] == start["config"]
+        assert description["stages_sha256"][description["network"]] == start["sha256"]
+        assert description["metrics"]["validation"] == metrics
+        assert description["metrics"]["validation_of_stages"].keys() == metrics.keys()
+        assert str(tmp_path) not in json.dumps(description)
+        moved = {
+            name for name, value in after.state_dict().items() if not torch.equal(value, before.state_dict()[name])
+        }
+        assert {name.split(".")[0] for name in moved} >= {name.split(".")[0] for name, _ in after.named_parameters()}
+    with pytest.raises(ValueError, match="expected another one"):
+        train_end_to_end.main(dataclasses.replace(toy.end_to_end("maze2d", tmp_path), out=tmp_path / "weights"))
+    with pytest.raises(ValueError, match="steps is 100; expected a multiple of 8"):
+        train_end_to_end.main(dataclasses.replace(toy.end_to_end("maze2d", tmp_path), steps=100))
+
+
+def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.smoke.two_processes", str(tmp_path)]
+    done = subprocess.run(command, cwd=runs.ROOT, capture_output=True, text=True, timeout=150)
+    assert done.returncode == 0, done.stderr[-2000:]
+    first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
+    assert len(first["mazes"]) == len(second["mazes"]) == len({*first["mazes"], *second["mazes"]}) / 2 > 0
+    assert first["weights"] == second["weights"] != first["weights_at_first"]
+    # Written once, by one of them.
+    assert [row["epoch"] for row in curve(tmp_path)] == ["0", "1"]
+    weights = tmp_path / "weights" / "maze2d" / f"{LOCAL}.safetensors"
+    assert hashlib.sha256(weights.read_bytes()).hexdigest() == first["weights"]
+    training = load_local(weights.parent)[1]["training"]
+    assert training["processes"] == 2
+    assert training["command"].startswith("python -m training.train_local --accelerator cpu --devices 2 --strategy ddp")
+
+
+def test_the_speed_of_making_data_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy.shrink(monkeypatch, 161, 300)
+    table = throughput.main(toy.speed("maze2d"))
+    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"world": "maze2d", **table}
+    assert {"local", "place", "trajectories"} == {n.removesuffix("_datapoints_per_s") for n in table if "_per_s" in n}
+    assert min(table[name] for name in table if name.endswith("_per_s")) > 0.0

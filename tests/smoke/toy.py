@@ -2,10 +2,21 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from training import evaluate, featurise, streams, train_local, train_optimizer, train_place, worlds
+from training import (
+    evaluate,
+    featurise,
+    streams,
+    throughput,
+    train_end_to_end,
+    train_local,
+    train_optimizer,
+    train_place,
+    worlds,
+)
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:
@@ -20,7 +31,7 @@ def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> N
         monkeypatch.setitem(worlds.WORLDS, name, dataclasses.replace(world, episode_frames=frames - 1, rows=(4, 4)))
 
 
-def local(world: str, folder: Path, epochs: int = 1) -> train_local.Arguments:
+def local(world: str, folder: Path, epochs: int = 1, **changes: Any) -> train_local.Arguments:
     return train_local.Arguments(
         world=world,
         width=0.03,
@@ -31,6 +42,7 @@ def local(world: str, folder: Path, epochs: int = 1) -> train_local.Arguments:
         workers=0,
         out=folder / "weights",
         runs=folder / "runs",
+        **changes,
     )
 
 
@@ -65,8 +77,28 @@ def optimizer(world: str, folder: Path, epochs: int = 1, form: str = "loops") ->
         steps=3,
         batch_size=2,
         weights=folder / "weights",
+        out=folder / "weights",
         runs=folder / "runs",
     )
+
+
+def end_to_end(world: str, folder: Path, epochs: int = 1) -> train_end_to_end.Arguments:
+    return train_end_to_end.Arguments(
+        world=world,
+        steps=128,
+        epochs=epochs,
+        batches=4,
+        batch_size=1,
+        validation_trajectories=2,
+        workers=0,
+        weights=folder / "weights",
+        out=folder / "end_to_end",
+        runs=folder / "runs",
+    )
+
+
+def speed(world: str) -> throughput.Arguments:
+    return throughput.Arguments(world=world, workers=0, seconds=0.1)
 
 
 def evaluation(world: str, folder: Path) -> evaluate.Arguments:

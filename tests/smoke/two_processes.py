@@ -1,0 +1,50 @@
+"""The local network trained by two processes, as a program: ``python -m tests.smoke.two_processes FOLDER``.
+
+Each writes the mazes that it trained on and the weights that it ended with to ``FOLDER/rankN.json``.
+"""
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from safetensors.torch import save
+
+from ngo_sim.episodes import Episode
+from tests.smoke import toy
+from training import streams, train_local
+from training.worlds import World
+
+
+def main(folder: Path) -> None:
+    patch = pytest.MonkeyPatch()
+    toy.shrink(patch, 97, 300)
+    simulate = streams.simulate
+    mazes: list[int] = []
+    at_first: list[str] = []
+
+    def noted(world: World, seeds: list[int], frames: int) -> Iterator[Episode]:
+        mazes.extend(seeds)
+        return simulate(world, seeds, frames)
+
+    def digest(self: Any) -> str:
+        return hashlib.sha256(save(self.network.state_dict())).hexdigest()
+
+    def note(self: Any) -> None:
+        at_first.append(digest(self))
+
+    def write(self: Any) -> None:
+        text = json.dumps({"mazes": mazes, "weights": digest(self), "weights_at_first": at_first[0]})
+        (folder / f"rank{self.global_rank}.json").write_text(text)
+
+    patch.setattr(streams, "simulate", noted)
+    patch.setattr(train_local.LocalTraining, "on_train_start", note)
+    patch.setattr(train_local.LocalTraining, "on_train_end", write)
+    train_local.main(toy.local("maze2d", folder, epochs=2, accelerator="cpu", devices="2", strategy="ddp"))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

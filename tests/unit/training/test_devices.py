@@ -1,0 +1,77 @@
+"""The losses compute where their batch is: no tensor made on the CPU meets one of another device.
+
+No GPU is needed: on torch's ``meta`` device, which has shapes but no numbers, mixing fails as it would on a GPU.
+"""
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pytest
+import torch
+
+from ngo_estimator.checkpoint import load_local, load_optimizer, load_place, write_untrained
+from training import train_end_to_end, train_local, train_place
+from training.streams import Batch, mirrored
+from training.worlds import WORLDS
+
+WORLD = WORLDS["maze3d"]  # its pictures are made brighter and darker at random
+BATCH = 8
+
+
+def step(module: lightning.LightningModule, batch: Batch) -> torch.Tensor:
+    """The loss of the mirror image of a batch, after a backward pass that reaches some parameter."""
+    loss: Any = module.to("meta").training_step(mirrored({name: x.to("meta") for name, x in batch.items()}), 0)
+    loss.backward()
+    assert any(parameter.grad is not None for parameter in module.parameters())
+    return loss
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("weights")
+    write_untrained(folder, "maze3d")
+    return folder
+
+
+def images(*shape: int) -> torch.Tensor:
+    return torch.zeros(*shape, 60, 80, 3, dtype=torch.uint8)
+
+
+def test_the_check_fails_where_devices_meet(weights: Path) -> None:
+    module = train_local.LocalTraining(train_local.Arguments("maze3d"), WORLD, load_local(weights)[0])
+    batch = {"earlier": images(2), "later": images(2), "action": torch.zeros(2).long(), "relative": torch.zeros(2, 3)}
+    module.to("meta")
+    with pytest.raises(RuntimeError, match="device"):
+        module.training_step({name: x if name == "relative" else x.to("meta") for name, x in batch.items()}, 0)
+
+
+def test_the_local_networks_loss_stays_on_its_device(weights: Path) -> None:
+    module = train_local.LocalTraining(train_local.Arguments("maze3d"), WORLD, load_local(weights)[0].requires_grad_())
+    batch = {
+        "earlier": images(BATCH),
+        "later": images(BATCH),
+        "action": torch.zeros(BATCH).long(),
+        "relative": torch.zeros(BATCH, 3),
+    }
+    assert step(module, batch).device.type == "meta"
+
+
+def test_the_place_encoders_loss_stays_on_its_device(weights: Path) -> None:
+    module = train_place.PlaceTraining(train_place.Arguments("maze3d"), WORLD, load_place(weights)[0].requires_grad_())
+    batch = {
+        "a": images(BATCH),
+        "b": images(BATCH),
+        "poses": torch.zeros(BATCH, 2, 3),
+        "maze": torch.zeros(BATCH).long(),
+    }
+    assert step(module, batch).device.type == "meta"
+
+
+def test_the_loss_of_all_networks_together_stays_on_its_device(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # meta knows none
+    networks = (load(weights)[0] for load in (load_local, load_place, load_optimizer))
+    module = train_end_to_end.EndToEndTraining(train_end_to_end.Arguments("maze3d"), *networks, 1.0)
+    batch = {"images": images(2, 129), "action": torch.zeros(2, 128).long(), "relative": torch.zeros(2, 128, 3)}
+    assert step(module, batch).device.type == "meta"

@@ -1,0 +1,235 @@
+"""Fine-tune all networks of a world together, from the weights of the stages, on short trajectories.
+
+    python -m training.train_end_to_end --world maze2d
+
+Worker processes simulate the trajectories, each in a maze of its own and each used once. The loss of the corrected
+trajectory reaches back through optimizer, loop measurements and aggregation into both encoders. Run again, it goes on
+where it was stopped. It ends with a set of weights of its own that the estimator takes like those of the stages.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning
+import torch
+import tyro
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import (
+    LOCAL,
+    OPTIMIZER,
+    PLACE,
+    CheckpointError,
+    PlaceNetworks,
+    load_description,
+    load_local,
+    load_optimizer,
+    load_place,
+    save_checkpoint,
+)
+from ngo_estimator.local_pose_network import LocalPoseNetwork
+from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
+from training import runs
+from training.streams import Batch, Share, TrajectoryStream, loader
+from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics
+from training.train_optimizer import trajectory_loss
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+
+
+@dataclass(frozen=True)
+class Arguments(runs.TrainerArguments):
+    """Settings of a training of all networks together."""
+
+    world: Literal["maze2d", "maze3d"]
+    """World to train for."""
+    steps: int = 512
+    """Steps of a trajectory."""
+    epochs: int = 8
+    """Passes of new data."""
+    batches: int = 128
+    """Batches in an epoch, of all processes."""
+    batch_size: int = 2
+    """Trajectories in a step of the optimiser, in each process; at most 8."""
+    learning_rate: float = 1e-4
+    """Highest learning rate of aggregation and optimizer."""
+    encoder_learning_rate: float = 2e-5
+    """Highest learning rate of the local pose network, the place encoder and its pair head."""
+    local_weight: float = 1.0
+    """Weight of the local network's own loss, which keeps the odometry as good as it was."""
+    validation_trajectories: int = 16
+    """Trajectories of the validation split that each epoch is measured on."""
+    workers: int = 1
+    """Processes that simulate for each one that trains."""
+    seed: int = 0
+    """Seed of whatever is drawn at random."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/ as the stages made it: the three networks to start from."""
+    out: Path = runs.ROOT / "runs" / "end_to_end"
+    """Folder that gets WORLD/ with the three networks."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of checkpoints and logs."""
+
+
+class EndToEndTraining(lightning.LightningModule):
+    """The optimizer's loss on corrected trajectories, and the local network's own loss as an anchor."""
+
+    def __init__(
+        self,
+        arguments: Arguments,
+        local: LocalPoseNetwork,
+        place: PlaceNetworks,
+        optimizer: NeuralGraphOptimizer,
+        scale_m: float,
+    ) -> None:
+        super().__init__()
+        self.arguments, self.scale_m = arguments, scale_m
+        self.local, self.place, self.optimizer = local, place, optimizer
+        self.requires_grad_(True)
+        self.place.requires_grad_(optimizer.config.loops)  # the paper's form has no use for them
+
+    def forward(self, batch: Batch) -> tuple[Tensor, Tensor, OptimizedTrajectory]:
+        """Relative poses and logarithms of their deviations ``(batch, steps, 3)``, and the corrected trajectories."""
+        # As they will be used: the local network's estimate is another one while it is trained alone.
+        self.local.eval()
+        shape = batch["action"].shape
+        earlier, later = batch["images"][:, :-1].flatten(0, 1), batch["images"][:, 1:].flatten(0, 1)
+        estimates = self.local(earlier, later, batch["action"].flatten())
+        relative, log_std, motion = (value.float().unflatten(0, shape) for value in estimates)
+        has_loops = self.optimizer.config.loops
+        codes = self.place.encoder(later).float().unflatten(0, shape) if has_loops else relative
+        # Sums over the whole trajectory and linear systems need all digits, and are small.
+        with torch.autocast(self.device.type, enabled=False):
+            loops = self.optimizer.find_loops(relative, codes, self.place.pair_head) if has_loops else None
+            result = self.optimizer(relative, log_std, motion, loops)
+        return relative, log_std, result
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        relative, log_std, result = self(batch)
+        block = self.optimizer.block
+        truth = se2.r2g(batch["relative"])[:, block - 1 :: block]
+        corrected = trajectory_loss(result.meta_relative, truth, self.optimizer.correction_std, self.scale_m)
+        pose_loss, likelihood = step_losses(relative, log_std, batch["relative"], self.local.relative_std)
+        loss = corrected + self.arguments.local_weight * (pose_loss + LIKELIHOOD_WEIGHT * likelihood)
+        figures = {"loss": loss, "trajectory_loss": corrected, "pose_loss": pose_loss, "likelihood": likelihood}
+        self.log_dict(
+            figures, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True, batch_size=len(batch["action"])
+        )
+        return loss
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        figures = {f"validation_{name}": value for name, value in self.figures(batch).items()}
+        self.log_dict(figures, on_epoch=True, prog_bar=True, sync_dist=True, batch_size=len(batch["action"]))
+
+    def figures(self, batch: Batch) -> dict[str, float]:
+        """Mean errors of trajectories before and after correction (RMSE; m, deg), and the errors of single steps."""
+        with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
+            relative, log_std, result = self(batch)
+        truth = se2.r2g(batch["relative"])
+        figures: dict[str, float] = {}
+        for name, poses in (("odometry", se2.r2g(relative)), ("corrected", result.poses)):
+            error = poses - truth
+            figures[f"{name}_m"] = float(error[..., :2].square().sum(-1).mean(1).sqrt().mean())
+            figures[f"{name}_deg"] = float(error[..., 2].square().mean(1).sqrt().rad2deg().mean())
+        steps = step_metrics(*(value.flatten(0, 1) for value in (relative, log_std, batch["relative"])))
+        return {**figures, **{f"step_{name}": value for name, value in steps.items()}}
+
+    def configure_optimizers(self) -> Any:
+        encoders = [p for network in (self.local, self.place) for p in network.parameters() if p.requires_grad]
+        groups = [
+            {"params": list(self.optimizer.parameters()), "lr": self.arguments.learning_rate},
+            {"params": encoders, "lr": self.arguments.encoder_learning_rate},
+        ]
+        return runs.one_cycle(torch.optim.AdamW(groups, weight_decay=1e-4), self.trainer)
+
+
+class _Data(lightning.LightningDataModule):
+    def __init__(self, arguments: Arguments, world: World) -> None:
+        super().__init__()
+        self.arguments, self.world = arguments, world
+        self.fixed: list[Batch] = []
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        assert self.trainer is not None
+        a = self.arguments
+        # Mazes that neither the local network nor the feature store has seen.
+        seeds = OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 2 :]
+        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
+        return loader(TrajectoryStream(self.world, seeds, epoch, a.batches, a.batch_size, a.steps, share), a.workers)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
+
+    def validation(self) -> list[Batch]:
+        """The trajectories of the validation split, made when they are first needed."""
+        if not self.fixed:
+            a = self.arguments
+            batches = max(1, a.validation_trajectories // a.batch_size)
+            self.fixed = list(TrajectoryStream(self.world, VALIDATION_SEEDS, 0, batches, a.batch_size, a.steps))
+        return self.fixed
+
+
+@torch.no_grad()
+def measure(training: EndToEndTraining, batches: list[Batch]) -> dict[str, float]:
+    """Means of the figures over batches, on the CPU."""
+    training.cpu()
+    figures = [training.figures(batch) for batch in batches]
+    return {name: sum(f[name] for f in figures) / len(figures) for name in figures[0]}
+
+
+def main(arguments: Arguments) -> dict[str, float]:
+    """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
+    world = world_named(arguments.world)
+    staged, out = arguments.weights / world.name, arguments.out / world.name
+    if staged.resolve() == out.resolve():
+        raise ValueError(f"out is {arguments.out}, the folder of the weights to start from; expected another one")
+    local, local_description = load_local(staged, world.name)
+    place, place_description = load_place(staged, world.name)
+    optimizer, description = load_optimizer(staged, world.name)
+    if description.get("place_encoder_sha256", place_description["sha256"]) != place_description["sha256"]:
+        raise CheckpointError(f"{staged}: the optimizer was trained with another place encoder than the one beside it")
+    block = optimizer.block
+    if arguments.steps % block or arguments.steps < block:
+        raise ValueError(f"steps is {arguments.steps}; expected a multiple of {block}, the steps of a meta-pose")
+    run = runs.Run(
+        arguments.runs / world.name / f"end_to_end-seed{arguments.seed}",
+        "train_end_to_end",
+        arguments,
+        arguments.epochs,
+        arguments.seed,
+        datapoints=lambda batch: batch["action"].numel(),
+    )
+    training = EndToEndTraining(arguments, local, place, optimizer, world.block_m)
+    data = _Data(arguments, world)
+    before = measure(training, data.validation())
+    run.fit(training, data)
+    if not run.is_first:
+        return {}
+    metrics = measure(training, data.validation())
+    details = {
+        "training": run.finish(metrics),
+        "metrics": {"validation": metrics, "validation_of_stages": before},
+        "stages_sha256": {
+            LOCAL: local_description["sha256"],
+            PLACE: place_description["sha256"],
+            OPTIMIZER: description["sha256"],
+        },
+    }
+    save_checkpoint(out / f"{LOCAL}.safetensors", local, LOCAL, world.name, details)
+    save_checkpoint(out / f"{PLACE}.safetensors", place, PLACE, world.name, details)
+    trained_with = load_description(out / f"{PLACE}.safetensors", PLACE)["sha256"]
+    save_checkpoint(
+        out / f"{OPTIMIZER}.safetensors",
+        optimizer,
+        OPTIMIZER,
+        world.name,
+        {"place_encoder_sha256": trained_with, **details},
+    )
+    print("validation", {name: (round(before[name], 5), round(value, 5)) for name, value in metrics.items()})
+    return metrics
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
