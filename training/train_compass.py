@@ -35,7 +35,7 @@ class Arguments(runs.TrainerArguments):
     """World to train for."""
     width: int = 32
     """Channels of the first convolution."""
-    epochs: int = 8
+    epochs: int = 10
     """Passes of new data."""
     datapoints: int = 100_000
     """Frames in an epoch."""

@@ -38,7 +38,7 @@ def snapped(readings: Tensor, poses: Tensor, block_m: float) -> Tensor:
 
 
 def initial_lattice(
-    readings: Tensor, log_scale: Tensor, poses: Tensor, block_m: float, horizon: float = 16.0
+    readings: Tensor, log_scale: Tensor, poses: Tensor, block_m: float, drift: tuple[float, float] = (0.003, 0.001)
 ) -> Tensor:
     """The lattice's pose ``(..., 3)`` in the map, from the first frames that a compass has read.
 
@@ -49,15 +49,18 @@ def initial_lattice(
         readings, log_scale: ``(..., frames, 3)`` and ``(..., frames, 2)`` of the frames, the first one first.
         poses: ``(..., frames, 3)`` of the frames in the map, by odometry.
         block_m: side of the lattice's cells.
-        horizon: frames after which the odometry's drift makes a frame count 1/e of the first.
+        drift: what the odometry loses from one of the frames to the next (m, rad). The more it is against the scales of
+            the readings, the faster the frames count less than the first one, where the map begins.
     """
     age = torch.arange(poses.shape[-2], dtype=poses.dtype, device=poses.device)
-    weight, scale = torch.exp(-age / horizon), log_scale.to(poses.dtype).exp()
-    readings = readings.to(poses.dtype)
-    yaw = _circular_median(poses[..., 2:] - readings[..., 2:], _QUARTER, weight, scale[..., 1]).squeeze(-1)
+    readings, scale = readings.to(poses.dtype), log_scale.to(poses.dtype).exp()
+    # A random walk of steps q, measured with deviation s, is smoothed best by weights that fall by exp(-q / s) a step.
+    decay = scale.new_tensor(drift) / (math.sqrt(2.0) * scale.median(-2, keepdim=True).values)
+    weight = torch.exp(-age.unsqueeze(-1) * decay)
+    yaw = _circular_median(poses[..., 2:] - readings[..., 2:], _QUARTER, weight[..., 1], scale[..., 1]).squeeze(-1)
     turned = se2.between(torch.stack((0.0 * yaw, 0.0 * yaw, yaw), dim=-1).unsqueeze(-2), poses)
     offset = _circular_median(
-        snapped(readings, turned, block_m)[..., :2] - turned[..., :2], block_m, weight, scale[..., 0]
+        snapped(readings, turned, block_m)[..., :2] - turned[..., :2], block_m, weight[..., 0], scale[..., 0]
     )
     return se2.inverse(torch.cat((offset, -yaw.unsqueeze(-1)), dim=-1))
 
