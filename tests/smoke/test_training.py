@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -187,11 +188,14 @@ def test_all_networks_train_together_and_make_a_set_of_weights(tmp_path: Path, m
 
 def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.smoke.two_processes", str(tmp_path)]
-    done = subprocess.run(command, cwd=runs.ROOT, capture_output=True, text=True, timeout=150)
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=runs.ROOT, env=one_thread, capture_output=True, text=True, timeout=150)
     assert done.returncode == 0, done.stderr[-2000:]
     first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
     assert len(first["mazes"]) == len(second["mazes"]) == len({*first["mazes"], *second["mazes"]}) / 2 > 0
     assert first["weights"] == second["weights"] != first["weights_at_first"]
+    # Of all validation data, in both.
+    assert first["logged_rmse_m"] == second["logged_rmse_m"] == pytest.approx(first["rmse_m"], rel=1e-5)
     # Written once, by one of them.
     assert [row["epoch"] for row in curve(tmp_path)] == ["0", "1"]
     weights = tmp_path / "weights" / "maze2d" / f"{LOCAL}.safetensors"

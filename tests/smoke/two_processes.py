@@ -1,6 +1,6 @@
 """The local network trained by two processes, as a program: ``python -m tests.smoke.two_processes FOLDER``.
 
-Each writes the mazes that it trained on and the weights that it ended with to ``FOLDER/rankN.json``.
+Each writes the mazes that it trained on, the weights that it ended with and their error to ``FOLDER/rankN.json``.
 """
 
 import hashlib
@@ -37,8 +37,14 @@ def main(folder: Path) -> None:
         at_first.append(digest(self))
 
     def write(self: Any) -> None:
-        text = json.dumps({"mazes": mazes, "weights": digest(self), "weights_at_first": at_first[0]})
-        (folder / f"rank{self.global_rank}.json").write_text(text)
+        result = {
+            "mazes": mazes,
+            "weights": digest(self),
+            "weights_at_first": at_first[0],
+            "logged_rmse_m": float(self.trainer.callback_metrics["validation_rmse_m"]),
+            "rmse_m": train_local.measure(self.network.eval(), self.trainer.datamodule.validation())["rmse_m"],
+        }
+        (folder / f"rank{self.global_rank}.json").write_text(json.dumps(result))
 
     patch.setattr(streams, "simulate", noted)
     patch.setattr(train_local.LocalTraining, "on_train_start", note)
