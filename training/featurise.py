@@ -9,8 +9,9 @@ memory-mapped arrays, the features as float16. Run again, it goes on where it wa
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,14 +21,19 @@ import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_place
+from ngo_estimator.compass import Compass, load_compass, read_frames
+from ngo_estimator.compass_closure import frames_to_read
+from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from ngo_sim.episodes import Episode
 from training import runs
 from training.metrics import seen_from_first
 from training.streams import images_of, simulate
-from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, world_named
+from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, MazeSize, World, world_named
 
 _GROUP = 8  # mazes of one size
 _MADE_WITH = "networks.json"
+_COMPASS = ("compass", "compass_log_scale")
+_BLOCK = PoseAggregationConfig(1).block
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,8 @@ class Arguments:
     """Folder with WORLD/local_pose_network.safetensors and WORLD/place_encoder.safetensors."""
     out: Path = runs.ROOT / "runs"
     """Folder that gets WORLD/features/."""
+    compass: Path | None = None
+    """Folder with WORLD/compass.safetensors, for stores that also hold the readings of a compass."""
     part: int = 0
     """This process makes the groups of mazes whose number leaves this rest ..."""
     parts: int = 1
@@ -70,6 +78,14 @@ def features_of(world: World, episode: Episode, weights: Path, networks: tuple |
         "codes": codes.astype(np.float16),
         "truth": seen_from_first(episode.poses_xyyaw)[1:],
     }
+
+
+@torch.inference_mode()
+def readings_of(world: World, compass: Compass, episode: Episode) -> dict[str, np.ndarray]:
+    """What a compass reads in the ``frames_to_read`` of an episode."""
+    frames = frames_to_read(len(episode.actions), _BLOCK)
+    readings, log_scale = read_frames(compass, images_of(world, episode)[frames])
+    return {"compass": readings.numpy(), "compass_log_scale": log_scale.numpy()}
 
 
 def _groups(seeds: list[int], part: int, parts: int) -> Iterator[tuple[int, list[int]]]:
@@ -98,21 +114,35 @@ def main(arguments: Arguments) -> None:
         store.mkdir(parents=True, exist_ok=True)
         check_networks(store, local_description, place_description)
         (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
-        progress = store / f"done.{arguments.part}of{arguments.parts}.json"
-        done = set(json.loads(progress.read_text())) if progress.exists() else set()
-        bar = tqdm(
-            desc=f"{world.name} {split}",
-            total=len(range(arguments.part, -(-len(seeds) // _GROUP), arguments.parts)),
-        )
-        for first, group in _groups(seeds, arguments.part, arguments.parts):
-            if first not in done:
-                for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1, size)):
-                    for name, value in features_of(world, episode, folder, (local, place)).items():
-                        _array(store / f"{name}.npy", (len(seeds), *value.shape), value.dtype)[first + offset] = value
-                done.add(first)
-                progress.write_text(json.dumps(sorted(done)))
-            bar.update()
-        bar.close()
+        part = (arguments.part, arguments.parts)
+        _fill(store, "done", world, seeds, size, part, lambda e: features_of(world, e, folder, (local, place)))
+        if arguments.compass is not None:
+            compass, _ = load_compass(arguments.compass / world.name, world.name)
+            _fill(store, "compass_done", world, seeds, size, part, partial(readings_of, world, compass))
+
+
+def _fill(
+    store: Path,
+    name: str,
+    world: World,
+    seeds: list[int],
+    size: MazeSize,
+    part: tuple[int, int],
+    arrays_of: Callable[[Episode], dict[str, np.ndarray]],
+) -> None:
+    """Make arrays of a store from the episodes in the mazes of ``seeds``, those of this process that are not done."""
+    progress = store / f"{name}.{part[0]}of{part[1]}.json"
+    mine = set(json.loads(progress.read_text())) if progress.exists() else set()
+    done = mine | _done(store, name)
+    groups = list(_groups(seeds, *part))
+    for first, group in tqdm(groups, desc=f"{world.name} {store.name}"):
+        if first in done:
+            continue
+        for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1, size)):
+            for key, value in arrays_of(episode).items():
+                _array(store / f"{key}.npy", (len(seeds), *value.shape), value.dtype)[first + offset] = value
+        mine.add(first)
+        progress.write_text(json.dumps(sorted(mine)))
 
 
 def check_networks(store: Path, local_description: dict[str, Any], place_description: dict[str, Any]) -> None:
@@ -122,28 +152,32 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
         raise ValueError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
-def open_store(store: Path) -> dict[str, np.ndarray]:
+def open_store(store: Path, with_compass: bool = False) -> dict[str, np.ndarray]:
     """The arrays of a whole feature store, memory-mapped; raises ``ValueError`` if it is not whole."""
-    names = ("relative", "log_std", "motion", "codes", "truth")
+    names = ["relative", "log_std", "motion", "codes", "truth", *(_COMPASS if with_compass else ())]
     hint = "run `python -m training.featurise` first"
     if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
         raise ValueError(f"{store} lacks {missing}; expected a feature store: {hint}")
     arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in names}
     count = len(arrays["relative"])
-    done = {first for path in store.glob("done.*.json") for first in json.loads(path.read_text())}
-    if left := set(range(0, count, _GROUP)) - done:
-        raise ValueError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
+    for name in ["done", *(["compass_done"] if with_compass else [])]:
+        if left := set(range(0, count, _GROUP)) - _done(store, name):
+            raise ValueError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
     return arrays
+
+
+def _done(store: Path, name: str) -> set[int]:
+    return {first for path in store.glob(f"{name}.*.json") for first in json.loads(path.read_text())}
 
 
 def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
     if not path.exists():
         # Under its name only once it is whole, and never over the one that another process has begun to fill.
-        partial = path.with_name(f"{path.name}.{os.getpid()}")
-        np.lib.format.open_memmap(partial, "w+", dtype, shape).flush()
+        unfinished = path.with_name(f"{path.name}.{os.getpid()}")
+        np.lib.format.open_memmap(unfinished, "w+", dtype, shape).flush()
         with contextlib.suppress(FileExistsError):
-            os.link(partial, path)
-        partial.unlink()
+            os.link(unfinished, path)
+        unfinished.unlink()
     array: np.memmap = np.load(path, mmap_mode="r+")
     if array.shape != shape:
         raise ValueError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")

@@ -25,11 +25,13 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.featurise import check_networks
 from training.streams import Batch, Share
-from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, loops_of
+from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, fixes_of, loops_of
 from training.worlds import World, world_named
 
-HEADING_WEIGHT = 3.0
-RELATIVE_WEIGHT = 0.5
+POSITION_SCALE = 0.1  # corridor widths: errors below count by their square, so that large ones do not rule the rest
+HEADING_SCALE = 0.02  # rad
+HEADING_WEIGHT = 0.3
+RELATIVE_WEIGHT = 0.05
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,15 @@ class Arguments(runs.TrainerArguments):
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
     iterations: int = 5
     """Attend-optimise iterations."""
+    compass: bool = False
+    """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
     width: int = 64
     """Channels of aggregation and optimizer."""
     loops_per_pose: int = LoopSearch.per_pose
     """Loop candidates of a meta-pose."""
     max_loops: int = LoopSearch.most
     """Loop candidates of a trajectory."""
-    epochs: int = 20
+    epochs: int = 6
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
     """Steps of the optimiser in an epoch."""
@@ -74,39 +78,46 @@ def trajectory_loss(meta_relative: list[Tensor], truth: Tensor, correction_std: 
     Args:
         meta_relative: relative meta-poses ``(batch, blocks, 3)`` after each iteration.
         truth: true global meta-poses ``(batch, blocks, 3)``.
-        correction_std: typical error of a relative meta-pose ``(3,)``; scale_m: that of a position.
+        correction_std: typical error of a relative meta-pose ``(3,)``.
+        scale_m: the size of a position's error (m) below which its square counts.
     """
     true_relative = se2.g2r(truth)
     loss, weights = truth.new_zeros(()), 0.0
     for number, relative in enumerate(meta_relative, start=1):
         error = se2.r2g(relative) - truth
         position = huber_loss(error[..., :2] / scale_m, torch.zeros_like(error[..., :2]), delta=1.0)
-        heading = huber_loss(error[..., 2] * 5.0, torch.zeros_like(error[..., 2]), delta=1.0) / 5.0
-        step = relative - true_relative
-        step = torch.cat((step[..., :2], se2.wrap(step[..., 2:])), dim=-1) / correction_std
-        local = huber_loss(step, torch.zeros_like(step), delta=1.0)
+        heading = huber_loss(error[..., 2] / HEADING_SCALE, torch.zeros_like(error[..., 2]), delta=1.0)
+        local = step_loss(relative, true_relative, correction_std)
         loss = loss + number * (position + HEADING_WEIGHT * heading + RELATIVE_WEIGHT * local)
         weights += number
     return loss / weights
 
 
+def step_loss(relative: Tensor, truth: Tensor, std: Tensor) -> Tensor:
+    """Huber loss on relative poses ``(batch, steps, 3)`` in units of their deviations."""
+    step = relative - truth
+    step = torch.cat((step[..., :2], se2.wrap(step[..., 2:])), dim=-1) / std
+    return huber_loss(step, torch.zeros_like(step), delta=1.0)
+
+
 class OptimizerTraining(lightning.LightningModule):
     """``trajectory_loss`` on stretches of trajectories; on the validation split, errors of whole ones."""
 
-    def __init__(self, arguments: Arguments, optimizer: NeuralGraphOptimizer, scale_m: float) -> None:
+    def __init__(self, arguments: Arguments, optimizer: NeuralGraphOptimizer, block_m: float) -> None:
         super().__init__()
-        self.arguments, self.optimizer, self.scale_m = arguments, optimizer, scale_m
+        self.arguments, self.optimizer, self.block_m = arguments, optimizer, block_m
 
     def forward(self, batch: Batch) -> Any:
-        return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops_of(batch))
+        fixes = fixes_of(batch, self.optimizer.block, self.block_m)
+        return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops_of(batch), fixes)
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        block = self.optimizer.block
+        result, block = self(batch), self.optimizer.block
         loss = trajectory_loss(
-            self(batch).meta_relative,
+            result.meta_relative,
             batch["truth"][:, block - 1 :: block],
             self.optimizer.correction_std,
-            self.scale_m,
+            POSITION_SCALE * self.block_m,
         )
         self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
         return loss
@@ -122,8 +133,8 @@ class OptimizerTraining(lightning.LightningModule):
         slow: list[nn.Parameter] = []
         fast: list[nn.Parameter] = []
         for name, parameter in self.optimizer.named_parameters():
-            # Single numbers that start from zero, and hold everything else back until they move.
-            (fast if name in ("loop_gain", "place_gain") else slow).append(parameter)
+            # A single number that starts from zero, and holds the attention back until it moves.
+            (fast if name == "place_gain" else slow).append(parameter)
         rate = self.arguments.learning_rate
         groups: list[dict[str, Any]] = [{"params": slow}]
         if fast:
@@ -159,9 +170,13 @@ def config_of(arguments: Arguments, world: World, scale: tuple[float, float, flo
     changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale}
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
-    search = LoopSearch(per_pose=arguments.loops_per_pose, most=arguments.max_loops)
+    search = LoopSearch(per_pose=arguments.loops_per_pose, most=arguments.max_loops, views=world.loop_views)
     return NeuralGraphOptimizerConfig(
-        aggregation=aggregation, search=search, network=arguments.form == "loops", **changes
+        aggregation=aggregation,
+        search=search,
+        network=arguments.form == "loops",
+        compass=arguments.compass,
+        **changes,
     )
 
 
@@ -177,9 +192,10 @@ def main(arguments: Arguments) -> dict[str, float]:
         check_networks(store, local_description, place_description)
     search = config_of(arguments, world, (1.0, 1.0, 1.0)).search if arguments.form != "paper" else None
     block = PoseAggregationConfig(1).block
-    train = StoredTrajectories(stores[:1], search, place.pair_head, block)
-    validation = StoredTrajectories(stores[1:], search, place.pair_head, block)
-    name = f"optimizer-{arguments.form}-{arguments.iterations}-seed{arguments.seed}"
+    train = StoredTrajectories(stores[:1], search, place.pair_head, block, arguments.compass)
+    validation = StoredTrajectories(stores[1:], search, place.pair_head, block, arguments.compass)
+    form = arguments.form + ("-compass" if arguments.compass else "")
+    name = f"optimizer-{form}-{arguments.iterations}-seed{arguments.seed}"
     run = runs.Run(arguments.runs / world.name / name, "train_optimizer", arguments, arguments.epochs, arguments.seed)
     optimizer = NeuralGraphOptimizer(config_of(arguments, world, correction_scale(train)))
     training = OptimizerTraining(arguments, optimizer, world.block_m)

@@ -100,7 +100,7 @@ class PlaceTraining(lightning.LightningModule):
             other, torch.zeros_like(other)
         )
         return {
-            "loss": contrast + 0.5 * regression + 0.5 * belief,
+            "loss": contrast + regression + 0.5 * belief,
             "contrast": contrast,
             "precision_at_1": (logits.argmax(1) == target).float().mean(),
             "median_m": position_error.median(),

@@ -11,6 +11,7 @@ import torch
 from torch.utils.data import IterableDataset
 
 from ngo_estimator import se2
+from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to_read
 from ngo_estimator.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
@@ -20,6 +21,7 @@ from training.streams import ALL, Batch, Share
 _LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
 _TOGETHER = 8  # trajectories that are searched for loops at once
 _STEPWISE = ("relative", "log_std", "motion", "truth")
+_COMPASS = ("compass", "compass_log_scale")
 
 
 class StoredTrajectories:
@@ -28,13 +30,21 @@ class StoredTrajectories:
     The candidates do not depend on what is trained: they are found once, and kept in ``STORE/loops/``.
     """
 
-    def __init__(self, stores: list[Path], search: LoopSearch | None, pair_head: PairHead, block: int) -> None:
+    def __init__(
+        self,
+        stores: list[Path],
+        search: LoopSearch | None,
+        pair_head: PairHead,
+        block: int,
+        with_compass: bool = False,
+    ) -> None:
         self.parts = []
         for store in stores:
-            arrays = open_store(store)
+            arrays = open_store(store, with_compass)
             found = {} if search is None else found_loops(store, arrays, search, pair_head, block)
-            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found})
-        self.block = block
+            compass = {name: arrays[name] for name in _COMPASS} if with_compass else {}
+            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **compass})
+        self.block, self.with_compass = block, with_compass
         self.steps = min(part["relative"].shape[1] for part in self.parts) // block * block
         self.index = [(p, row) for p, part in enumerate(self.parts) for row in range(len(part["relative"]))]
 
@@ -59,13 +69,27 @@ class StoredTrajectories:
         values["truth"][..., 2] = torch.from_numpy(np.unwrap(values["truth"][..., 2].numpy()))
         values = {name: value.float() for name, value in values.items()}
         loops = {name: torch.from_numpy(array[row].copy()) for name, array in arrays.items() if name.startswith(_LOOP)}
-        return {**values, **_cropped(loops, start // self.block, length // self.block, self.block)}
+        frames = {}
+        if _COMPASS[0] in arrays:
+            if start:
+                raise ValueError(f"a stretch begins at step {start}; expected 0, where a compass reads")
+            count = len(frames_to_read(length, self.block))
+            frames = {name: torch.from_numpy(arrays[name][row, :count].copy()) for name in _COMPASS}
+        return {**values, **frames, **_cropped(loops, start // self.block, length // self.block, self.block)}
 
 
 def loops_of(batch: Batch) -> Loops | None:
     """The loop candidates in a batch, None without."""
     fields = {name.removeprefix(_LOOP): value for name, value in batch.items() if name.startswith(_LOOP)}
     return Loops(**fields) if fields else None
+
+
+def fixes_of(batch: Batch, block: int, block_m: float) -> CompassFixes | None:
+    """The compass readings in a batch, None without."""
+    if "compass" not in batch:
+        return None
+    readings = batch["compass"], batch["compass_log_scale"]
+    return compass_fixes(*readings, batch["relative"], batch["log_std"], block, block_m)
 
 
 def found_loops(
@@ -134,6 +158,7 @@ class RandomStretches(IterableDataset[Batch]):
             length = length // data.block * data.block
             chosen = np.sort(rng.choice(len(data), self.batch_size, replace=False))
             start = int(rng.integers(0, (data.steps - length) // data.block + 1)) * data.block
+            start = 0 if data.with_compass else start
             yield data.batch(chosen.tolist(), start, length)
 
 

@@ -36,13 +36,13 @@ def small_optimizer(
     make = NeuralGraphOptimizerConfig.paper_form if form == "paper" else NeuralGraphOptimizerConfig
     settings = {"aggregation": aggregation, "iterations": 3, **changes}
     if form != "paper":
-        settings = {"network": form == "loops", "search": LoopSearch(2, 8, 2, 0), **settings}
+        settings = {"network": form == "loops", "search": LoopSearch(2, 8, 2, 0, 3), **settings}
     optimizer = NeuralGraphOptimizer(make(**settings)).eval()  # type: ignore[arg-type]
     if trained:
         with torch.no_grad():
             for name, parameter in optimizer.named_parameters():
                 parameter.add_(0.1 * torch.randn_like(parameter))
-                if name in ("loop_gain", "place_gain"):
+                if name == "place_gain":
                     parameter.fill_(0.7)
     return optimizer.requires_grad_(False)
 
@@ -79,7 +79,7 @@ def make_loops(start: list[int], end: list[int], measured: Tensor | None = None)
     measured = torch.zeros(1, count, 3, dtype=torch.float64) if measured is None else measured
     number = torch.zeros(1, count, dtype=torch.float64)
     scale, embeddings = number.unsqueeze(-1).expand(-1, -1, 2), torch.zeros(1, 1, 1, dtype=torch.float64)
-    return Loops(*indices, measured, scale, number, number, number == 0.0, embeddings)
+    return Loops(*indices, measured, scale, scale, number, number, number == 0.0, embeddings)
 
 
 def with_origin(poses: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """Loop closures against plain loops over what they find, compare and spread."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -89,7 +91,7 @@ def planted(pairs: list[tuple[int, int]], steps: int = 96) -> tuple[Tensor, Tens
 
 
 def search(relative: Tensor, codes: Tensor, block: int = 8, **changes: int) -> Loops:
-    limits = LoopSearch(**{"per_pose": 2, "most": 6, "min_separation": 3, "min_apart": 0, **changes})
+    limits = LoopSearch(**{"per_pose": 2, "most": 6, "min_separation": 3, "min_apart": 0, "views": 1, **changes})
     return find_loops(Identity(place_config("maze2d")), codes, poses_in_blocks(relative, block), limits)
 
 
@@ -150,9 +152,58 @@ def test_measurements_have_gradients_and_the_choice_has_none() -> None:
     assert not loops.similarity.requires_grad and loops.embeddings.requires_grad
 
 
-@pytest.mark.parametrize("change", [{"per_pose": 0}, {"most": 0}, {"min_separation": 0}, {"min_apart": -1}])
+class Surveyor(PairHead):
+    """Its codes begin with the true pose of their frame; it measures exactly but for an error of each pair's own."""
+
+    def __init__(self, config: PlaceConfig, sigma: float) -> None:
+        super().__init__(config)
+        self.embedding = nn.Identity()  # type: ignore[assignment]
+        self.sigma = sigma
+
+    def forward(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        error = self.sigma * torch.sin(1e4 * (a[..., :3] + 1.7 * b[..., :3]))
+        scale = torch.full((*a.shape[:-1], 2), math.log(self.sigma + 1e-6))
+        return se2.between(a[..., :3], b[..., :3]) + error, scale, torch.ones(a.shape[:-1])
+
+
+def surveyed(sigma: float, views: int) -> tuple[Loops, Tensor]:
+    """Loops of a robot on a circle whose odometry is exact, and the true poses between their ends."""
+    relative = torch.tensor([0.1, 0.0, 2.0 * torch.pi / 96]).expand(1, 192, 3)
+    poses = se2.r2g(relative)
+    codes = torch.cat((poses[..., :2], poses[..., 2:], torch.zeros(1, 192, 125)), dim=-1)
+    search = LoopSearch(per_pose=2, most=40, min_separation=6, views=views)
+    loops = find_loops(Surveyor(place_config("maze2d"), sigma), codes, poses_in_blocks(relative, 8), search)
+    ends = with_origin(poses[:, 7::8])[0]
+    return loops, se2.between(ends[loops.start[0]], ends[loops.end[0] + 1])
+
+
+@pytest.mark.parametrize("views", [1, 2, 5, 9])
+def test_exact_views_agree(views: int) -> None:
+    loops, truth = surveyed(0.0, views)
+    error = (loops.measured[0] - truth)[loops.valid[0]]
+    assert error[:, :2].abs().max() < 1e-4 and se2.wrap(error[:, 2]).abs().max() < 1e-4
+    assert loops.spread.max() < -6.0
+
+
+def test_more_views_measure_better_and_tell_how_far_they_disagree() -> None:
+    errors = {}
+    for views in (1, 5, 9):
+        loops, truth = surveyed(0.02, views)
+        error = (loops.measured[0] - truth)[loops.valid[0]]
+        errors[views] = se2.wrap(error[:, 2]).square().mean().sqrt().item()
+        assert loops.log_scale.exp().mean().item() == pytest.approx(0.02 / math.sqrt(views), rel=0.3)
+        if views > 1:
+            assert 0.005 < loops.spread.exp().mean().item() < 0.03
+    assert errors[9] < errors[5] < errors[1]
+    assert errors[9] < 0.6 * errors[1]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"per_pose": 0}, {"most": 0}, {"min_separation": 0}, {"min_apart": -1}, {"views": 0}, {"views": 99}],
+)
 def test_impossible_searches_are_refused(change: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="expected at least 1, 1, 1, 0"):
+    with pytest.raises(ValueError, match=r"expected (at least 1, 1, 1, 0|1 to 9)"):
         LoopSearch(**change)
 
 
@@ -168,7 +219,7 @@ def test_odometry_variances_are_the_diagonal_of_the_propagated_covariance() -> N
     index = torch.arange(9)
     on_loop = (index >= loops.start[0, :, None]) & (index <= loops.end[0, :, None])
     expected = ((jacobian * on_loop[:, None, :, None]).square() * variance[0]).sum((-2, -1))
-    result = odometry_variances(loops, with_origin(se2.r2g(relative)), variance)[0]
+    result = odometry_variances(loops.start, loops.end + 1, with_origin(se2.r2g(relative)), variance)[0]
     assert torch.allclose(result, expected, atol=1e-12)
 
 

@@ -4,6 +4,7 @@ Not in the paper, whose attention has to learn all this. A loop says where a met
 frame.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,19 +14,27 @@ from ngo_estimator import se2
 from ngo_estimator.gauss_newton import pick
 from ngo_estimator.place_encoder import PairHead
 
+_VIEWS = ((0, 0), (-4, -4), (4, -4), (-2, -2), (2, -2), (-4, 0), (4, 0), (0, -3), (0, -6))
+"""Steps from the frames of a candidate to those of its views: at the earlier frame, and at the later one."""
+
+_REWEIGHTINGS = 3
+_SMALLEST_SPREAD = 1e-4  # m or rad
+
 
 @dataclass(frozen=True)
 class LoopSearch:
     """Which pairs of frames become loop candidates.
 
     ``per_pose`` candidates for each meta-pose, at least ``min_separation`` meta-poses older and more than
-    ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief.
+    ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief. Each
+    is measured between ``views`` pairs of frames around it.
     """
 
     per_pose: int = 4
     most: int = 512
     min_separation: int = 6
     min_apart: int = 1
+    views: int = 5
 
     def __post_init__(self) -> None:
         if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
@@ -33,6 +42,8 @@ class LoopSearch:
                 f"per_pose, most, min_separation, min_apart are {self.per_pose}, {self.most}, {self.min_separation}, "
                 f"{self.min_apart}; expected at least 1, 1, 1, 0"
             )
+        if not 1 <= self.views <= len(_VIEWS):
+            raise ValueError(f"views is {self.views}; expected 1 to {len(_VIEWS)}")
 
 
 @dataclass(frozen=True)
@@ -42,9 +53,10 @@ class Loops:
     ``start`` indexes the global meta-poses with the origin in front: the measurement starts at the pose before
     meta-step ``start`` and ends at the pose after meta-step ``end``, so the meta-steps ``start .. end`` lie on the
     loop. ``measured`` ``(batch, loops, 3)`` is the end's pose in the frame of the start, ``log_scale`` ``(batch,
-    loops, 2)`` the logarithm of its scale (position in m, heading in rad), ``logit`` the belief that it is the same
-    place, ``similarity`` the inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false
-    for fill. ``embeddings`` ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
+    loops, 2)`` the logarithm of its scale (position in m, heading in rad), ``spread`` ``(batch, loops, 2)`` the
+    logarithm of how far its views disagree (m, rad), ``logit`` the belief that it is the same place, ``similarity`` the
+    inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false for fill. ``embeddings``
+    ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
     """
 
     start: Tensor
@@ -52,6 +64,7 @@ class Loops:
     frame: Tensor
     measured: Tensor
     log_scale: Tensor
+    spread: Tensor
     logit: Tensor
     similarity: Tensor
     valid: Tensor
@@ -84,19 +97,71 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     logit = logit.masked_fill(similarity < _NONE / 2.0, -1e4)
     keep = logit.topk(min(search.most, logit.shape[1]), dim=-1).indices.sort(dim=-1).values
     frame, end, logit, similarity = (value.gather(1, keep) for value in (frame, end, logit, similarity))
-    frame_in_block = pick(in_blocks.flatten(1, 2), frame)
+    measured, log_scale = pick(measured, keep), pick(log_scale, keep)
+    last = end * block + block - 1
+    spread = torch.full_like(log_scale, math.log(_SMALLEST_SPREAD))
+    if search.views > 1:
+        measured, log_scale, spread = fused_measurements(pair_head, codes, in_blocks, frame, last, search.views)
     return Loops(
         # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
         start=torch.minimum(frame // block, end),
         end=end,
         frame=frame,
-        measured=se2.compose(frame_in_block, pick(measured, keep)),
-        log_scale=pick(log_scale, keep),
+        measured=se2.compose(pick(in_blocks.flatten(1, 2), frame), measured),
+        log_scale=log_scale,
+        spread=spread,
         logit=logit.clamp(min=-20.0),
         similarity=similarity,
         valid=logit > -1e3,
         embeddings=at_ends,
     )
+
+
+def fused_measurements(
+    pair_head: PairHead, codes: Tensor, in_blocks: Tensor, earlier: Tensor, later: Tensor, views: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Measure each candidate from several pairs of frames near it, and fuse them robustly.
+
+    Errors of the pair head change from frame to frame, those of the odometry over so few steps are small.
+
+    Args:
+        earlier, later: the frames of each candidate ``(batch, loops)``.
+
+    Returns:
+        Pose of the later frame in the earlier one ``(batch, loops, 3)``, logarithm of its scales ``(batch, loops, 2)``
+        as if the views erred independently, and logarithm of their spread ``(batch, loops, 2)``.
+    """
+    steps = codes.shape[1]
+    poses = _with_starts(in_blocks)
+    start = pick(poses, earlier)
+    results, precisions = [], []
+    for at_earlier, at_later in _VIEWS[:views]:
+        a = (earlier + at_earlier).clamp(0, steps - 1)
+        b = (later + at_later).clamp(0, steps - 1)
+        measured, log_scale, _ = pair_head(pick(codes, a), pick(codes, b))
+        measured = se2.compose(se2.between(start, pick(poses, a)), measured)
+        results.append(se2.compose(measured, se2.between(pick(poses, b), pick(poses, later))))
+        precisions.append(torch.exp(-2.0 * log_scale))
+    all_results, precision = torch.stack(results), torch.stack(precisions)
+    error = all_results - results[0]
+    error = torch.cat((error[..., :2], se2.wrap(error[..., 2:])), dim=-1)
+    weight, mean = precision, torch.zeros_like(results[0])
+    for _ in range(_REWEIGHTINGS + 1):
+        by_component = weight[..., [0, 0, 1]]
+        mean = (by_component * error).sum(0) / by_component.sum(0)
+        left = (error - mean).square()
+        squares = torch.stack((left[..., 0] + left[..., 1], left[..., 2]), dim=-1)
+        weight = precision / (1.0 + 0.25 * precision * squares)
+    spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=_SMALLEST_SPREAD).log()
+    fused = results[0] + mean
+    return torch.cat((fused[..., :2], se2.wrap(fused[..., 2:])), dim=-1), -0.5 * weight.sum(0).log(), spread
+
+
+def _with_starts(in_blocks: Tensor) -> Tensor:
+    """Global poses ``(batch, steps, 3)`` of all frames by odometry."""
+    ends = se2.r2g(in_blocks[..., -1, :])
+    starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
+    return se2.compose(starts.unsqueeze(2), in_blocks).flatten(1, 2)
 
 
 _NONE = -4.0  # the similarity of what is no candidate
@@ -131,12 +196,13 @@ def loop_residuals(loops: Loops, poses: Tensor) -> Tensor:
     return torch.cat((xy, yaw.unsqueeze(-1)), dim=-1)
 
 
-def odometry_variances(loops: Loops, poses: Tensor, step_variance: Tensor) -> Tensor:
-    """Variances ``(batch, loops, 3)``, float64, of the loops' ends as seen from their starts by odometry alone.
+def odometry_variances(start: Tensor, end: Tensor, poses: Tensor, step_variance: Tensor) -> Tensor:
+    """Variances ``(batch, n, 3)``, float64, of poses as seen from earlier ones by odometry alone.
 
     A turn of a meta-step swings the end about the pose behind that step; cross-correlations are dropped.
 
     Args:
+        start, end: nodes ``(batch, n)``, the earlier and the later pose.
         poses: global meta-poses with the origin in front ``(batch, blocks + 1, 3)``.
         step_variance: of the relative meta-poses ``(batch, blocks, 3)``, along the axes of the earlier pose.
     """
@@ -148,8 +214,8 @@ def odometry_variances(loops: Loops, poses: Tensor, step_variance: Tensor) -> Te
     terms = (cos * along + sin * aside, sin * along + cos * aside, turn, turn * x, turn * y, turn * x * x, turn * y * y)
     prefix = torch.stack(terms, dim=-1).cumsum(1)
     prefix = torch.cat((torch.zeros_like(prefix[:, :1]), prefix), dim=1)
-    xx, yy, one, t_x, t_y, t_xx, t_yy = (pick(prefix, loops.end + 1) - pick(prefix, loops.start)).unbind(-1)
-    end_x, end_y, _ = pick(poses, loops.end + 1).unbind(-1)
+    xx, yy, one, t_x, t_y, t_xx, t_yy = (pick(prefix, end) - pick(prefix, start)).unbind(-1)
+    end_x, end_y, _ = pick(poses, end).unbind(-1)
     across_x = xx + end_y * (end_y * one - 2.0 * t_y) + t_yy
     across_y = yy + end_x * (end_x * one - 2.0 * t_x) + t_xx
     return torch.stack((across_x, across_y, one), dim=-1).clamp(min=0.0)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ngo_estimator import se2
+from ngo_estimator.compass_closure import CompassFixes, CompassGate, compass_factors
 from ngo_estimator.gauss_newton import Factors, chain_factors, gauss_newton_step, node_covariance, pair_factors
 from ngo_estimator.loop_closure import (
     Loops,
@@ -24,6 +25,9 @@ from ngo_estimator.pose_aggregation import (
     frame_poses,
     poses_in_blocks,
 )
+
+_ODOMETRY_NOISE = (2.0, 2.0, 1.0)
+"""Deviations of a relative meta-pose, before anything is learned, in units of what its steps' deviations make it."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class NeuralGraphOptimizerConfig:
     residual: bool = True
     loops: bool = True
     network: bool = True
+    compass: bool = False
     search: LoopSearch = field(default_factory=LoopSearch)
     correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
 
@@ -57,8 +62,11 @@ class NeuralGraphOptimizerConfig:
                 f"iterations, dilations are {self.iterations}, {self.dilations}; expected at least 1, and a positive "
                 "number for each convolution"
             )
-        if not (self.loops or self.network):
-            raise ValueError("loops and network are both false; expected at least one of them")
+        if not (self.loops or self.network) or (self.compass and not self.loops):
+            raise ValueError(
+                f"loops, network, compass are {self.loops}, {self.network}, {self.compass}; expected loops or a "
+                "network, and a compass with loops only"
+            )
         if min(self.correction_std) <= 0.0:
             raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
 
@@ -103,43 +111,59 @@ class OptimizedTrajectory:
 
 
 class LoopGate(nn.Module):
-    """How much each loop candidate is trusted, from its similarity, length and residual."""
+    """How much each loop candidate is trusted, from its similarity, length and residual.
+
+    Untrained it is a robust kernel (Geman-McClure) that allows for the drift of the odometry at first, and for less of
+    it with each iteration (as in graduated non-convexity, Yang et al. 2020); the network corrects that.
+    """
+
+    POSITION_NOISE, HEADING_NOISE = 2.0, 1.0  # deviations of a measurement in units of what the pair head says
+    WIDTH = 4.0  # of the kernel: a loop of this squared residual, in deviations, keeps a quarter of its weight
+    ANNEALING = 0.25  # share of the drift's variance that is left for the next iteration to allow for
 
     def __init__(self, hidden: int = 32) -> None:
         super().__init__()
-        self.layers = nn.Sequential(nn.Linear(9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.layers = nn.Sequential(nn.Linear(11, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
         self.head = nn.Linear(hidden, 3)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, loops: Loops, residuals: Tensor, expected_variance: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, loops: Loops, residuals: Tensor, expected_variance: Tensor, iteration: int
+    ) -> tuple[Tensor, Tensor]:
         """Gate ``(batch, loops)`` in zero to one, and information ``(batch, loops, 3)`` of each loop.
 
         Args:
             residuals: ``(batch, loops, 3)``.
             expected_variance: what the odometry alone lets the residuals vary ``(batch, loops, 3)``.
+            iteration: how many iterations came before.
         """
         measured_variance = torch.exp(2.0 * loops.log_scale)
-        position_variance, heading_variance = measured_variance.unbind(-1)
+        position_variance = self.POSITION_NOISE**2 * measured_variance[..., 0]
+        heading_variance = self.HEADING_NOISE**2 * measured_variance[..., 1]
         position_error = residuals[..., :2].square().sum(-1)
         heading_error = residuals[..., 2].square()
-        expected_position = expected_variance[..., :2].sum(-1)
+        drift = expected_variance * self.ANNEALING**iteration
+        squared = position_error / (2.0 * position_variance + drift[..., :2].sum(-1))
+        squared = squared + heading_error / (heading_variance + drift[..., 2])
         inputs = torch.stack(
             (
                 loops.similarity,
                 loops.logit / 5.0,
                 loops.log_scale[..., 0],
                 loops.log_scale[..., 1],
+                *(loops.spread - loops.log_scale).unbind(-1),
                 torch.log((loops.end - loops.start + 1).to(residuals.dtype)) / 3.0,
                 torch.log1p(position_error / (2.0 * position_variance)) / 3.0,
                 torch.log1p(heading_error / heading_variance) / 3.0,
-                torch.log1p(position_error / (expected_position + 2.0 * position_variance)),
-                torch.log1p(heading_error / (expected_variance[..., 2] + heading_variance)),
+                torch.log1p(squared),
+                torch.full_like(squared, self.ANNEALING**iteration),
             ),
             dim=-1,
         )
         out = self.head(self.layers(inputs))
-        gate = torch.sigmoid(loops.logit + 4.0 * out[..., 0]) * loops.valid
+        kernel = (1.0 + squared / self.WIDTH).reciprocal().square()
+        gate = kernel * torch.sigmoid(loops.logit + 2.0 + 4.0 * out[..., 0]) * loops.valid
         scale = torch.exp(4.0 * torch.tanh(out[..., 1:] / 2.0))
         position = gate * scale[..., 0] / position_variance
         heading = gate * scale[..., 1] / heading_variance
@@ -152,8 +176,9 @@ class NeuralGraphOptimizer(nn.Module):
     Each iteration attends over all meta-poses, passes features and attention through the convolutions, and adds gated
     adjustments to the relative meta-poses. With ``loops`` the convolutions also see the loops' residuals, spread over
     their spans, and say how far each meta-step may bend; a Gauss-Newton step then closes the gated loops.
-    A freshly initialised optimizer returns its input exactly. Unlike in the paper, features, adjustments and gates are
-    read from the last convolution by three layers of kernel 1, and only the features pass through a ReLU.
+    A freshly initialised optimizer returns its input exactly, or with loops what a robust pose graph makes of it.
+    Unlike in the paper, features, adjustments and gates are read from the last convolution by three layers of kernel 1,
+    and only the features pass through a ReLU.
     """
 
     def __init__(self, config: NeuralGraphOptimizerConfig) -> None:
@@ -164,10 +189,13 @@ class NeuralGraphOptimizer(nn.Module):
         if config.network:
             self._build_network(config)
         if config.loops:
+            self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
+            self.odometry_noise: Tensor
             self.loop_gate = LoopGate()
-            self.loop_gain = nn.Parameter(torch.tensor(0.0))
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
+            if config.compass:
+                self.compass_gate = CompassGate()
 
     def _build_network(self, config: NeuralGraphOptimizerConfig) -> None:
         width = config.aggregation.width
@@ -218,7 +246,12 @@ class NeuralGraphOptimizer(nn.Module):
         return find_loops(pair_head, place_codes, poses_in_blocks(relative, self.block), self.config.search)
 
     def forward(
-        self, relative: Tensor, log_std: Tensor, motion_features: Tensor, loops: Loops | None = None
+        self,
+        relative: Tensor,
+        log_std: Tensor,
+        motion_features: Tensor,
+        loops: Loops | None = None,
+        fixes: CompassFixes | None = None,
     ) -> OptimizedTrajectory:
         """Optimise trajectories whose number of steps is a multiple of the block.
 
@@ -226,26 +259,31 @@ class NeuralGraphOptimizer(nn.Module):
             relative: relative poses ``(batch, steps, 3)`` (m, m, rad); log_std: logarithm of their deviations.
             motion_features: ``(batch, steps, motion_feature_size)``.
             loops: what ``find_loops`` found, for an optimizer with loops.
+            fixes: what ``compass_fixes`` chose, for an optimizer with a compass.
         """
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
+        if self.config.compass != (fixes is not None):
+            given = "no fixes were given" if fixes is None else "fixes were given"
+            raise ValueError(f"{given} to an optimizer with{'' if self.config.compass else 'out'} a compass")
         in_blocks = poses_in_blocks(relative, self.block)
         odometry = in_blocks[..., -1, :]
         base_std = block_variances(in_blocks, log_std).sqrt()
         features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
         similarity = None if loops is None or features is None else loops.embeddings @ loops.embeddings.mT
         adjusted, deviation, step_std = odometry, torch.zeros_like(odometry), base_std
+        lattice = None if fixes is None else fixes.lattice.double()
         results: list[Tensor] = []
         weights: Tensor | None = None
         information: Tensor | None = None
-        for _ in range(self.config.iterations):
+        for iteration in range(self.config.iterations):
             poses = _with_origin(se2.r2g(adjusted + deviation))
             inputs: list[Tensor] = []
             if loops is not None:
                 residuals = loop_residuals(loops, poses)
-                expected = odometry_variances(loops, poses, step_std.square()).to(poses.dtype)
-                weights, information = self.loop_gate(loops, residuals, expected)
+                expected = odometry_variances(loops.start, loops.end + 1, poses, step_std.square()).to(poses.dtype)
+                weights, information = self.loop_gate(loops, residuals, expected, iteration)
                 spread, support = spread_over_span(loops, residuals, weights, odometry.shape[1])
                 local = torch.cat((se2.rotate(-poses[:, :-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
                 # Residuals of many standard deviations are the rule at first: they enter by their logarithm.
@@ -262,23 +300,31 @@ class NeuralGraphOptimizer(nn.Module):
             elif loops is not None:
                 log_scale = self.log_scale
             if loops is not None and information is not None and log_scale is not None:
-                step_std = base_std * torch.exp(3.0 * torch.tanh(log_scale / 3.0))
-                deviation = deviation + self._closing(loops, residuals, information, poses, deviation, step_std)
+                step_std = base_std * torch.exp(3.0 * torch.tanh(log_scale / 3.0)) * self.odometry_noise
+                factors = [
+                    chain_factors(poses.double(), deviation.double(), step_std.double()),
+                    pair_factors(loops.nodes, poses.double(), residuals.double(), information.double()),
+                ]
+                if fixes is not None and lattice is not None:
+                    origin = torch.zeros_like(fixes.node)
+                    drift = odometry_variances(origin, fixes.node, poses, step_std.square())
+                    drift = drift * LoopGate.ANNEALING ** (2 * iteration)
+                    factors.append(compass_factors(fixes, self.compass_gate, lattice, poses.double(), drift))
+                change, lattice = self._closing(factors, poses.double(), lattice)
+                deviation = deviation + change.to(deviation.dtype)
             results.append(adjusted + deviation)
-        return OptimizedTrajectory(frame_poses(in_blocks, results[-1]), results, loops, weights, information, step_std)
+        poses = frame_poses(in_blocks, results[-1])
+        return OptimizedTrajectory(poses, results, loops, weights, information, step_std)
 
     def _closing(
-        self, loops: Loops, residuals: Tensor, information: Tensor, poses: Tensor, deviation: Tensor, step_std: Tensor
-    ) -> Tensor:
-        """What a Gauss-Newton step at ``poses`` adds to the relative meta-poses ``(batch, blocks, 3)``."""
-        exact = poses.double()
-        factors: list[Factors] = [
-            chain_factors(exact, deviation.double(), step_std.double()),
-            pair_factors(loops.nodes, exact, residuals.double(), information.double()),
-        ]
-        step = gauss_newton_step(factors, exact.shape[1])
-        change = se2.g2r((exact + self.loop_gain * step)[:, 1:]) - se2.g2r(exact[:, 1:])
-        return torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1).to(poses.dtype)
+        self, factors: list[Factors], poses: Tensor, lattice: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """What a Gauss-Newton step at ``poses`` adds to the relative meta-poses, and where it moves the lattice."""
+        nodes = poses.shape[1]
+        step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
+        change = se2.g2r((poses + step[:, :nodes])[:, 1:]) - se2.g2r(poses[:, 1:])
+        change = torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
+        return change, None if lattice is None else lattice + step[:, nodes]
 
 
 def _zero(layer: nn.Conv1d) -> nn.Conv1d:

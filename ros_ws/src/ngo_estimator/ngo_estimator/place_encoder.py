@@ -26,7 +26,7 @@ class PlaceConfig:
     offset_scale_m: float
     code_size: int = 128
     embedding_size: int = 64
-    pair_hidden_size: int = 256
+    pair_hidden_size: int = 384
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
