@@ -44,6 +44,8 @@ class Arguments(runs.TrainerArguments):
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
     iterations: int = 5
     """Attend-optimise iterations."""
+    robust: bool = True
+    """Whether the loops' gates start from a robust kernel, or from nothing."""
     compass: bool = False
     """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
     width: int = 64
@@ -133,8 +135,8 @@ class OptimizerTraining(lightning.LightningModule):
         slow: list[nn.Parameter] = []
         fast: list[nn.Parameter] = []
         for name, parameter in self.optimizer.named_parameters():
-            # A single number that starts from zero, and holds the attention back until it moves.
-            (fast if name == "place_gain" else slow).append(parameter)
+            # Single numbers that start from zero, and hold the rest back until they move.
+            (fast if name in ("place_gain", "loop_gain") else slow).append(parameter)
         rate = self.arguments.learning_rate
         groups: list[dict[str, Any]] = [{"params": slow}]
         if fast:
@@ -175,6 +177,7 @@ def config_of(arguments: Arguments, world: World, scale: tuple[float, float, flo
         aggregation=aggregation,
         search=search,
         network=arguments.form == "loops",
+        robust=arguments.robust,
         compass=arguments.compass,
         **changes,
     )

@@ -36,13 +36,13 @@ def small_optimizer(
     make = NeuralGraphOptimizerConfig.paper_form if form == "paper" else NeuralGraphOptimizerConfig
     settings = {"aggregation": aggregation, "iterations": 3, **changes}
     if form != "paper":
-        settings = {"network": form == "loops", "search": LoopSearch(2, 8, 2, 0, 3), **settings}
+        settings = {"network": form != "gauss_newton", "robust": form != "learned", "search": LoopSearch(2, 8, 2, 0, 3), **settings}
     optimizer = NeuralGraphOptimizer(make(**settings)).eval()  # type: ignore[arg-type]
     if trained:
         with torch.no_grad():
             for name, parameter in optimizer.named_parameters():
                 parameter.add_(0.1 * torch.randn_like(parameter))
-                if name == "place_gain":
+                if name in ("loop_gain", "place_gain"):
                     parameter.fill_(0.7)
     return optimizer.requires_grad_(False)
 

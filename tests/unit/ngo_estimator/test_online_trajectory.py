@@ -27,7 +27,10 @@ FORMS = ["loops", "paper"]
 
 def make(form: str = "loops", trained: bool = True, window_frames: int = 2000) -> OnlineTrajectory:
     return OnlineTrajectory(
-        small_optimizer(form, trained), small_pair_head() if form == "loops" else None, window_frames
+        # Fresh and with gates that are learned from nothing, it passes the odometry on.
+        small_optimizer("learned" if form == "loops" and not trained else form, trained),
+        small_pair_head() if form == "loops" else None,
+        window_frames,
     )
 
 

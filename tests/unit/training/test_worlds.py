@@ -13,6 +13,7 @@ from training.worlds import (
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
     WORLDS,
+    World,
     world_named,
 )
 
@@ -66,3 +67,27 @@ def test_make_without_a_size_is_the_simulators_own() -> None:
 
     assert WORLDS["maze2d"].make().unwrapped.config == Maze2DConfig()  # type: ignore[attr-defined]
     assert WORLDS["maze2d"].make(4, 1).unwrapped.config == Maze2DConfig(rows=4, cols=4, extra_openings=1)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
+def test_each_table_has_mazes_of_its_own_in_its_split(world: World) -> None:
+    stretches = [world.table_seeds(table, split) for split in ("validation", "test") for table in world.tables]
+    assert all(len(seeds) >= 100 for seeds in stretches)
+    for a, b in itertools.combinations(stretches, 2):
+        assert not set(a) & set(b)
+    for table in world.tables:
+        assert set(world.table_seeds(table, "test")) <= set(TEST_SEEDS)
+        assert set(world.table_seeds(table, "validation")) <= set(VALIDATION_SEEDS)
+    # The first mazes of the validation split are those that the networks are measured on while they train.
+    assert min(min(seeds) for seeds in stretches[: len(world.tables)]) >= VALIDATION_SEEDS[0] + 100
+    with pytest.raises(ValueError, match=r"'nowhere'.*expected one of"):
+        world.table_seeds("nowhere", "test")
+
+
+def test_tables_say_what_their_mazes_are() -> None:
+    world = WORLDS["maze2d"]
+    for table, openings in (("perfect", 0), ("cycles", 8)):
+        env = world.make_random(np.random.default_rng(0), world.tables[table])
+        config = env.unwrapped.config  # type: ignore[attr-defined]
+        assert (config.rows, config.cols, config.extra_openings) == (7, 7, openings)
+        env.close()

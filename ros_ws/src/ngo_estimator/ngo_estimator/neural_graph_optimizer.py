@@ -50,6 +50,7 @@ class NeuralGraphOptimizerConfig:
     residual: bool = True
     loops: bool = True
     network: bool = True
+    robust: bool = True
     compass: bool = False
     search: LoopSearch = field(default_factory=LoopSearch)
     correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
@@ -110,7 +111,7 @@ class OptimizedTrajectory:
         return node_covariance(factors, poses.shape[1], poses.shape[1] - 1)
 
 
-class LoopGate(nn.Module):
+class RobustLoopGate(nn.Module):
     """How much each loop candidate is trusted, from its similarity, length and residual.
 
     Untrained it is a robust kernel (Geman-McClure) that allows for the drift of the odometry at first, and for less of
@@ -170,6 +171,47 @@ class LoopGate(nn.Module):
         return gate, torch.stack((position, position, heading), dim=-1)
 
 
+class LearnedLoopGate(nn.Module):
+    """How much each loop candidate is trusted, learned from nothing: untrained it believes the pair head."""
+
+    def __init__(self, hidden: int = 32) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.head = nn.Linear(hidden, 3)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(
+        self, loops: Loops, residuals: Tensor, expected_variance: Tensor, iteration: int
+    ) -> tuple[Tensor, Tensor]:
+        """As of ``RobustLoopGate``; all iterations are alike."""
+        measured_variance = torch.exp(2.0 * loops.log_scale)
+        position_variance, heading_variance = measured_variance.unbind(-1)
+        position_error = residuals[..., :2].square().sum(-1)
+        heading_error = residuals[..., 2].square()
+        expected_position = expected_variance[..., :2].sum(-1)
+        inputs = torch.stack(
+            (
+                loops.similarity,
+                loops.logit / 5.0,
+                loops.log_scale[..., 0],
+                loops.log_scale[..., 1],
+                torch.log((loops.end - loops.start + 1).to(residuals.dtype)) / 3.0,
+                torch.log1p(position_error / (2.0 * position_variance)) / 3.0,
+                torch.log1p(heading_error / heading_variance) / 3.0,
+                torch.log1p(position_error / (expected_position + 2.0 * position_variance)),
+                torch.log1p(heading_error / (expected_variance[..., 2] + heading_variance)),
+            ),
+            dim=-1,
+        )
+        out = self.head(self.layers(inputs))
+        gate = torch.sigmoid(loops.logit + 4.0 * out[..., 0]) * loops.valid
+        scale = torch.exp(4.0 * torch.tanh(out[..., 1:] / 2.0))
+        position = gate * scale[..., 0] / position_variance
+        heading = gate * scale[..., 1] / heading_variance
+        return gate, torch.stack((position, position, heading), dim=-1)
+
+
 class NeuralGraphOptimizer(nn.Module):
     """Redistributes the error of a trajectory by iterated attention and temporal convolution.
 
@@ -189,9 +231,13 @@ class NeuralGraphOptimizer(nn.Module):
         if config.network:
             self._build_network(config)
         if config.loops:
-            self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
+            noise = torch.tensor(_ODOMETRY_NOISE) if config.robust else torch.ones(3)
+            self.register_buffer("odometry_noise", noise, persistent=False)
             self.odometry_noise: Tensor
-            self.loop_gate = LoopGate()
+            self.loop_gate = RobustLoopGate() if config.robust else LearnedLoopGate()
+            if not config.robust:
+                # Gates that know nothing yet must not bend the trajectory.
+                self.loop_gain = nn.Parameter(torch.tensor(0.0))
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
             if config.compass:
@@ -308,7 +354,7 @@ class NeuralGraphOptimizer(nn.Module):
                 if fixes is not None and lattice is not None:
                     origin = torch.zeros_like(fixes.node)
                     drift = odometry_variances(origin, fixes.node, poses, step_std.square())
-                    drift = drift * LoopGate.ANNEALING ** (2 * iteration)
+                    drift = drift * RobustLoopGate.ANNEALING ** (2 * iteration)
                     factors.append(compass_factors(fixes, self.compass_gate, lattice, poses.double(), drift))
                 change, lattice = self._closing(factors, poses.double(), lattice)
                 deviation = deviation + change.to(deviation.dtype)
@@ -322,6 +368,7 @@ class NeuralGraphOptimizer(nn.Module):
         """What a Gauss-Newton step at ``poses`` adds to the relative meta-poses, and where it moves the lattice."""
         nodes = poses.shape[1]
         step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
+        step = step if self.config.robust else self.loop_gain * step
         change = se2.g2r((poses + step[:, :nodes])[:, 1:]) - se2.g2r(poses[:, 1:])
         change = torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
         return change, None if lattice is None else lattice + step[:, nodes]
