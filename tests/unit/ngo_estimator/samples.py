@@ -36,7 +36,8 @@ def small_optimizer(
     make = NeuralGraphOptimizerConfig.paper_form if form == "paper" else NeuralGraphOptimizerConfig
     settings = {"aggregation": aggregation, "iterations": 3, **changes}
     if form != "paper":
-        settings = {"network": form != "gauss_newton", "robust": form != "learned", "search": LoopSearch(2, 8, 2, 0, 3), **settings}
+        parts = {"network": form != "gauss_newton", "robust": form != "learned"}
+        settings = {**parts, "search": LoopSearch(2, 8, 2, 0, 3), **settings}
     optimizer = NeuralGraphOptimizer(make(**settings)).eval()  # type: ignore[arg-type]
     if trained:
         with torch.no_grad():
