@@ -1,0 +1,170 @@
+"""The search for the pose graph's settings, on problems whose answer is known."""
+
+import dataclasses
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.compass_closure import frames_to_read
+from ngo_estimator.loop_closure import LoopSearch
+from tests.unit.ngo_estimator.samples import small_pair_head
+from training.compass_factors import found_fixes
+from training.pose_graph import PoseGraphSettings
+from training.tune_pose_graph import (
+    COMPASS_GRID,
+    GRID,
+    Arguments,
+    Objective,
+    fit_calibration,
+    load_settings,
+    main,
+    tune,
+)
+from training.worlds import world_named
+
+START = PoseGraphSettings(odometry_position_scale=1.0, loop_position_scale=1.0, kernel="dcs")
+
+
+def valley(settings: PoseGraphSettings) -> float:
+    """Smallest at an odometry scale of 3 and a loop scale of 2, which is found along a slanted valley only."""
+    x, y = settings.odometry_position_scale - 3.0, settings.loop_position_scale - 2.0
+    return 1.0 + x * x + x * y + y * y + (settings.kernel != "cauchy")
+
+
+SCALES = tuple(
+    tuple({name: float(value)} for value in range(1, 6)) for name in ("odometry_position_scale", "loop_position_scale")
+)
+KERNELS = ({"kernel": "huber"}, {"kernel": "cauchy"})
+
+
+def test_the_search_ends_at_the_best_of_the_grid() -> None:
+    best, least = tune(valley, START, (*SCALES, KERNELS), passes=10)
+    assert best == replace(START, odometry_position_scale=3.0, loop_position_scale=2.0, kernel="cauchy")
+    assert least == 1.0
+
+
+def test_nothing_is_tried_twice_and_the_search_stops_when_nothing_gets_better() -> None:
+    tried: list[PoseGraphSettings] = []
+
+    def counted(settings: PoseGraphSettings) -> float:
+        tried.append(settings)
+        return valley(settings)
+
+    tune(counted, START, (*SCALES, KERNELS), passes=1000)
+    assert len(tried) == len(set(tried)) < 50
+
+
+def test_what_is_no_gain_changes_nothing() -> None:
+    best, least = tune(lambda settings: 1.0 - 1e-4 * settings.loop_position_scale, START, SCALES, passes=3)
+    assert best == START and least == 1.0 - 1e-4
+
+
+def test_every_value_of_the_grids_makes_settings() -> None:
+    for group in (*GRID, *COMPASS_GRID):
+        candidates = [replace(PoseGraphSettings(), **change) for change in group]
+        assert len(set(candidates)) == len(group) > 1
+
+
+def drive(trajectories: int = 2, steps: int = 160) -> dict[str, np.ndarray]:
+    """Truth of robots in circles, and an odometry that is a tenth too short and turns too far."""
+    rng = np.random.default_rng(0)
+    true_steps = np.tile([0.1, 0.0, 0.1], (trajectories, steps, 1)) * rng.uniform(0.5, 1.5, (trajectories, steps, 1))
+    truth = se2.r2g(torch.from_numpy(true_steps)).numpy()
+    relative = (true_steps * [0.9, 1.0, 1.0] + [0.0, 0.0, 0.01]).astype(np.float32)
+    codes = rng.normal(0.0, 1.0, (trajectories, steps, 12)).astype(np.float16)
+    return {"relative": relative, "log_std": np.full_like(relative, -4.0), "codes": codes, "truth": truth}
+
+
+def test_the_calibration_undoes_gain_and_bias() -> None:
+    arrays = drive()
+    settings = replace(START, **fit_calibration(arrays["relative"], arrays["truth"]))
+    assert settings.odometry_gain == pytest.approx((1.0 / 0.9, settings.odometry_gain[1], 1.0), abs=1e-4)
+    assert settings.odometry_bias == pytest.approx((0.0, 0.0, -0.01), abs=1e-4)
+
+
+def test_the_objective_is_the_mean_error_of_the_pose_graph() -> None:
+    arrays = drive()
+    unbelieved = replace(START, min_logit=1e9)
+    objective = Objective(arrays, small_pair_head())
+    odometry = se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy()
+    assert objective(unbelieved) == pytest.approx(objective.error(odometry), rel=1e-4)
+    squares = np.square(odometry - arrays["truth"])[..., :2].sum(-1)
+    expected = np.sqrt(squares.sum(-1) / (squares.shape[1] + 1)).mean()  # the first frame is exact
+    assert objective.error(odometry) == pytest.approx(expected)
+    calibrated = replace(unbelieved, **fit_calibration(arrays["relative"], arrays["truth"]))
+    assert objective(calibrated) < 0.01 < objective(unbelieved)
+
+
+def test_the_objective_sees_the_compass() -> None:
+    arrays = drive(steps=40)  # in more of them the odometry turns an eighth of a circle too far
+    one = {name: array[:1] for name, array in arrays.items()}
+    frames = frames_to_read(40, 8)
+    readings = np.concatenate((np.zeros((1, 1, 3)), one["truth"]), axis=1)[:, frames]  # of a lattice at the origin
+    exact = found_fixes(readings, np.full((1, len(frames), 2), -6.0), one["relative"], one["log_std"], 8, 1.0)
+    unbelieved = replace(START, min_logit=1e9)
+    without, with_compass = Objective(one, small_pair_head()), Objective(one, small_pair_head(), exact)
+    assert with_compass(unbelieved) < 0.5 * without(unbelieved)
+
+
+def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("training.tune_pose_graph.GRID", GRID[3:4])
+    monkeypatch.setattr("training.tune_pose_graph.COMPASS_GRID", COMPASS_GRID[:1])
+    steps = 64
+    frames = frames_to_read(steps, 8)
+    for seed, table in enumerate(world_named("maze2d").tables):
+        arrays = drive(steps=steps)
+        arrays["codes"] = np.random.default_rng(seed).normal(0.0, 1.0, (2, steps, 128)).astype(np.float16)
+        arrays["compass"] = np.concatenate((np.zeros((2, 1, 3)), arrays["truth"]), axis=1)[:, frames]
+        arrays["compass_log_scale"] = np.full((2, len(frames), 2), -6.0)
+        store = tmp_path / "maze2d" / "features" / f"validation_{table}"
+        store.mkdir(parents=True)
+        for name, array in {**arrays, "motion": np.zeros((2, steps, 1))}.items():
+            np.save(store / f"{name}.npy", array)
+        for name in ("done", "compass_done"):
+            (store / f"{name}.0of1.json").write_text("[0]")
+    arguments = Arguments("maze2d", passes=1, runs=tmp_path, out=tmp_path)
+    best = main(arguments)
+    written = json.loads((tmp_path / "maze2d.gtsam.json").read_text())
+    assert load_settings(tmp_path / "maze2d.gtsam.json") == best
+    assert written["validation"]["trajectories"] == 4
+    assert written["validation"]["position_rmse_m"] < 0.1 * written["validation"]["odometry_position_rmse_m"]
+    assert best.odometry_bias[2] == pytest.approx(-0.01, abs=1e-3)
+    assert written["tuning"]["command"] == "python -m training.tune_pose_graph --world maze2d --passes 1"
+    with_compass = main(replace(arguments, form="compass"))
+    assert load_settings(tmp_path / "maze2d.gtsam_compass.json") == with_compass
+    assert with_compass.odometry_bias == best.odometry_bias
+
+
+def test_settings_survive_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "maze2d.gtsam.json"
+    settings = replace(START, odometry_bias=(0.1, 0.0, -0.2), search=LoopSearch(per_pose=3, most=7))
+    path.write_text(json.dumps({"settings": dataclasses.asdict(settings), "validation": {}}))
+    assert load_settings(path) == settings
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        None,
+        "no json",
+        {},
+        {"settings": {**dataclasses.asdict(START), "colour": 1}},
+        {"settings": {**dataclasses.asdict(START), "kernel_width": -1.0}},
+        {"settings": {**dataclasses.asdict(START), "search": {"most": 0}}},
+        {"settings": {"kernel": "dcs"}},
+    ],
+)
+def test_a_file_of_something_else_is_refused_by_name(tmp_path: Path, content: Any) -> None:
+    path = tmp_path / "maze2d.gtsam.json"
+    if content is not None:
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(ValueError, match=r"maze2d\.gtsam\.json.* expected what `python -m training\.tune_pose_graph`"):
+        load_settings(path)

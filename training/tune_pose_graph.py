@@ -1,0 +1,233 @@
+"""Choose the settings of the classical pose graph on validation mazes, and write them beside the results.
+
+    python -m training.tune_pose_graph --world maze2d
+
+From the default settings on, one group of settings after the other takes the value of its grid with the smallest mean
+position RMSE, over and over until nothing gets better. Nothing is drawn at random.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import load_place
+from ngo_estimator.compass_closure import CompassFixes
+from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.place_encoder import PairHead
+from training import runs
+from training.compass_factors import found_fixes
+from training.featurise import open_store
+from training.loop_factors import LoopFactors, found_loops
+from training.metrics import trajectory_error
+from training.pose_graph import PoseGraphSettings, optimize
+from training.worlds import world_named
+
+GRID: tuple[tuple[dict[str, Any], ...], ...] = (
+    tuple(
+        {"kernel": kernel, "kernel_width": width}
+        for kernel, widths in {
+            "none": (1.0,),
+            "huber": (0.5, 1.0, 2.0),
+            "cauchy": (0.5, 1.0, 2.0, 4.0),
+            "geman_mcclure": (1.0, 2.0, 4.0, 8.0),
+            "dcs": (2.0, 3.5, 5.0, 10.0),
+        }.items()
+        for width in widths
+    ),
+    tuple({"odometry_position_scale": value} for value in (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)),
+    tuple({"odometry_heading_scale": value} for value in (0.7, 1.0, 1.5, 2.0, 3.0, 4.0)),
+    tuple({"loop_position_scale": value} for value in (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)),
+    tuple({"loop_heading_scale": value} for value in (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)),
+    tuple({"min_logit": value} for value in (-2.0, 0.0, 2.0, 4.0)),
+    tuple(
+        {"search": LoopSearch(per_pose=per_pose, most=most, views=views)}
+        for per_pose, most, views in ((2, 96, 5), (2, 500, 1), (2, 500, 5), (4, 500, 1), (4, 500, 5), (4, 1000, 1))
+    ),
+)
+"""The values of each group of settings, in the order in which they are tried."""
+
+COMPASS_GRID: tuple[tuple[dict[str, Any], ...], ...] = (
+    tuple({"compass_kernel_width": value} for value in (2.0, 10.0, 50.0)),
+    tuple({"compass_position_scale": value} for value in (0.7, 1.0, 2.0, 4.0)),
+    tuple({"compass_heading_scale": value} for value in (0.7, 1.0, 2.0, 4.0)),
+    tuple({"odometry_position_scale": value} for value in (1.0, 2.0, 4.0)),
+    tuple({"odometry_heading_scale": value} for value in (1.0, 2.0, 4.0)),
+    tuple({"loop_position_scale": value} for value in (0.7, 1.0, 2.0, 4.0)),
+    tuple({"loop_heading_scale": value} for value in (0.5, 1.0, 2.0, 4.0)),
+)
+"""The same for the pose graph with a compass, which begins with what is best without."""
+
+_COMPASS = ("compass", "compass_log_scale")
+_SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was there first stays
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the search."""
+
+    world: Literal["maze2d", "maze3d"]
+    """World to tune for."""
+    trajectories: int = 0
+    """Validation trajectories of each table of results; 0 for all."""
+    form: Literal["loops", "compass"] = "loops"
+    """The graph of odometry and loops, or that with a compass, from the settings that are best without."""
+    passes: int = 2
+    """How often the search goes over all groups at most."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/place_encoder.safetensors."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets WORLD.gtsam.json, with a compass WORLD.gtsam_compass.json."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of WORLD/features/."""
+
+
+class Objective:
+    """Mean position RMSE (m) of the pose graph over trajectories, as a function of its settings.
+
+    Args:
+        arrays: ``relative``, ``log_std``, ``codes`` and ``truth`` of a feature store.
+        compass: readings for each trajectory.
+    """
+
+    def __init__(
+        self, arrays: dict[str, np.ndarray], pair_head: PairHead, compass: list[CompassFixes] | None = None
+    ) -> None:
+        self.arrays, self._pair_head = arrays, pair_head
+        self._compass: Sequence[CompassFixes | None] = compass or [None] * len(arrays["relative"])
+        self._loops: dict[object, list[LoopFactors]] = {}
+
+    def loops(self, settings: PoseGraphSettings) -> list[LoopFactors]:
+        """The loops of each trajectory under these settings."""
+        key = (settings.search, settings.block, settings.odometry_gain, settings.odometry_bias)
+        if key not in self._loops:
+            relative = settings.calibrated(self.arrays["relative"])
+            self._loops[key] = found_loops(
+                self._pair_head, relative, self.arrays["codes"], settings.search, settings.block
+            )
+        return self._loops[key]
+
+    def __call__(self, settings: PoseGraphSettings) -> float:
+        odometry = zip(self.arrays["relative"], self.arrays["log_std"], strict=True)
+        added = zip(self.loops(settings), self._compass, strict=True)
+        return self.error(
+            optimize(*steps, loops, settings, compass) for steps, (loops, compass) in zip(odometry, added, strict=True)
+        )
+
+    def error(self, poses: Iterable[np.ndarray]) -> float:
+        """Mean position RMSE (m) of trajectories ``(steps, 3)``."""
+        origin = np.zeros((1, 3))
+        return float(
+            np.mean(
+                [
+                    trajectory_error(np.concatenate((origin, one)), np.concatenate((origin, truth))).position_rmse_m
+                    for one, truth in zip(poses, self.arrays["truth"], strict=True)
+                ]
+            )
+        )
+
+
+def fit_calibration(relative: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """Gain and bias of each component of a step that fit the true steps best, by least squares.
+
+    Args:
+        relative: steps ``(trajectories, steps, 3)``; truth: true poses after each of them.
+    """
+    true_steps = se2.g2r(torch.from_numpy(np.array(truth))).numpy()
+    fits = []
+    for k in range(3):
+        steps = np.ravel(relative[..., k]).astype(np.float64)
+        design = np.column_stack((steps, np.ones_like(steps)))
+        fits.append(np.linalg.lstsq(design, np.ravel(true_steps[..., k]))[0].tolist())
+    gain, bias = zip(*fits, strict=True)
+    return {"odometry_gain": gain, "odometry_bias": bias}
+
+
+def tune(
+    objective: Callable[[PoseGraphSettings], float],
+    start: PoseGraphSettings,
+    grid: Iterable[Iterable[dict[str, Any]]],
+    passes: int,
+) -> tuple[PoseGraphSettings, float]:
+    """Coordinate search for the settings with the smallest ``objective``, from ``start``; returns both."""
+    groups = [list(group) for group in grid]
+    known: dict[PoseGraphSettings, float] = {}
+    best, least = start, objective(start)
+    known[best] = least
+    with tqdm(total=passes * sum(map(len, groups)), desc="tune", unit="setting") as bar:
+        for _ in range(passes):
+            before = best
+            for group in groups:
+                for change in group:
+                    candidate = replace(best, **change)
+                    if candidate not in known:
+                        known[candidate] = objective(candidate)
+                    if known[candidate] < least * (1.0 - _SMALLEST_GAIN):
+                        best, least = candidate, known[candidate]
+                    bar.update()
+                    bar.set_postfix(least=f"{least:.4f}")
+            if best == before:
+                break
+    return best, least
+
+
+def load_settings(path: Path) -> PoseGraphSettings:
+    """The settings in a file that this script wrote; raises ``ValueError`` naming what is wrong with it."""
+    try:
+        values = dict(json.loads(path.read_text())["settings"])
+        search = LoopSearch(**values.pop("search"))
+        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+        return PoseGraphSettings(**{**values, **lists, "search": search})
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}; expected what `python -m training.tune_pose_graph` writes") from error
+
+
+def main(arguments: Arguments) -> PoseGraphSettings:
+    """Search, print the best settings and write them."""
+    torch.set_num_threads(1)
+    world = world_named(arguments.world)
+    features, with_compass = arguments.runs / world.name / "features", arguments.form == "compass"
+    stores = [open_store(features / f"validation_{table}", with_compass) for table in world.tables]
+    arrays = {
+        name: np.concatenate([store[name][: arguments.trajectories or None] for store in stores])
+        for name in ("relative", "log_std", "codes", "truth", *(_COMPASS if with_compass else ()))
+    }
+    path = arguments.out / f"{world.name}.gtsam.json"
+    start, grid = PoseGraphSettings(), (*GRID, (fit_calibration(arrays["relative"], arrays["truth"]),))
+    compass: list[CompassFixes] | None = None
+    if with_compass:
+        start, grid, path = load_settings(path), COMPASS_GRID, arguments.out / f"{world.name}.gtsam_compass.json"
+        relative = start.calibrated(arrays["relative"])
+        readings, log_scale = (arrays[name] for name in _COMPASS)
+        compass = found_fixes(readings, log_scale, relative, arrays["log_std"], start.block, world.block_m)
+    objective = Objective(arrays, load_place(arguments.weights / world.name, world.name)[0].pair_head, compass)
+    started = time.monotonic()
+    best, least = tune(objective, start, grid, arguments.passes)
+    odometry = objective.error(se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy())
+    result = {
+        "settings": dataclasses.asdict(best),
+        "validation": {
+            "trajectories": len(arrays["truth"]),
+            "position_rmse_m": least,
+            "odometry_position_rmse_m": odometry,
+        },
+        "tuning": {**runs.record("tune_pose_graph", arguments), "seconds": round(time.monotonic() - started)},
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=2) + "\n")
+    print(json.dumps(result["settings"]))
+    print(f"position RMSE {least:.4f} m (odometry {odometry:.4f} m) over {len(arrays['truth'])} trajectories; {path}")
+    return best
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
