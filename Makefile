@@ -14,7 +14,7 @@ TYPED := ros_ws/src/ngo_sim/ngo_sim ros_ws/src/ngo_estimator/ngo_estimator tools
 
 OPEN := . ./env.sh
 
-.PHONY: help venv build demo train test lint format clean
+.PHONY: help venv build demo train results test lint format clean
 .DEFAULT_GOAL := help
 # One step at a time, and nothing printed after the demo's last line.
 .NOTPARALLEL:
@@ -35,6 +35,9 @@ demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 
 train: build ## every network of a world, from simulated data, into the estimator's package: WORLD=maze3d|maze2d
 	@$(OPEN) && for script in train_local train_place featurise train_optimizer evaluate; do \
 		python -m training.$$script --world $(WORLD) || exit; done
+
+results: build ## tables and figures of a world, from networks to docs/: WORLD=maze2d
+	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)
 
 test: build ## every test below tests/: ARGS="tests/unit -k name" goes to pytest
 	@$(OPEN) && exec python -m pytest $(ARGS)

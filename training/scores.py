@@ -76,6 +76,11 @@ METRICS: dict[str, tuple[Metric, ...]] = {
 """The metrics of each world; the first is the one that comparisons and figures are about."""
 
 
+def in_sentence(title: str) -> str:
+    """A metric's title within a sentence."""
+    return title[0].lower() + title[1:]
+
+
 def errors_of(estimate: np.ndarray, truth: np.ndarray) -> Errors:
     """Errors of estimated poses ``(trajectories, steps, 3)`` after each step, seen from the first frame."""
     if estimate.shape != truth.shape or truth.ndim != 3 or truth.shape[2] != 3:

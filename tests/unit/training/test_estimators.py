@@ -1,0 +1,101 @@
+"""The rows' estimators: batches equal single trajectories, and prefixes know nothing of what follows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator.compass_closure import frames_to_read
+from ngo_estimator.online_trajectory import optimize_offline
+from ngo_estimator.place_encoder import PairHead
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
+from training.estimators import Arrays, calibrated, estimators, local, optimized_by, pose_graph, prefix
+from training.pose_graph import PoseGraphSettings
+from training.rows import ROWS, Sources, rows_of, trainings_of
+from training.worlds import WORLDS, world_named
+
+STEPS = 101  # twelve blocks of 8, and a tail
+
+
+def arrays(trajectories: int = 3) -> Arrays:
+    names = ("relative", "log_std", "motion", "codes")
+    values = trajectory_inputs(trajectories, STEPS)
+    found = {name: value.numpy() for name, value in zip(names, values, strict=True)}
+    return {**found, "truth": local(found) + 0.01}
+
+
+@pytest.fixture(scope="module")
+def pair_head() -> PairHead:
+    return small_pair_head()
+
+
+@pytest.mark.parametrize("form", ["loops", "paper", "gauss_newton"])
+@pytest.mark.parametrize("steps", [STEPS, 96])
+def test_many_trajectories_come_out_as_single_ones(form: str, steps: int, pair_head: PairHead) -> None:
+    optimizer = small_optimizer(form, trained=True)
+    some = prefix(arrays(), steps)
+    poses = optimized_by(optimizer, pair_head, 1.0)(some)
+    assert poses.shape == (3, steps, 3) and poses.dtype == np.float64
+    moved = np.abs(poses - local(some)).max()
+    assert moved > 5e-3
+    for k in range(3):
+        inputs = (torch.from_numpy(some[name][k]) for name in ("relative", "log_std", "motion", "codes"))
+        single = optimize_offline(optimizer, pair_head, *inputs).poses[0].numpy()
+        np.testing.assert_allclose(poses[k, :, :2], single[:, :2], atol=0.02 * moved)
+        turn = poses[k, :, 2] - single[:, 2]
+        np.testing.assert_allclose(np.remainder(turn + np.pi, 2 * np.pi) - np.pi, 0.0, atol=0.02 * moved)
+
+
+def test_the_classical_rows_keep_the_odometry_behind_the_last_whole_block(pair_head: PairHead) -> None:
+    some = arrays()
+    for row in ("gtsam", "true_pairs", "oracle"):
+        poses = pose_graph(row, PoseGraphSettings(), pair_head, 1.0)(some)
+        assert poses.shape == (3, STEPS, 3)
+        steps = np.diff(poses[:, 95:, :2], axis=1)
+        expected = np.diff(local(some)[:, 95:, :2], axis=1)
+        np.testing.assert_allclose(np.linalg.norm(steps, axis=2), np.linalg.norm(expected, axis=2), atol=1e-6)
+
+
+def test_odometry_is_the_composition_of_its_steps() -> None:
+    relative = np.array([[[1.0, 0.0, np.pi / 2], [2.0, 0.0, np.pi / 2], [0.0, 3.0, 0.0]]], dtype=np.float32)
+    expected = [[1.0, 0.0, np.pi / 2], [1.0, 2.0, np.pi], [1.0, -1.0, np.pi]]
+    np.testing.assert_allclose(local({"relative": relative})[0], expected, atol=1e-6)
+
+
+def test_a_calibration_is_a_gain_and_a_bias() -> None:
+    some = calibrated(
+        {"relative": np.ones((1, 2, 3))}, {"odometry_gain": (2.0, 1.0, 1.0), "odometry_bias": (0.0, 0.0, 0.5)}
+    )
+    np.testing.assert_array_equal(some["relative"], [[[2.0, 1.0, 1.5]] * 2])
+
+
+def test_a_prefix_has_its_first_frame_and_nothing_that_follows() -> None:
+    frames = frames_to_read(100, 8).numpy()[None]
+    some = {"relative": np.arange(1, 101)[None], "compass": frames, "compass_log_scale": frames}
+    for steps in (4, 30, 50, 100):
+        seen = prefix(some, steps)
+        assert seen["relative"].tolist() == [list(range(1, steps + 1))]
+        for name in ("compass", "compass_log_scale"):
+            assert seen[name].tolist() == [frames[frames <= steps].tolist()]
+
+
+def test_less_than_a_meta_pose_is_refused(pair_head: PairHead) -> None:
+    with pytest.raises(ValueError, match="7 steps make no meta-pose; expected at least 8"):
+        optimized_by(small_optimizer("loops"), pair_head, 1.0)(prefix(arrays(), 7))
+
+
+def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="row is 'ngo_9'; expected one of local, "):
+        estimators("ngo_9", 1, Sources(world_named("maze2d"), tmp_path, tmp_path, tmp_path))
+
+
+def test_rows_with_a_compass_say_so() -> None:
+    for name, row in ROWS.items():
+        assert row.compass == ("compass" in name)
+    for world in WORLDS.values():
+        assert {name for name in ROWS if not ROWS[name].compass} <= set(rows_of(world))
+
+
+def test_only_what_is_trained_has_trainings() -> None:
+    assert [trainings_of(row, 3) for row in ("local", "gtsam", "ngo_5", "end_to_end")] == [0, 0, 3, 1]

@@ -1,0 +1,151 @@
+"""The JSON and the page of the results, on errors that are known; and the mazes that figures show."""
+
+import numpy as np
+import pytest
+
+from training import results_page, tables
+from training.featurise import _GROUP
+from training.maze_views import in_maze, maze_and_start
+from training.measured import Measured
+from training.metrics import seen_from_first
+from training.results import Arguments
+from training.results_page import number, page
+from training.scores import METRICS
+from training.streams import simulate
+from training.worlds import world_named
+
+WORLD = world_named("maze2d")
+KEYS = [metric.key for metric in METRICS["maze2d"]]
+
+
+def measured(errors: list[float]) -> Measured:
+    values = {key: np.array(errors) for key in KEYS}
+    return Measured(np.zeros((len(errors), 8, 3), np.float32), {4: {k: 0.5 * v for k, v in values.items()}, 8: values})
+
+
+TABLE = {
+    "local": [measured([1.0, 2.0, 3.0, 4.0])],
+    "ngo_1": [measured([0.5, 1.0, 1.5, 2.0])] * 2,
+    "ngo_5": [measured([0.1, 0.2, 0.3, 0.4]), measured([0.3, 0.4, 0.5, 0.6])],
+    "gtsam": [measured([0.4, 0.6, 0.8, 1.0])],
+}
+
+
+def test_a_table_in_json() -> None:
+    found = tables.table_json(TABLE, (4, 8), 8, WORLD)
+    assert list(found) == list(TABLE)
+    assert found["local"]["position_rmse"]["mean"] == pytest.approx(2.5)
+    assert "seeds" not in found["local"]["position_rmse"]
+    assert found["ngo_5"]["heading_rmse_deg"]["seeds"] == pytest.approx([0.25, 0.45])
+    assert found["ngo_5"]["heading_rmse_deg"]["mean"] == pytest.approx(0.35)
+    assert found["ngo_5"]["prefixes"]["4"]["position_rmse"]["mean"] == pytest.approx(0.175)
+    assert found["ngo_5"]["prefixes"]["8"]["position_rmse"] == found["ngo_5"]["position_rmse"]
+
+
+def test_rows_are_compared_where_both_are() -> None:
+    found = tables.paired_json(TABLE, 8, WORLD)
+    assert set(found) == {"ngo_1_vs_local", "ngo_5_vs_local", "gtsam_vs_local", "ngo_5_vs_ngo_1", "ngo_5_vs_gtsam"}
+    assert found["ngo_5_vs_gtsam"]["position_rmse"]["relative_percent"]["mean"] == pytest.approx(-50.0)
+    assert found["ngo_5_vs_gtsam"]["position_rmse"]["difference"]["mean"] == pytest.approx(-0.35)
+    assert found["gtsam_vs_local"]["position_rmse"]["difference"]["ci95"][1] < 0.0
+
+
+def test_a_constant_turn_is_found_as_heading_bias() -> None:
+    truth = np.zeros((3, 50, 3))
+    truth[..., 0] = np.arange(1, 51)
+    relative = np.zeros((3, 50, 3), np.float32)
+    relative[..., 2] = np.radians([0.01, 0.02, 0.03])[:, None]
+    bias = tables.heading_bias_json(relative, truth)
+    assert bias["mean"] == pytest.approx(0.02, rel=1e-5)
+    assert 0.0099 < bias["ci95"][0] < bias["ci95"][1] < 0.0301
+
+
+def test_the_path_after_some_steps() -> None:
+    truth = np.zeros((2, 4, 3))
+    truth[0, :, 0] = [1.0, 2.0, 3.0, 4.0]
+    truth[1, :, 1] = [2.0, 4.0, 6.0, 8.0]
+    assert tables.path_json(truth, (1, 4)) == {"1": pytest.approx(1.5), "4": pytest.approx(6.0)}
+
+
+def result() -> dict[str, object]:
+    return {
+        "command": "python -m training.results --world maze2d",
+        "revision": "abc",
+        "split": "validation",
+        "trajectories": 4,
+        "steps": 8,
+        "seeds": [0, 1],
+        "tables": {"perfect": tables.table_json(TABLE, (4, 8), 8, WORLD)},
+        "paired": {"perfect": tables.paired_json(TABLE, 8, WORLD)},
+        "local_bias_deg": {"perfect": {"mean": -0.0012, "ci95": [-0.002, 0.0001]}},
+        "path_m": {"perfect": {"4": 10.0, "8": 20.0}},
+        "attention": {},
+        "trainings": {"ngo_5-seed0": {"command": "python -m x", "seconds": 90.0, "datapoints_per_s": 12.5}},
+        "data_generation": {"workers": 1, "local_datapoints_per_s": 4321.0, "peak_memory_mb": 512.0},
+    }
+
+
+def test_the_page_has_what_the_json_has() -> None:
+    text = page(result(), {"a.png": "What it shows."}, WORLD)
+    lines = text.splitlines()
+    (local,) = [line for line in lines if line.startswith("| `local` | odometry")]
+    assert local.count("| 2.50 [") == len(KEYS)
+    (ours,) = [line for line in lines if line.startswith("| `ngo_5` | our")]
+    assert "(0.250 to 0.450)" in ours
+    (pair,) = [line for line in lines if line.startswith("| `ngo_5` | `gtsam` |")]
+    assert "| -50.0 % [" in pair and pair.endswith("| yes |")
+    assert "-0.0012 deg [-0.0020, +0.0001]" in text
+    assert "![What it shows.](images/a.png)" in text
+    assert "| `ngo_5-seed0` | 1.50 min | 12.5 /s |  | `python -m x` |" in lines
+    assert "seeds 0 and 1" in text
+    assert "with 1 worker process(es): local 4,321; peak memory 0.500 GiB." in text
+
+
+def test_every_line_of_a_table_has_as_many_cells() -> None:
+    block: list[str] = []
+    for line in [*page(result(), {}, WORLD).splitlines(), ""]:
+        if line.startswith("|"):
+            block.append(line)
+        elif block:
+            assert len({row.replace(" | ", "|").count("|") for row in block}) == 1, block
+            block = []
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (123.4, "123"),
+        (12.34, "12.3"),
+        (1.234, "1.23"),
+        (0.1234, "0.123"),
+        (0.01234, "0.0123"),
+        (-0.5, "-0.500"),
+        (0.0, "0.000"),
+    ],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_joined_words() -> None:
+    assert results_page._joined([0]) == "0"
+    assert results_page._joined([0, 1, 2]) == "0, 1 and 2"
+
+
+@pytest.mark.parametrize("index", [1, _GROUP + 1])
+def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
+    seeds = WORLD.table_seeds("cycles", "validation")
+    first = index // _GROUP * _GROUP
+    episodes = list(simulate(WORLD, list(seeds[first : index + 1]), 60, WORLD.tables["cycles"]))
+    episode = episodes[index - first]
+    maze, start = maze_and_start(WORLD, "cycles", "validation", index)
+    np.testing.assert_array_equal(maze.walls, episode.maze.walls)
+    np.testing.assert_allclose(start, episode.poses_xyyaw[0])
+    placed = in_maze(start, seen_from_first(episode.poses_xyyaw)[1:])
+    np.testing.assert_allclose(placed[:, :2], episode.poses_xyyaw[:, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize("change", [{"trajectories": 1}, {"seeds": 0}, {"prefixes": ()}, {"prefixes": (0, 8)}])
+def test_settings_that_give_no_table_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Arguments(world="maze2d", **change)  # type: ignore[arg-type]

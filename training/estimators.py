@@ -1,0 +1,178 @@
+"""What makes trajectories out of features, for every row of the tables of results."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import load_optimizer, load_place
+from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to_read
+from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.pose_aggregation import PoseAggregationConfig
+from training import loop_factors
+from training.compass_factors import found_fixes
+from training.featurise import open_store
+from training.pose_graph import PoseGraphSettings, optimize, optimize_exact
+from training.rows import ROWS, Sources
+from training.tune_pose_graph import fit_calibration, load_settings
+
+Arrays = dict[str, np.ndarray]
+"""Arrays of a feature store ``(trajectories, steps, ...)``; readings of a compass are of ``frames_to_read``."""
+
+Array = TypeVar("Array", np.ndarray, Tensor)
+
+COMPASS_ARRAYS = ("compass", "compass_log_scale")
+_BLOCK = PoseAggregationConfig(1).block
+_TOGETHER = 8  # trajectories that are optimised at once
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """One way to get trajectories: a function, and all that its result depends on beside code and data.
+
+    ``poses`` maps arrays ``(trajectories, steps, ...)`` to global poses ``(trajectories, steps, 3)`` after each step,
+    seen from the first frame, float64. ``identity`` names weights by their hash, and settings.
+    """
+
+    poses: Callable[[Arrays], np.ndarray]
+    identity: str
+
+
+def estimators(row: str, seeds: int, sources: Sources) -> list[Estimator]:
+    """The estimators of a row: one, or one for each training seed."""
+    if row not in ROWS:
+        raise ValueError(f"row is {row!r}; expected one of {', '.join(ROWS)}")
+    kind = ROWS[row]
+    if row == "local":
+        return [Estimator(local, row)]
+    if row == "local_calibrated":
+        calibration = calibration_of(sources)
+        return [Estimator(lambda arrays: local(calibrated(arrays, calibration)), f"{row} {json.dumps(calibration)}")]
+    if kind.own_networks:
+        own = sources.of_row(row, 0)
+        return [_trained(own, own.networks)]
+    if kind.form is not None:
+        return [_trained(sources, sources.row_folder(row, seed)) for seed in range(seeds)]
+    settings = load_settings(sources.settings_file(kind.compass))
+    place, description = load_place(sources.networks, sources.world.name)
+    identity = f"{row} {json.dumps(dataclasses.asdict(settings))} {description['sha256']}"
+    return [Estimator(pose_graph(row, settings, place.pair_head, sources.world.block_m), identity)]
+
+
+def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
+    """What there was after so many steps."""
+    read = len(frames_to_read(steps, _BLOCK))
+    return {name: array[:, : read if name in COMPASS_ARRAYS else steps] for name, array in arrays.items()}
+
+
+def local(arrays: Arrays) -> np.ndarray:
+    """The odometry alone."""
+    return se2.r2g(_float64(arrays["relative"])).numpy()
+
+
+def calibration_of(sources: Sources) -> dict[str, tuple[float, float, float]]:
+    """Constant gain and bias of each component of a step, least squares over the validation mazes of all tables."""
+    stores = [open_store(sources.store_folder("validation", table)) for table in sources.world.tables]
+    relative, truth = (np.concatenate([store[name] for store in stores]) for name in ("relative", "truth"))
+    return fit_calibration(relative, truth)
+
+
+def calibrated(arrays: Arrays, calibration: dict[str, tuple[float, float, float]]) -> Arrays:
+    """The arrays with a constant calibration applied to the odometry."""
+    relative = arrays["relative"] * np.array(calibration["odometry_gain"]) + np.array(calibration["odometry_bias"])
+    return {**arrays, "relative": relative}
+
+
+def _trained(sources: Sources, optimizer_folder: Path) -> Estimator:
+    place, description = load_place(sources.networks, sources.world.name)
+    optimizer, trained = load_optimizer(optimizer_folder, sources.world.name)
+    if trained.get("place_encoder_sha256") != description["sha256"]:
+        raise ValueError(
+            f"{optimizer_folder} was trained on features of other networks than the present ones; remove it to make "
+            "it anew"
+        )
+    identity = f"{trained['sha256']} {description['sha256']}"
+    return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m), identity)
+
+
+def optimized_by(
+    optimizer: NeuralGraphOptimizer, pair_head: PairHead, block_m: float
+) -> Callable[[Arrays], np.ndarray]:
+    """What ``optimize_offline`` does, for many trajectories at once; ``block_m`` is the side of a compass's lattice."""
+
+    @torch.inference_mode()
+    def poses(arrays: Arrays) -> np.ndarray:
+        parts = []
+        for first in range(0, len(arrays["relative"]), _TOGETHER):
+            some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
+            whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
+            odometry, config = (whole["relative"], whole["log_std"]), optimizer.config
+            loops = optimizer.find_loops(odometry[0], whole["codes"], pair_head) if config.loops else None
+            fixes = None
+            if config.compass:
+                reading, scale = (whole[name] for name in COMPASS_ARRAYS)
+                fixes = compass_fixes(reading, scale, *odometry, optimizer.block, block_m)
+            result = optimizer(*odometry, whole["motion"], loops, fixes)
+            parts.append(_with_tail(result.poses.double(), some["relative"].double()))
+        return torch.cat(parts).numpy()
+
+    return poses
+
+
+def pose_graph(
+    row: str, settings: PoseGraphSettings, pair_head: PairHead, block_m: float
+) -> Callable[[Arrays], np.ndarray]:
+    """The classical rows: GTSAM with the loops that are found (and a compass), or with those that are known."""
+
+    def poses(arrays: Arrays) -> np.ndarray:
+        whole = prefix(arrays, _whole(arrays["relative"].shape[1], settings.block))
+        odometry = list(zip(whole["relative"], whole["log_std"], strict=True))
+        relative, codes, truth = settings.calibrated(whole["relative"]), whole["codes"], whole["truth"]
+        if row == "oracle":
+            solved = [optimize_exact(*one, true, settings) for one, true in zip(odometry, truth, strict=True)]
+        else:
+            if row == "true_pairs":
+                loops = [
+                    loop_factors.measured_revisits(pair_head, *one, settings.search, settings.block)
+                    for one in zip(relative, codes, truth, strict=True)
+                ]
+            else:
+                loops = loop_factors.found_loops(pair_head, relative, codes, settings.search, settings.block)
+            fixes: Sequence[CompassFixes | None] = [None] * len(relative)
+            if ROWS[row].compass:
+                reading, scale = (whole[name] for name in COMPASS_ARRAYS)
+                fixes = found_fixes(reading, scale, relative, whole["log_std"], settings.block, block_m)
+            added = zip(odometry, loops, fixes, strict=True)
+            solved = [optimize(*one, found, settings, fix) for one, found, fix in added]
+        left = torch.from_numpy(settings.calibrated(arrays["relative"]))
+        return _with_tail(torch.from_numpy(np.stack(solved)), left).numpy()
+
+    return poses
+
+
+def _whole(steps: int, block: int) -> int:
+    if steps < block:
+        raise ValueError(f"{steps} steps make no meta-pose; expected at least {block}")
+    return steps // block * block
+
+
+def _with_tail(poses: Tensor, relative: Tensor) -> Tensor:
+    """Poses of the first steps, followed by the odometry ``(trajectories, steps, 3)`` of the others."""
+    left = relative[:, poses.shape[1] :]
+    return poses if left.shape[1] == 0 else torch.cat((poses, se2.compose(poses[:, -1:], se2.r2g(left))), dim=1)
+
+
+def _float32(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32))
+
+
+def _float64(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float64))

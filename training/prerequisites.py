@@ -1,0 +1,199 @@
+"""Everything that the tables of results need and that is missing: networks, features, settings and rows' weights.
+
+What is there is left alone, and every script goes on where it was stopped, so this can be run again at any time.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE
+from ngo_estimator.compass import COMPASS
+from training import (
+    featurise,
+    throughput,
+    train_compass,
+    train_end_to_end,
+    train_local,
+    train_optimizer,
+    train_place,
+    tune_pose_graph,
+)
+from training.curves import write_at_once
+from training.featurise import open_store
+from training.rows import ROWS, Sources, rows_of
+
+
+@dataclass(frozen=True)
+class Scripts:
+    """How each script is run; world, form, iterations, seed and folders are set for what is made."""
+
+    local: train_local.Arguments = field(default_factory=lambda: train_local.Arguments(world="maze2d"))
+    place: train_place.Arguments = field(default_factory=lambda: train_place.Arguments(world="maze2d"))
+    compass: train_compass.Arguments = field(default_factory=lambda: train_compass.Arguments(world="maze2d"))
+    features: featurise.Arguments = field(default_factory=lambda: featurise.Arguments(world="maze2d"))
+    optimizer: train_optimizer.Arguments = field(default_factory=lambda: train_optimizer.Arguments(world="maze2d"))
+    pose_graph: tune_pose_graph.Arguments = field(default_factory=lambda: tune_pose_graph.Arguments(world="maze2d"))
+    speed: throughput.Arguments = field(default_factory=lambda: throughput.Arguments(world="maze2d"))
+    end_to_end: train_end_to_end.Arguments = field(default_factory=lambda: train_end_to_end.Arguments(world="maze2d"))
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which trajectories the tables are about, and how many trainings of each optimizer."""
+
+    split: str
+    trajectories: int
+    seeds: int
+
+
+class Step(NamedTuple):
+    """Something that is needed: what it is, whether it is there, and how to make it."""
+
+    what: str
+    is_there: Callable[[], bool]
+    make: Callable[[], object]
+
+
+def prepare(sources: Sources, wanted: Wanted, scripts: Scripts) -> None:
+    """Make what is missing, in order; raises what the script raises that fails."""
+    threads = torch.get_num_threads()
+    for step in (
+        *_networks(sources, scripts),
+        *_features(sources, wanted, scripts, (_TRAIN, _VALIDATION, wanted.split)),
+        *_settings(sources, scripts),
+        *_optimizers(sources, wanted, scripts),
+        *_end_to_end(sources, wanted, scripts),
+        Step("a measurement of how fast data is made", sources.speed_file.exists, lambda: _speed(sources, scripts)),
+    ):
+        if not step.is_there():
+            print(f"{sources.world.name}: {step.what} is missing and is made now", flush=True)
+            step.make()
+            torch.set_num_threads(threads)
+
+
+def _networks(sources: Sources, scripts: Scripts) -> Iterator[Step]:
+    common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
+    local = replace(scripts.local, out=sources.weights, **common)
+    place = replace(scripts.place, out=sources.weights, **common)
+    yield Step("the local network", _exists(sources, LOCAL), lambda: train_local.main(local))
+    yield Step("the place encoder", _exists(sources, PLACE), lambda: train_place.main(place))
+    if sources.has_compass:
+        weights = sources.compass_weights / sources.world.name / f"{COMPASS}.safetensors"
+        compass = replace(scripts.compass, **common)
+        yield Step("the compass", weights.exists, lambda: _compass(compass, weights.parent))
+
+
+def _compass(arguments: train_compass.Arguments, folder: Path) -> None:
+    train_compass.main(arguments)
+    folder.mkdir(parents=True, exist_ok=True)
+    for suffix in (".json", ".safetensors"):  # the description first: what is complete has both
+        shutil.copy(arguments.runs / arguments.world / COMPASS / f"{COMPASS}{suffix}", folder)
+
+
+_TRAIN, _VALIDATION = "train", "validation"
+_COUNTS = {_TRAIN: "trajectories", _VALIDATION: "validation_trajectories", "test": "test_trajectories"}
+
+
+def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[str, ...]) -> Iterator[Step]:
+    for split in dict.fromkeys(splits):
+        count = getattr(scripts.features, _COUNTS[split])
+        if split == wanted.split:
+            count = max(count, wanted.trajectories)
+        changes: dict[str, Any] = {name: count if name == _COUNTS[split] else 0 for name in _COUNTS.values()}
+        changes["world"] = sources.world.name
+        compass = sources.compass_weights if sources.has_compass else None
+        arguments = replace(scripts.features, weights=sources.weights, out=sources.runs, compass=compass, **changes)
+        for store in [_TRAIN] if split == _TRAIN else [f"{split}_{table}" for table in sources.world.tables]:
+            yield Step(f"the feature store {store}", _whole(sources, store), _call(featurise.main, arguments))
+
+
+def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
+    common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
+    for compass in (False, True) if sources.has_compass else (False,):
+        changes = {**common, "form": "compass" if compass else "loops"}
+        arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
+        what = f"tuning of the pose graph{' with a compass' if compass else ''}"
+        yield Step(what, sources.settings_file(compass).exists, _call(tune_pose_graph.main, arguments))
+
+
+def _optimizers(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:
+    for name in rows_of(sources.world):
+        row = ROWS[name]
+        for seed in range(wanted.seeds if row.form is not None else 0):
+            folder = sources.row_folder(name, seed)
+            changes: dict[str, Any] = {"world": sources.world.name, "form": row.form, "compass": row.compass}
+            if row.learning_rate is not None:
+                changes["learning_rate"] = row.learning_rate
+            arguments = replace(
+                scripts.optimizer,
+                iterations=row.iterations,
+                seed=seed,
+                weights=sources.weights,
+                out=folder,
+                runs=sources.runs,
+                **changes,
+            )
+            yield Step(f"{name} of seed {seed}", (folder / f"{OPTIMIZER}.safetensors").exists, _optimizer(arguments))
+
+
+def _optimizer(arguments: train_optimizer.Arguments) -> Callable[[], None]:
+    def make() -> None:
+        train_optimizer.main(arguments)
+        # The scripts write WORLD/NAME, for folders that hold several worlds; a row has a folder for each world.
+        written = arguments.out / arguments.world
+        for path in sorted(written.iterdir()):  # the description first: what is complete has both
+            path.replace(arguments.out / path.name)
+        written.rmdir()
+
+    return make
+
+
+def _end_to_end(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:
+    for row in (name for name in rows_of(sources.world) if ROWS[name].own_networks):
+        own = sources.of_row(row, 0)
+        stages = own.weights / "stages"
+        changes: dict[str, Any] = {"world": sources.world.name, "seed": 0, "runs": sources.runs}
+        arguments = replace(scripts.end_to_end, weights=stages, out=own.weights, **changes)
+
+        def make(sources: Sources = sources, arguments: train_end_to_end.Arguments = arguments) -> None:
+            folder = arguments.weights / arguments.world
+            folder.mkdir(parents=True, exist_ok=True)
+            trained = sources.row_folder("ngo_5", 0)
+            for kind, source in ((LOCAL, sources.networks), (PLACE, sources.networks), (OPTIMIZER, trained)):
+                for suffix in (".json", ".safetensors"):
+                    shutil.copy(source / f"{kind}{suffix}", folder)
+            train_end_to_end.main(arguments)
+
+        yield Step(row, _exists(own, OPTIMIZER), make)
+        yield from _features(own, wanted, scripts, (wanted.split,))
+
+
+def _speed(sources: Sources, scripts: Scripts) -> None:
+    world: Any = sources.world.name
+    measured = throughput.main(replace(scripts.speed, world=world))
+    write_at_once(sources.speed_file, json.dumps(measured) + "\n")
+
+
+def _call(main: Callable[[Any], object], arguments: Any) -> Callable[[], object]:
+    return lambda: main(arguments)
+
+
+def _exists(sources: Sources, kind: str) -> Callable[[], bool]:
+    return (sources.networks / f"{kind}.safetensors").exists
+
+
+def _whole(sources: Sources, store: str) -> Callable[[], bool]:
+    def is_whole() -> bool:
+        try:
+            open_store(sources.runs / sources.world.name / "features" / store, sources.has_compass)
+        except ValueError:
+            return False
+        return True
+
+    return is_whole

@@ -1,0 +1,162 @@
+"""The tables and figures of a world's results, by one command from nothing.
+
+    python -m training.results --world maze2d
+
+makes whatever is missing (networks, features, the pose graph's settings, three trainings of every optimizer), measures
+every row on mazes that nothing was trained or chosen on, and writes ``training/results/WORLD.json``,
+``docs/results_WORLD.md`` and ``docs/images/results_WORLD_*.png``. Run again, it goes on where it was stopped.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from training import attention, figures, results_page, runs, tables
+from training.curves import write_at_once
+from training.estimators import Arrays, estimators
+from training.featurise import open_store
+from training.measured import Measured, measure
+from training.prerequisites import Scripts, Wanted, prepare
+from training.rows import COMPASS_WORLDS, ROWS, Sources, rows_of
+from training.trained import trainings_json
+from training.worlds import world_named
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the results."""
+
+    world: Literal["maze2d"]
+    """World to measure in."""
+    split: Literal["validation", "test"] = "test"
+    """Mazes to measure on; designs are chosen on validation, and the test split is for the final tables alone."""
+    trajectories: int = 100
+    """Trajectories of each table, each in a maze of its own."""
+    seeds: int = 3
+    """Trainings of each optimizer, with the seeds 0, 1, ..."""
+    prefixes: tuple[int, ...] = (250, 500, 1000, 1500, 2000)
+    """Numbers of steps after which errors are given, as if the robot had stopped there."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/*.safetensors of the local network and the place encoder."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets WORLD.json, and holds WORLD.gtsam.json."""
+    docs: Path = runs.ROOT / "docs"
+    """Folder that gets results_WORLD.md and images/."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of feature stores, rows' weights, logs and estimates."""
+
+    def __post_init__(self) -> None:
+        if self.trajectories < 2 or self.seeds < 1:
+            raise ValueError(
+                f"trajectories, seeds are {self.trajectories}, {self.seeds}; expected at least 2 and at least 1"
+            )
+        if min(self.prefixes, default=0) < 1:
+            raise ValueError(f"prefixes are {self.prefixes}; expected numbers of steps, each at least 1")
+
+
+_ATTENTION_TRAJECTORIES = 24
+
+
+def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]:
+    """Make what is missing, measure, write everything, and return the JSON's content."""
+    world = world_named(arguments.world)
+    has_compass = world.name in COMPASS_WORLDS
+    sources = Sources(world, arguments.weights, arguments.runs, arguments.out, has_compass)
+    prepare(sources, Wanted(arguments.split, arguments.trajectories, arguments.seeds), scripts or Scripts())
+    stores = {table: table_data(arguments, sources, table).arrays for table in world.tables}
+    measured = {table: measured_rows(arguments, sources, table) for table in world.tables}
+    result = summary(arguments, sources, stores, measured)
+    write_at_once(arguments.out / f"{world.name}.json", json.dumps(result, indent=2) + "\n")
+    images = figures.draw_all(arguments.docs / "images", sources, arguments.split, stores, measured, result)
+    write_at_once(arguments.docs / f"results_{world.name}.md", results_page.page(result, images, world))
+    print(f"{world.name}: {arguments.out / f'{world.name}.json'}, {arguments.docs / f'results_{world.name}.md'}")
+    return result
+
+
+@dataclass(frozen=True)
+class TableData:
+    """The features of a table's trajectories, and what identifies them."""
+
+    arrays: Arrays
+    identity: str
+
+
+def table_data(arguments: Arguments, sources: Sources, table: str) -> TableData:
+    """The features of a table's trajectories; raises ``ValueError`` if there are too few, or too short ones."""
+    folder = sources.store_folder(arguments.split, table)
+    arrays = open_store(folder, sources.has_compass)
+    count, steps = arrays["relative"].shape[:2]
+    if count < arguments.trajectories:
+        raise ValueError(
+            f"{folder} holds {count} trajectories; expected {arguments.trajectories} or more: remove it to make it anew"
+        )
+    if max(arguments.prefixes) > steps:
+        raise ValueError(f"prefixes are {arguments.prefixes}; expected at most {steps}, the steps of a trajectory")
+    identity = f"{folder.name} {(folder / 'networks.json').read_text()}"
+    return TableData({name: array[: arguments.trajectories] for name, array in arrays.items()}, identity)
+
+
+def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Measured]]:
+    """What every row makes of a table's trajectories."""
+    shared = table_data(arguments, sources, table)
+    cache = arguments.runs / sources.world.name / "results" / f"{arguments.split}_{table}"
+    result: dict[str, list[Measured]] = {}
+    with tqdm(rows_of(sources.world), desc=f"{sources.world.name} {table}", unit="row") as bar:
+        for row in bar:
+            bar.set_postfix_str(row)
+            data = table_data(arguments, sources.of_row(row, 0), table) if ROWS[row].own_networks else shared
+            if not np.array_equal(data.arrays["truth"], shared.arrays["truth"]):
+                raise ValueError(f"the features of {row} are of other trajectories than those of the table {table}")
+            result[row] = [
+                measure(
+                    estimator,
+                    data.arrays,
+                    data.identity,
+                    arguments.prefixes,
+                    sources.world,
+                    cache / f"{row}-seed{seed}.npz",
+                )
+                for seed, estimator in enumerate(estimators(row, arguments.seeds, sources))
+            ]
+    return result
+
+
+def summary(
+    arguments: Arguments,
+    sources: Sources,
+    stores: dict[str, Arrays],
+    measured: dict[str, dict[str, list[Measured]]],
+) -> dict[str, Any]:
+    """The content of the JSON."""
+    world, prefixes = sources.world, sorted(arguments.prefixes)
+    steps = next(iter(stores.values()))["relative"].shape[1]
+    record = runs.record("results", arguments)
+    few = {table: {k: v[:_ATTENTION_TRAJECTORIES] for k, v in arrays.items()} for table, arrays in stores.items()}
+    return {
+        "command": record["command"],
+        "revision": record["revision"],
+        "split": arguments.split,
+        "trajectories": arguments.trajectories,
+        "steps": steps,
+        "seeds": list(range(arguments.seeds)),
+        "tables": {name: tables.table_json(table, prefixes, steps, world) for name, table in measured.items()},
+        "paired": {name: tables.paired_json(table, steps, world) for name, table in measured.items()},
+        "local_bias_deg": {
+            name: tables.heading_bias_json(arrays["relative"], arrays["truth"]) for name, arrays in stores.items()
+        },
+        "path_m": {
+            name: tables.path_json(arrays["truth"], sorted({*prefixes, steps})) for name, arrays in stores.items()
+        },
+        "attention": {name: attention.attention_json(sources, arrays) for name, arrays in few.items()},
+        "data_generation": json.loads(sources.speed_file.read_text()),
+        "trainings": trainings_json(sources, arguments.seeds),
+    }
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
