@@ -145,7 +145,9 @@ def by_prefix(
             prefixes = rows[row]["prefixes"]
             x = [position(table, int(steps)) for steps in prefixes]
             values = [prefixes[steps][metric] for steps in prefixes]
-            axes.plot(x, [value["mean"] for value in values], "o-", color=COLORS[row], label=row, markersize=4)
+            # The paper's form may lie on the odometry, so that only dashes show both.
+            style = "o--" if ROWS[row].form == "paper" else "o-"
+            axes.plot(x, [value["mean"] for value in values], style, color=COLORS[row], label=row, markersize=4)
             low, high = zip(*(value["ci95"] for value in values), strict=True)
             axes.fill_between(x, low, high, color=COLORS[row], alpha=0.15, linewidth=0)
         _log_scale(axes)
@@ -201,7 +203,7 @@ def _optimizer_curves(axes: Axes, curves: dict[str, list[dict[str, np.ndarray]]]
         axes.axhline(odometry, color=LOCAL_COLOR, linestyle=":", label="local")
     _log_scale(axes)
     axes.set(title="optimizers", ylabel="position RMSE, m", xlabel="epoch")
-    axes.legend(frameon=False)
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
 
 
 def _log_scale(axes: Axes) -> None:
