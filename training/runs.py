@@ -64,7 +64,11 @@ def record(script: str, arguments: Any) -> dict[str, Any]:
             continue
         values[field.name] = value
         if value != field.default:
-            changed += [f"--{field.name.replace('_', '-')}", str(value)]
+            flag = field.name.replace("_", "-")
+            if isinstance(value, bool):
+                changed.append(f"--{flag}" if value else f"--no-{flag}")
+            else:
+                changed += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
     command = shlex.join(["python", "-m", f"training.{script}", *changed])
     return {"command": command, "arguments": values, "revision": revision()}
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import tyro
 
 from training import runs
 
@@ -29,6 +30,28 @@ def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
     trainer = {"accelerator": "auto", "devices": "2", "strategy": "auto", "precision": "bf16-mixed"}
     assert record["arguments"] == {**trainer, **expected}
     assert record["revision"]
+
+
+@dataclass(frozen=True)
+class Switches:
+    compass: bool = False
+    robust: bool = True
+    prefixes: tuple[int, ...] = (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("given", "flags"),
+    [
+        (Switches(compass=True), " --compass"),
+        (Switches(robust=False), " --no-robust"),
+        (Switches(prefixes=(5, 6, 7)), " --prefixes 5 6 7"),
+        (Switches(), ""),
+    ],
+)
+def test_the_command_is_one_that_the_command_line_takes(given: Switches, flags: str) -> None:
+    command = runs.record("results", given)["command"]
+    assert command == f"python -m training.results{flags}"
+    assert tyro.cli(Switches, args=command.split()[3:]) == given
 
 
 def test_a_run_is_resumed_only_from_a_checkpoint_that_is_there(tmp_path: Path) -> None:
