@@ -4,12 +4,15 @@ import signal
 from collections.abc import Callable
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, get_logger, get_logger_level, set_logger_level
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from ngo_estimator.nodes.parameters import BadParameter
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_WAIT_S = 0.1  # for a message, before a signal that came meanwhile is seen
 
 
 class StartError(Exception):
@@ -22,36 +25,37 @@ def run_node(name: str, create: Callable[[], Node]) -> int:
     0 after a signal, 2 where the node could not start: ROS arguments that cannot be read, a ``BadParameter``
     or a ``StartError``. One line then says why.
     """
+    # rclpy's own handlers end the context from another thread while this one publishes, which now and then ends in a
+    # crash. These raise in this thread.
+    for number in _SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     node = None
     try:
         _initialise()
         node = create()
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while True:
+            executor.spin_once(timeout_sec=_WAIT_S)
+    except KeyboardInterrupt:
+        return 0
     except (BadParameter, StartError) as error:
         get_logger(name).fatal(" ".join(str(error).split()))
         return 2
-    except rclpy_implementation.RCLError:
-        # A signal ends the context while a callback runs: what the callback then publishes fails, as it
-        # should.
-        if rclpy.ok():
-            raise
     finally:
         # A second signal, as from a terminal and a launcher together, must not interrupt the cleaning up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
 
 
 def _initialise() -> None:
     level = get_logger_level("rcl")
     set_logger_level("rcl", LoggingSeverity.FATAL)  # it would say the same error on a line of its own
     try:
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # the common base of rclpy's errors about arguments
         raise StartError(str(error)) from error
     finally:
