@@ -13,7 +13,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_estimator.local_odometry import LocalEstimate
 from ngo_estimator.nodes import messages
-from ngo_estimator.online_trajectory import TrajectoryUpdate
+from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
 
 SCAN_SHAPE, PICTURE_SHAPE = (1, 7, 4), (3, 5, 3)
 
@@ -37,21 +37,17 @@ def picture() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, PICTURE_SHAPE, dtype=np.uint8)
 
 
-def update(loops: int) -> TrajectoryUpdate:
+def update(loops: int) -> WholeTrajectory:
     """A trajectory of five frames with so many loops."""
     rng = np.random.default_rng(1)
-    return TrajectoryUpdate(
+    return WholeTrajectory(
         stamps_ns=np.arange(1, 6) * 1_500_000_001,
         poses_xyyaw=rng.normal(size=(5, 3)),
         odometry_xyyaw=rng.normal(size=(5, 3)),
+        online_xyyaw=rng.normal(size=(5, 3)),
         moved_m=rng.random(5),
         loops=np.array([[0, 4], [1, 3]])[:loops],
         loop_weights=np.array([0.25, 1.0])[:loops],
-        map_from_odom_xyyaw=np.zeros(3),
-        covariance=np.eye(3),
-        optimized=True,
-        restarted=False,
-        gap=False,
     )
 
 

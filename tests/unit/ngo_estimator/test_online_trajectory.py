@@ -1,6 +1,6 @@
 """The online trajectory: equal to the offline optimizer after every step, and unshaken by any sequence of steps."""
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from ngo_estimator.online_trajectory import (
     OnlineTrajectory,
     RejectedStep,
     RelativeStep,
+    Trajectory,
     TrajectoryUpdate,
     optimize_offline,
 )
@@ -56,6 +57,17 @@ def make_steps(count: int, seed: int = 0, origin_ns: int = 0) -> list[RelativeSt
     return result
 
 
+@dataclass(frozen=True)
+class Seen(Trajectory, TrajectoryUpdate):
+    """An update, and the whole trajectory after it."""
+
+
+def take(core: OnlineTrajectory, step: RelativeStep) -> Seen:
+    update, whole = core.update(step), core.trajectory()
+    assert whole is not None
+    return Seen(**vars(update), **vars(whole))
+
+
 def shifted(step: RelativeStep, by_ns: int) -> RelativeStep:
     return replace(step, stamp_ns=step.stamp_ns + by_ns, from_stamp_ns=step.from_stamp_ns + by_ns)
 
@@ -79,12 +91,12 @@ def assert_same_poses(a: np.ndarray, b: np.ndarray, tolerance: float = 2e-4) -> 
     np.testing.assert_allclose(np.remainder(a[:, 2] - b[:, 2] + np.pi, 2 * np.pi) - np.pi, 0.0, atol=tolerance)
 
 
-def assert_same_updates(a: TrajectoryUpdate, b: TrajectoryUpdate) -> None:
-    for field in fields(TrajectoryUpdate):
+def assert_same_updates(a: Seen, b: Seen) -> None:
+    for field in fields(Seen):
         np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), err_msg=field.name)
 
 
-def assert_sound(update: TrajectoryUpdate) -> None:
+def assert_sound(update: Seen) -> None:
     """What holds after any step."""
     count = len(update.stamps_ns)
     assert update.stamps_ns.dtype == np.int64 and (np.diff(update.stamps_ns) > 0).all()
@@ -118,7 +130,7 @@ def test_after_every_step_it_equals_the_offline_optimizer_on_the_steps_so_far(fo
     core, steps = make(form, trained), make_steps(75)
     moved = 0.0
     for count, step in enumerate(steps, start=1):
-        update = core.update(step)
+        update = take(core, step)
         assert_sound(update)
         assert update.optimized == (count % 8 == 0) and not update.restarted and not update.gap
         if count < 8:
@@ -138,7 +150,7 @@ def test_after_every_step_it_equals_the_offline_optimizer_on_the_steps_so_far(fo
 def test_moved_is_how_far_each_pose_moved() -> None:
     core, before = make(), np.zeros((1, 3))
     for step in make_steps(32):
-        update = core.update(step)
+        update = take(core, step)
         expected = np.linalg.norm(update.poses_xyyaw[:-1, :2] - before[:, :2], axis=1)
         if update.optimized:
             np.testing.assert_allclose(update.moved_m[:-1][: len(before)], expected, atol=1e-12)
@@ -150,7 +162,7 @@ def test_moved_is_how_far_each_pose_moved() -> None:
 def test_loops_join_earlier_to_later_frames() -> None:
     core = make()
     for step in make_steps(80):
-        update = core.update(step)
+        update = take(core, step)
     # The later frame is the end of a block, at least two blocks (the least separation) after the earlier one's.
     assert len(update.loops) == 8
     assert (update.loops[:, 1] % 8 == 0).all()
@@ -171,7 +183,7 @@ def test_lost_steps_are_composed_from_the_odometry(lost: slice) -> None:
     known = [step for k, step in enumerate(steps) if k not in range(40)[lost]]
     core = make(trained=False)
     for step in known:
-        update = core.update(step)
+        update = take(core, step)
         assert update.gap == (step is steps[lost.stop]) and not update.restarted
         assert_sound(update)
     expected = np.concatenate((np.zeros((1, 3)), np.stack([step.odom_xyyaw for step in known])))
@@ -182,11 +194,12 @@ def test_lost_steps_are_composed_from_the_odometry(lost: slice) -> None:
 def test_a_gap_widens_the_covariance_in_proportion_to_its_time() -> None:
     steps = make_steps(6)
     whole, gap = make(), make()
-    whole.update(steps[0])
-    gap.update(steps[0])
-    plain = whole.update(replace(steps[5], from_stamp_ns=steps[0].stamp_ns, stamp_ns=steps[1].stamp_ns))
-    wide = gap.update(
-        replace(steps[5], stamp_ns=steps[1].stamp_ns + 4 * PERIOD_NS, from_stamp_ns=steps[1].stamp_ns + 3 * PERIOD_NS)
+    take(whole, steps[0])
+    take(gap, steps[0])
+    plain = take(whole, replace(steps[5], from_stamp_ns=steps[0].stamp_ns, stamp_ns=steps[1].stamp_ns))
+    wide = take(
+        gap,
+        replace(steps[5], stamp_ns=steps[1].stamp_ns + 4 * PERIOD_NS, from_stamp_ns=steps[1].stamp_ns + 3 * PERIOD_NS),
     )
     first = steps[0].covariance[2, 2]
     assert wide.gap and not plain.gap
@@ -196,7 +209,7 @@ def test_a_gap_widens_the_covariance_in_proportion_to_its_time() -> None:
 def test_it_may_begin_in_the_middle_of_an_odometry() -> None:
     core, steps = make(trained=False), make_steps(40)
     for step in steps[12:]:
-        update = core.update(step)
+        update = take(core, step)
     assert_sound(update)
     assert len(update.stamps_ns) == 29
     start = torch.from_numpy(steps[11].odom_xyyaw)
@@ -211,7 +224,7 @@ def test_it_may_begin_in_the_middle_of_an_odometry() -> None:
 def test_a_restarted_odometry_begins_a_new_trajectory(change: str) -> None:
     core, fresh = make(), make()
     for step in make_steps(30, origin_ns=50 * RESTART_AFTER_NS):
-        core.update(step)
+        take(core, step)
     origin_ns = {"another origin, later": 60, "another origin, earlier": 20}.get(change, 0) * RESTART_AFTER_NS
     again = make_steps(20, seed=1, origin_ns=origin_ns)
     if not origin_ns:
@@ -227,7 +240,7 @@ def test_a_restarted_odometry_begins_a_new_trajectory(change: str) -> None:
             for s in again
         ]
     for k, step in enumerate(again):
-        update, expected = core.update(step), fresh.update(step)
+        update, expected = take(core, step), take(fresh, step)
         assert update.restarted == (k == 0)
         assert_same_updates(replace(update, restarted=False), expected)
 
@@ -235,10 +248,10 @@ def test_a_restarted_odometry_begins_a_new_trajectory(change: str) -> None:
 def test_reset_forgets_everything() -> None:
     core, fresh, steps = make(), make(), make_steps(20)
     for step in steps:
-        core.update(step)
+        take(core, step)
     core.reset()
     for step in steps:
-        assert_same_updates(core.update(step), fresh.update(step))
+        assert_same_updates(take(core, step), take(fresh, step))
 
 
 # ---- refused steps
@@ -281,13 +294,13 @@ def refused(step: RelativeStep) -> dict[str, RelativeStep]:
 def test_a_refused_step_leaves_no_trace(what: str, count: int) -> None:
     core, undisturbed, steps = make(), make(), make_steps(24)
     for step in steps[:count]:
-        core.update(step)
-        undisturbed.update(step)
+        take(core, step)
+        take(undisturbed, step)
     with pytest.raises(RejectedStep) as error:
         core.update(refused(steps[count])[what])
     assert "\n" not in str(error.value)
     for step in steps[count:]:
-        assert_same_updates(core.update(step), undisturbed.update(step))
+        assert_same_updates(take(core, step), take(undisturbed, step))
 
 
 @pytest.mark.parametrize(
@@ -297,14 +310,14 @@ def test_a_refused_first_step_is_not_the_first(what: str) -> None:
     core, steps = make(), make_steps(2)
     with pytest.raises(RejectedStep):
         core.update(refused(steps[0])[what])
-    assert len(core.update(steps[0]).stamps_ns) == 2
+    assert len(take(core, steps[0]).stamps_ns) == 2
 
 
 def test_without_loops_place_codes_are_of_no_account() -> None:
     core, other = make("paper"), make("paper")
     for k, step in enumerate(make_steps(17)):
         code = np.full(k % 3, np.nan, np.float32)
-        assert_same_updates(core.update(replace(step, place_code=code)), other.update(step))
+        assert_same_updates(take(core, replace(step, place_code=code)), take(other, step))
 
 
 # ---- window
@@ -315,7 +328,7 @@ def test_poses_that_have_left_the_window_stay_put() -> None:
     assert core.window_frames == 32 and core.block == 8
     history: list[np.ndarray] = []
     for count, step in enumerate(steps, start=1):
-        update = core.update(step)
+        update = take(core, step)
         assert_sound(update)
         history.append(update.poses_xyyaw)
         if update.optimized and count > 32:
@@ -331,8 +344,10 @@ def test_poses_that_have_left_the_window_stay_put() -> None:
 
 def test_within_the_window_its_size_does_not_matter() -> None:
     small, large = make(window_frames=48), make(window_frames=2000)
-    for step in make_steps(48):
-        assert_same_updates(small.update(step), large.update(step))
+    for count, step in enumerate(make_steps(48), start=1):
+        update, expected = take(small, step), take(large, step)
+        assert update.window_fill == count / 48 and expected.window_fill == count / 2000
+        assert_same_updates(replace(update, window_fill=0.0), replace(expected, window_fill=0.0))
 
 
 # ---- covariance
@@ -346,7 +361,7 @@ def test_covariance_of_a_fresh_optimizer_is_that_of_sampled_odometry(form: str) 
     if form == "loops":
         core._optimizer.loop_gate.head.bias[0] = -100.0  # no loop is believed
     for step in steps:
-        update = core.update(replace(step, covariance=np.diag(std**2)))
+        update = take(core, replace(step, covariance=np.diag(std**2)))
     relative = torch.from_numpy(np.stack([step.relative_xyyaw for step in steps]))
     noise = torch.randn(20_000, 13, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     ends = se2.r2g(relative + noise * torch.from_numpy(std))[:, -1]
@@ -359,12 +374,12 @@ def test_covariance_turns_with_the_window() -> None:
     """The same steps seen from another heading of the window's first pose."""
     core = make("paper", trained=False, window_frames=16)
     steps = make_steps(16)
-    straight = [core.update(step) for step in steps][-1].covariance
+    straight = [take(core, step) for step in steps][-1].covariance
     turned_core = make("paper", trained=False, window_frames=16)
     turn = replace(steps[0], relative_xyyaw=np.array([0.0, 0.0, np.pi / 16]))
     before = [shifted(replace(turn, odom_xyyaw=(k + 1) * turn.relative_xyyaw), k * PERIOD_NS) for k in range(8)]
     after = [shifted(step, 8 * PERIOD_NS) for step in steps]
-    turned = [turned_core.update(step) for step in (*before, *after)][-1].covariance
+    turned = [take(turned_core, step) for step in (*before, *after)][-1].covariance
     rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(turned, rotation @ straight @ rotation.T, rtol=1e-3, atol=1e-9)
 
@@ -375,7 +390,7 @@ def test_covariance_turns_with_the_window() -> None:
 def test_arrays_handed_out_never_change_and_cannot_be_written() -> None:
     core, kept = make(window_frames=64), []
     for step in make_steps(300):
-        update = core.update(step)
+        update = take(core, step)
         arrays = {name: value for name, value in vars(update).items() if isinstance(value, np.ndarray)}
         for name, value in arrays.items():
             with pytest.raises(ValueError, match="read-only"):
@@ -391,11 +406,11 @@ def test_the_callers_arrays_may_change_afterwards() -> None:
     core, other = make(), make()
     for step in make_steps(24):
         own = replace(step, **{k: v.copy() for k, v in vars(step).items() if isinstance(v, np.ndarray)})
-        update = core.update(own)
+        update = take(core, own)
         for value in vars(own).values():
             if isinstance(value, np.ndarray):
                 value[...] = 7.0
-        assert_same_updates(update, other.update(step))
+        assert_same_updates(update, take(other, step))
 
 
 # ---- any sequence of steps
@@ -443,7 +458,7 @@ def test_no_sequence_of_steps_breaks_it(plans: list[dict[str, object]], form: st
                 place_code=np.full(12, plan["feature"]),  # type: ignore[arg-type]
             )
             try:
-                update = core.update(step)
+                update = take(core, step)
             except RejectedStep:
                 continue
             assert_sound(update)
@@ -463,14 +478,15 @@ def test_the_largest_values_that_are_taken_leave_it_finite(
     core = make(form, window_frames=40)
     for k, step in enumerate(make_steps(56)):
         signs = np.array([1.0, -1.0, 1.0]) * (-1.0) ** (k // 3)
-        update = core.update(
+        update = take(
+            core,
             replace(
                 step,
                 relative_xyyaw=motion * signs + step.relative_xyyaw * (motion == 0.0),
                 covariance=variance * np.eye(3),
                 motion_feature=np.full(6, feature, np.float32),
                 place_code=np.full(12, feature, np.float32) if feature else step.place_code,
-            )
+            ),
         )
         # The odometry that is given does not fit the motion: what is checked is that all stays finite.
         assert_sound(update)

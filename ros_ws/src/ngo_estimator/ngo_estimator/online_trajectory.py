@@ -43,27 +43,47 @@ class RelativeStep:
 
 @dataclass(frozen=True)
 class TrajectoryUpdate:
-    """The trajectory after a step: ``n`` frames, the first at the origin of ``map``.
+    """What a step changed; its size does not depend on how long the trajectory is.
+
+    ``pose_xyyaw`` (3,) of the newest frame, corrected, in ``map``, whose origin is the first frame, with its
+    ``covariance`` (3, 3), as if the pose where the window begins were exact; ``map_from_odom_xyyaw`` (3,). ``frames``
+    counts all of the trajectory. ``optimized`` says whether this step ran the optimizer, ``restarted`` whether it
+    began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
+    ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
+    optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. The arrays are
+    read-only and stay as they are.
+    """
+
+    stamp_ns: int
+    pose_xyyaw: np.ndarray
+    covariance: np.ndarray
+    map_from_odom_xyyaw: np.ndarray
+    frames: int
+    optimized: bool
+    restarted: bool
+    gap: bool
+    largest_move_m: float
+    closed_loops: int
+    window_fill: float
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The whole trajectory: ``n`` frames, the first at the origin of ``map``.
 
     ``stamps_ns`` (n,) int64; ``poses_xyyaw`` (n, 3) corrected, in ``map``; ``odometry_xyyaw`` (n, 3) as the local
-    odometry has it; ``moved_m`` (n,) how far this update moved each pose; ``loops`` (e, 2) frame indices, earlier
-    first, with ``loop_weights`` (e,) of zero to one; ``map_from_odom_xyyaw`` (3,); ``covariance`` (3, 3) of the last
-    pose in ``map``, as if the pose where the window begins were exact. ``optimized`` says whether this step ran the
-    optimizer, ``restarted`` whether it began a new trajectory, ``gap`` whether steps before it were lost and composed
-    from the odometry. The arrays are read-only and stay as they are.
+    odometry has it; ``online_xyyaw`` (n, 3) each corrected pose as it was when its frame was the newest; ``moved_m``
+    (n,) how far the last step moved each pose; ``loops`` (e, 2) frame indices, earlier first, with ``loop_weights``
+    (e,) of zero to one. The arrays are read-only and stay as they are.
     """
 
     stamps_ns: np.ndarray
     poses_xyyaw: np.ndarray
     odometry_xyyaw: np.ndarray
+    online_xyyaw: np.ndarray
     moved_m: np.ndarray
     loops: np.ndarray
     loop_weights: np.ndarray
-    map_from_odom_xyyaw: np.ndarray
-    covariance: np.ndarray
-    optimized: bool
-    restarted: bool
-    gap: bool
 
 
 class OnlineTrajectory:
@@ -116,6 +136,8 @@ class OnlineTrajectory:
         self._stamps = _Rows((), np.int64)
         self._poses = _Rows((3,), np.float64)
         self._odometry = _Rows((3,), np.float64)
+        self._online = _Rows((3,), np.float64)
+        self._moved = np.zeros(0)
         self._relative = _Rows((3,), np.float32)
         self._log_std = _Rows((3,), np.float32)
         self._motion: _Rows | None = None
@@ -127,7 +149,7 @@ class OnlineTrajectory:
         self._covariance = np.zeros((3, 3))
 
     def update(self, step: RelativeStep) -> TrajectoryUpdate:
-        """Take the next step and give the whole trajectory.
+        """Take the next step.
 
         A step that begins after the last frame means lost steps: the motion between is composed from the odometry
         poses. A step of an odometry with another origin begins a new trajectory, for the motion between is unknown;
@@ -154,10 +176,25 @@ class OnlineTrajectory:
             self._begin(step)
         self._append(step, relative, np.clip(variance, *_VARIANCES))
         optimized = self._count % self._block == 0
-        moved = np.zeros(self._count + 1)
+        self._moved = np.zeros(self._count + 1)
         if optimized:
-            moved[:-1] = self._optimize()
-        return self._result(moved, optimized, restarted, gap)
+            self._moved[:-1] = self._optimize()
+        self._online.append(self._poses.values[-1])
+        return self._result(optimized, restarted, gap)
+
+    def trajectory(self) -> Trajectory | None:
+        """The whole trajectory as it is now, or None before the first step."""
+        if self._count == 0:
+            return None
+        return Trajectory(
+            stamps_ns=self._stamps.frozen(),
+            poses_xyyaw=self._poses.frozen(),
+            odometry_xyyaw=self._odometry.frozen(),
+            online_xyyaw=self._online.frozen(),
+            moved_m=_read_only(self._moved),
+            loops=_read_only(self._loops),
+            loop_weights=_read_only(self._loop_weights),
+        )
 
     def _check(self, step: RelativeStep) -> None:
         config = self._optimizer.config
@@ -201,6 +238,7 @@ class OnlineTrajectory:
         self._stamps.append(step.from_stamp_ns)
         self._poses.append(np.zeros(3))
         self._odometry.append(before.numpy())
+        self._online.append(np.zeros(3))
         self._motion = _Rows(step.motion_feature.shape, np.float32)
         self._codes = _Rows((0,) if self._pair_head is None else step.place_code.shape, np.float32)
 
@@ -247,21 +285,21 @@ class OnlineTrajectory:
             self._loop_weights = result.loop_weights[0][valid].double().numpy()
         return np.linalg.norm(self._poses.values[:-1, :2] - before[:-1, :2], axis=1)
 
-    def _result(self, moved: np.ndarray, optimized: bool, restarted: bool, gap: bool) -> TrajectoryUpdate:
-        corrected = torch.from_numpy(self._poses.values[-1].copy())
-        odom = torch.from_numpy(self._last_odom)
+    def _result(self, optimized: bool, restarted: bool, gap: bool) -> TrajectoryUpdate:
+        pose = self._poses.values[-1].copy()
+        map_from_odom = se2.compose(torch.from_numpy(pose), se2.inverse(torch.from_numpy(self._last_odom)))
         return TrajectoryUpdate(
-            stamps_ns=self._stamps.frozen(),
-            poses_xyyaw=self._poses.frozen(),
-            odometry_xyyaw=self._odometry.frozen(),
-            moved_m=_read_only(moved),
-            loops=_read_only(self._loops),
-            loop_weights=_read_only(self._loop_weights),
-            map_from_odom_xyyaw=_read_only(se2.compose(corrected, se2.inverse(odom)).numpy()),
+            stamp_ns=int(self._stamps.values[-1]),
+            pose_xyyaw=_read_only(pose),
             covariance=_read_only(0.5 * (self._covariance + self._covariance.T)),
+            map_from_odom_xyyaw=_read_only(map_from_odom.numpy()),
+            frames=self._count + 1,
             optimized=optimized,
             restarted=restarted,
             gap=gap,
+            largest_move_m=float(self._moved.max()),
+            closed_loops=int((self._loop_weights > 0.5).sum()),
+            window_fill=min(1.0, self._count / self._window),
         )
 
 

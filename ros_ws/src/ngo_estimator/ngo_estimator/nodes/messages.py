@@ -27,7 +27,8 @@ from ngo_estimator.planar_covariance import to_spatial
 
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
     from ngo_estimator.local_odometry import LocalEstimate
-    from ngo_estimator.online_trajectory import RelativeStep, TrajectoryUpdate
+    from ngo_estimator.online_trajectory import RelativeStep
+    from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
 _ENCODINGS = {"uint8": "rgb8", "float32": "32FC4"}
@@ -145,15 +146,15 @@ def planar_pose(pose_xyyaw: np.ndarray) -> Pose:
     )
 
 
-def trajectory_message(update: "TrajectoryUpdate", frame: str) -> Trajectory:
+def trajectory_message(trajectory: "WholeTrajectory", frame: str) -> Trajectory:
     """The whole trajectory in flat arrays, poses in ``frame``."""
     return Trajectory(
-        header=Header(stamp=to_time(int(update.stamps_ns[-1])), frame_id=frame),
-        stamps_ns=array("q", update.stamps_ns.astype(np.int64).tobytes()),
-        x=_doubles(update.poses_xyyaw[:, 0]),
-        y=_doubles(update.poses_xyyaw[:, 1]),
-        yaw=_doubles(update.poses_xyyaw[:, 2]),
-        moved=_doubles(update.moved_m),
+        header=Header(stamp=to_time(int(trajectory.stamps_ns[-1])), frame_id=frame),
+        stamps_ns=array("q", trajectory.stamps_ns.astype(np.int64).tobytes()),
+        x=_doubles(trajectory.poses_xyyaw[:, 0]),
+        y=_doubles(trajectory.poses_xyyaw[:, 1]),
+        yaw=_doubles(trajectory.poses_xyyaw[:, 2]),
+        moved=_doubles(trajectory.moved_m),
     )
 
 
@@ -161,17 +162,17 @@ def _doubles(values: np.ndarray) -> "array[float]":
     return array("d", values.astype(np.float64).tobytes())
 
 
-def loop_markers(update: "TrajectoryUpdate", frame: str) -> MarkerArray:
+def loop_markers(trajectory: "WholeTrajectory", frame: str) -> MarkerArray:
     """One line for each loop edge, opaque as its weight; if there is none, what deletes those shown."""
-    header = Header(stamp=to_time(int(update.stamps_ns[-1])), frame_id=frame)
+    header = Header(stamp=to_time(int(trajectory.stamps_ns[-1])), frame_id=frame)
     marker = Marker(header=header, ns="loops", type=Marker.LINE_LIST, action=Marker.ADD)
-    if len(update.loops) == 0:
+    if len(trajectory.loops) == 0:
         marker.action = Marker.DELETE
         return MarkerArray(markers=[marker])
     marker.pose.orientation.w = 1.0
     marker.scale.x = _LOOP_WIDTH_M
-    ends = update.poses_xyyaw[update.loops.reshape(-1), :2].tolist()
+    ends = trajectory.poses_xyyaw[trajectory.loops.reshape(-1), :2].tolist()
     marker.points = [Point(x=x, y=y) for x, y in ends]
-    opacities = np.repeat(np.clip(update.loop_weights, 0.0, 1.0), 2).tolist()
+    opacities = np.repeat(np.clip(trajectory.loop_weights, 0.0, 1.0), 2).tolist()
     marker.colors = [ColorRGBA(r=0.1, g=0.5, b=0.9, a=opacity) for opacity in opacities]
     return MarkerArray(markers=[marker])

@@ -74,20 +74,20 @@ class NgoNode(Node):
         self._publish(update)
 
     def _publish(self, update: "TrajectoryUpdate") -> None:
-        settings, stamp_ns = self._settings, int(update.stamps_ns[-1])
+        settings = self._settings
         if settings.publish_tf:
-            stamped = (stamp_ns, settings.map_frame, settings.odom_frame, update.map_from_odom_xyyaw)
+            stamped = (update.stamp_ns, settings.map_frame, settings.odom_frame, update.map_from_odom_xyyaw)
             self._tf.publish(messages.transform_message(*stamped))
-        self._whole.publish(update)
+        self._whole.publish(self._core, update)
         self._pose.publish(
-            messages.pose_message(stamp_ns, settings.map_frame, update.poses_xyyaw[-1], update.covariance)
+            messages.pose_message(update.stamp_ns, settings.map_frame, update.pose_xyyaw, update.covariance)
         )
 
     def _on_save(self, request: SaveTrajectory.Request, response: SaveTrajectory.Response) -> SaveTrajectory.Response:
         path = Path(request.path).expanduser().absolute()
         stamps_ns, poses_xyyaw = np.zeros(0, np.int64), np.zeros((0, 3))
-        if self._latest is not None:
-            stamps_ns, poses_xyyaw = self._latest.stamps_ns, self._latest.poses_xyyaw
+        if (trajectory := self._core.trajectory()) is not None:
+            stamps_ns, poses_xyyaw = trajectory.stamps_ns, trajectory.poses_xyyaw
         try:
             write_tum(path, stamps_ns, poses_xyyaw)
         except (ValueError, OSError) as error:
@@ -97,24 +97,24 @@ class NgoNode(Node):
         return response
 
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        frames = 0 if self._latest is None else len(self._latest.stamps_ns)
+        frames = 0 if self._latest is None else self._latest.frames
         self._core.reset()
         self._latest = None
-        self._whole.publish(None)
+        self._whole.publish(self._core, None)
         response.success, response.message = True, f"forgot {frames} poses"
         return response
 
     def _details(self) -> dict[str, str]:
         if self._latest is None:
             return {}
-        update, window = self._latest, self._settings.window_frames
+        update = self._latest
         x, y, yaw = update.map_from_odom_xyyaw.tolist()
         return {
-            "frames": str(len(update.stamps_ns)),
-            "window fill": f"{min(1.0, len(update.stamps_ns) / window):.3f}",
+            "frames": str(update.frames),
+            "window fill": f"{update.window_fill:.3f}",
             "gaps": str(self._gaps),
-            "loops": str(len(update.loops)),
-            "largest move in the last update (m)": f"{update.moved_m.max():.3f}",
+            "loops": str(update.closed_loops),
+            "largest move in the last update (m)": f"{update.largest_move_m:.3f}",
             "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",
         }
 

@@ -13,7 +13,7 @@ from ngo_estimator.nodes.messages import loop_markers, trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
 
 if TYPE_CHECKING:
-    from ngo_estimator.online_trajectory import TrajectoryUpdate
+    from ngo_estimator.online_trajectory import OnlineTrajectory, TrajectoryUpdate
 
 _DEPTH = 10
 _FIRST_POSES = 2
@@ -30,17 +30,17 @@ class TrajectoryPublishers:
         self._node = node
         self._frame_id = frame_id
         self._writer = PathWriter(frame_id)
-        self._latest: TrajectoryUpdate | None = None
+        self._core: OnlineTrajectory | None = None
         self._path = self._create(Path, path_topic)
         self._trajectory = self._create(Trajectory, trajectory_topic)
         self._loops = self._create(MarkerArray, loops_topic)
 
-    def publish(self, update: "TrajectoryUpdate | None") -> None:
-        """Publish ``update`` to those who listen or come before the next one; None: there is none."""
-        self._latest = update
+    def publish(self, core: "OnlineTrajectory", update: "TrajectoryUpdate | None") -> None:
+        """Publish the trajectory of ``core`` after ``update`` to those who listen or come before the next one."""
+        self._core = core
         # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last
         # one.
-        loops_changed = update is not None and (update.optimized or len(update.stamps_ns) == _FIRST_POSES)
+        loops_changed = update is not None and (update.optimized or update.frames == _FIRST_POSES)
         for publisher in (self._path, self._trajectory, *((self._loops,) if loops_changed else ())):
             if publisher.get_subscription_count():
                 self._send_latest(publisher)
@@ -55,12 +55,13 @@ class TrajectoryPublishers:
         return publisher
 
     def _send_latest(self, publisher: Publisher) -> None:
-        update = self._latest
-        if update is None:
+        trajectory = None if self._core is None else self._core.trajectory()
+        if trajectory is None:
             return
         if publisher is self._path:
-            publisher.publish(self._writer.write(int(update.stamps_ns[-1]), update.stamps_ns, update.poses_xyyaw))
+            stamps_ns = trajectory.stamps_ns
+            publisher.publish(self._writer.write(int(stamps_ns[-1]), stamps_ns, trajectory.poses_xyyaw))
         elif publisher is self._trajectory:
-            publisher.publish(trajectory_message(update, self._frame_id))
+            publisher.publish(trajectory_message(trajectory, self._frame_id))
         else:
-            publisher.publish(loop_markers(update, self._frame_id))
+            publisher.publish(loop_markers(trajectory, self._frame_id))
