@@ -25,7 +25,7 @@ from training import runs
 from training.featurise import features_of
 from training.metrics import TrajectoryError, trajectory_error
 from training.streams import simulate
-from training.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
+from training.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
 
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
@@ -34,7 +34,7 @@ _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 class Arguments:
     """Settings of an evaluation."""
 
-    world: Literal["maze2d", "maze3d"]
+    world: WorldName
     """World to measure in."""
     split: Literal["validation", "test"] = "validation"
     """Mazes to measure on."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from ngo_sim.episodes import Episode
 from training import runs
 from training.metrics import seen_from_first
 from training.streams import images_of, simulate
-from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, MazeSize, World, world_named
+from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, MazeSize, World, WorldName, world_named
 
 _GROUP = 8  # mazes of one size
 _MADE_WITH = "networks.json"
@@ -40,7 +40,7 @@ _BLOCK = PoseAggregationConfig(1).block
 class Arguments:
     """Settings of the feature store."""
 
-    world: Literal["maze2d", "maze3d"]
+    world: WorldName
     """World to train for."""
     trajectories: int = 960
     """Trajectories for training, each in a maze of its own that the local network has not seen."""
@@ -65,10 +65,11 @@ def features_of(world: World, episode: Episode, weights: Path, networks: tuple |
     """What the estimator makes of an episode in ``frames - 1`` steps, and the true poses after each of them."""
     local, place = networks or (load_local(weights, world.name)[0], load_place(weights, world.name)[0])
     images = images_of(world, episode)
-    actions = torch.from_numpy(episode.actions).long()
+    actions = torch.from_numpy(episode.actions).long() if world.actions else None
     parts: list[tuple[torch.Tensor, ...]] = []
-    for chunk in torch.arange(len(actions)).split(256):
-        relative, log_std, motion = local(images[chunk], images[chunk + 1], actions[chunk])
+    for chunk in torch.arange(len(images) - 1).split(256):
+        action = None if actions is None else actions[chunk]
+        relative, log_std, motion = local(images[chunk], images[chunk + 1], action)
         parts.append((relative, log_std, motion, place.encoder(images[chunk + 1])))
     relative, log_std, motion, codes = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
     return {

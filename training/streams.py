@@ -59,6 +59,13 @@ def mirrored(batch: Batch) -> Batch:
     return result
 
 
+def reversed_in_time(batch: Batch) -> Batch:
+    """Frame pairs (without actions) as a robot meets them that drives the same way backwards."""
+    origin = torch.zeros_like(batch["relative"])
+    relative = se2.between(batch["relative"], origin)
+    return {**batch, "earlier": batch["later"], "later": batch["earlier"], "relative": relative}
+
+
 @dataclass(frozen=True)
 class Share:
     """Which of the ``ranks`` processes that train together this is: each gets as many groups of mazes of its own."""
@@ -112,8 +119,8 @@ class _Stream(IterableDataset[Batch]):
 class PairStream(_Stream):
     """Batches of consecutive frames, shuffled over a group of mazes; every second batch is mirrored.
 
-    A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``, ``action`` ``(batch,)`` and ``relative``
-    ``(batch, 3)``.
+    A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``, ``relative`` ``(batch, 3)`` and, in a
+    world with actions, ``action`` ``(batch,)``. Where a world ``reverses``, time runs backwards in every fourth batch.
     """
 
     FRAMES = 401
@@ -143,9 +150,12 @@ class PairStream(_Stream):
             batch = {
                 "earlier": images[episode, step],
                 "later": images[episode, step + 1],
-                "action": actions[chosen],
                 "relative": relative[chosen],
             }
+            if self.world.actions:
+                batch["action"] = actions[chosen]
+            if self.world.reverses and count % 8 in (2, 5):
+                batch = reversed_in_time(batch)
             yield mirrored(batch) if count % 2 else batch
 
 

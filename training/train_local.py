@@ -10,7 +10,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning
 import numpy as np
@@ -25,7 +25,7 @@ from ngo_estimator.checkpoint import LOCAL, save_checkpoint
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from training import runs
 from training.streams import Batch, PairStream, Share, images_of, loader, relative_poses, simulate
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
 
 HEADING_WEIGHT = 3.0
 LIKELIHOOD_WEIGHT = 0.1
@@ -35,7 +35,7 @@ LIKELIHOOD_WEIGHT = 0.1
 class Arguments(runs.TrainerArguments):
     """Settings of a training of the local pose network."""
 
-    world: Literal["maze2d", "maze3d"]
+    world: WorldName
     """World to train for."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
@@ -68,7 +68,7 @@ class LocalTraining(lightning.LightningModule):
         self.validation: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
+        mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch.get("action"))
         pose_loss, likelihood = step_losses(mean, log_std, batch["relative"], self.network.relative_std)
         self.log_dict(
             {"pose_loss": pose_loss, "likelihood": likelihood},
@@ -81,7 +81,7 @@ class LocalTraining(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, _: int) -> None:
         with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
-            mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch["action"])
+            mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch.get("action"))
         self.validation.append((mean, log_std, batch["relative"]))
 
     def on_validation_epoch_end(self) -> None:
@@ -122,14 +122,10 @@ def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
     result = []
     for episode in simulate(world, seeds, 1000):
         images = images_of(world, episode)
-        result.append(
-            {
-                "earlier": images[:-1],
-                "later": images[1:],
-                "action": torch.from_numpy(episode.actions).long(),
-                "relative": relative_poses(episode.poses_xyyaw),
-            }
-        )
+        pairs = {"earlier": images[:-1], "later": images[1:], "relative": relative_poses(episode.poses_xyyaw)}
+        if world.actions:
+            pairs["action"] = torch.from_numpy(episode.actions).long()
+        result.append(pairs)
     return result
 
 
@@ -164,7 +160,7 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
     The deviations get a scale each that makes their mean square that of the errors.
     """
     network = network.eval()
-    parts = [network(p["earlier"], p["later"], p["action"]) for p in pairs]
+    parts = [network(p["earlier"], p["later"], p.get("action")) for p in pairs]
     estimates, log_std = (torch.cat([part[k] for part in parts]).double() for k in (0, 1))
     truth = torch.cat([p["relative"] for p in pairs]).double()
     mean, std = list(network.config.relative_mean), list(network.config.relative_std)
@@ -219,7 +215,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 @torch.no_grad()
 def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
     """``step_metrics`` of a network over episodes."""
-    parts = [network(p["earlier"], p["later"], p["action"])[:2] for p in pairs]
+    parts = [network(p["earlier"], p["later"], p.get("action"))[:2] for p in pairs]
     truth = torch.cat([p["relative"] for p in pairs])
     return step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
 

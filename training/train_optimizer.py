@@ -26,7 +26,7 @@ from training import runs
 from training.featurise import check_networks
 from training.streams import Batch, Share
 from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, fixes_of, loops_of
-from training.worlds import World, world_named
+from training.worlds import World, WorldName, world_named
 
 POSITION_SCALE = 0.1  # corridor widths: errors below count by their square, so that large ones do not rule the rest
 HEADING_SCALE = 0.02  # rad
@@ -38,7 +38,7 @@ RELATIVE_WEIGHT = 0.05
 class Arguments(runs.TrainerArguments):
     """Settings of a training of the optimizer."""
 
-    world: Literal["maze2d", "maze3d"]
+    world: WorldName
     """World to train for."""
     form: Literal["loops", "gauss_newton", "paper"] = "loops"
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""

@@ -7,7 +7,7 @@ Run again, it goes on where it was stopped. It ends with the weights written int
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning
 import torch
@@ -21,14 +21,14 @@ from ngo_estimator.checkpoint import PLACE, PlaceNetworks, save_checkpoint
 from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
 from training.streams import Batch, PlaceStream, Share, loader
-from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
 
 
 @dataclass(frozen=True)
 class Arguments(runs.TrainerArguments):
     """Settings of a training of the place encoder."""
 
-    world: Literal["maze2d", "maze3d"]
+    world: WorldName
     """World to train for."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""

@@ -1,7 +1,7 @@
-"""The two simulated worlds as training data: which mazes, which seeds, which driver."""
+"""The simulated worlds as training data: which mazes, which seeds, which driver."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -10,6 +10,9 @@ from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.images import ImageFormat
 from ngo_sim.drivers import Action
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
+from training.scans import ScannedMaze
+
+WorldName = Literal["maze2d", "maze3d", "scan"]
 
 # A maze is a function of its seed and size: these ranges never meet (tests/unit/training/test_worlds.py).
 TEST_SEEDS = range(0, 1_000)
@@ -38,12 +41,12 @@ DRAWN = MazeSize()
 class World:
     """A simulated world.
 
-    ``block_m`` is the corridor width, ``actions`` the number of discrete actions,
+    ``block_m`` is the corridor width, ``actions`` the number of discrete actions (0: networks see images alone),
     ``mirrored_actions`` what each of them becomes in a mirror, ``episode_frames`` the length of the
     paper's trajectories, ``rows`` and ``extra_openings`` the ranges (both ends included) that training mazes are
     drawn from, ``heading_limit_rad`` how far two frames of one place may be turned against each other,
     ``loop_views`` between how many pairs of frames a loop is measured. ``tables`` names the kinds of mazes that results
-    are given for.
+    are given for; ``reverses`` says that robots of its kind may drive backwards, which no driver here does.
     """
 
     name: str
@@ -58,6 +61,7 @@ class World:
     heading_limit_rad: float
     loop_views: int
     tables: dict[str, MazeSize]
+    reverses: bool = False
     actions: int = 3
     mirrored_actions: tuple[int, ...] = (Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT)
 
@@ -68,6 +72,8 @@ class World:
             changes["extra_openings"] = extra_openings
         if self.name == "maze2d":
             return Maze2D(Maze2DConfig(**changes))
+        if self.name == "scan":
+            return ScannedMaze(self.image, **changes)
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
         return Maze3D(Maze3DConfig(**changes))
@@ -122,6 +128,24 @@ WORLDS = {
         # Four frames on, at 0.24 m a frame, most pairs are out of the range that the pair head knows.
         loop_views=1,
         tables={"unseen": MazeSize()},
+    ),
+    # The 2D world as any 2D lidar sees it; corridors and paces are drawn, so lengths here are those of the middle.
+    "scan": World(
+        name="scan",
+        image=WORLD_IMAGES["scan"],
+        driver="corners",
+        block_m=1.4,
+        period_s=0.1,
+        episode_frames=2000,
+        rows=(4, 7),
+        extra_openings=(0, 8),
+        place_radius_m=0.7,
+        heading_limit_rad=np.pi,
+        loop_views=5,
+        tables={"unseen": MazeSize()},
+        reverses=True,
+        actions=0,
+        mirrored_actions=(),
     ),
 }
 

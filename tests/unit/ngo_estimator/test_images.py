@@ -10,7 +10,14 @@ from ngo_estimator.images import ImageFormat, to_network
 
 @pytest.mark.parametrize(
     "arguments",
-    [(0, 80, 3, "uint8"), (60, 7, 3, "uint8"), (60, 80, 4, "uint8"), (60, 80, 3, "float32"), (1, 9, 1, "u1")],
+    [
+        (0, 80, 3, "uint8"),
+        (60, 7, 3, "uint8"),
+        (60, 80, 4, "uint8"),
+        (60, 80, 3, "float32"),
+        (1, 9, 1, "u1"),
+        (1, 9, 2, "uint8"),
+    ],
 )
 def test_impossible_image_formats_are_refused(arguments: tuple[int, int, int, str]) -> None:
     with pytest.raises(ValueError, match="expected"):
@@ -41,8 +48,10 @@ def test_check_names_what_is_wrong() -> None:
 
 
 def test_network_input_is_channels_first_and_near_zero() -> None:
-    colour = to_network(torch.tensor([0, 255], dtype=torch.uint8).reshape(1, 1, 2, 1).expand(1, 1, 2, 3))
+    colour = to_network(
+        torch.tensor([0, 255], dtype=torch.uint8).reshape(1, 1, 2, 1).expand(1, 1, 2, 3), ImageFormat(1, 9, 3, "uint8")
+    )
     assert colour.shape == (1, 3, 1, 2) and colour.dtype == torch.float32
     assert colour[0, :, 0, 0].tolist() == [-0.5] * 3 and colour[0, :, 0, 1].tolist() == [0.5] * 3
     scan = torch.tensor([[[1.0, 0.0, 0.5, 0.3]]])  # one pixel: red 1, green 0, blue a half, 0.3 m
-    assert torch.allclose(to_network(scan).flatten(), torch.tensor([0.5, -0.5, 0.0, 0.5]))
+    assert torch.allclose(to_network(scan, WORLD_IMAGES["maze2d"]).flatten(), torch.tensor([0.5, -0.5, 0.0, 0.5]))

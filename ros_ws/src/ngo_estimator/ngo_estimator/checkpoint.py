@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import os
+import types
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,15 @@ LOCAL, PLACE, OPTIMIZER = "local_pose_network", "place_encoder", "neural_graph_o
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
+    "scan": ImageFormat(
+        height=1,
+        width=289,
+        channels=1,
+        dtype="float32",
+        field_of_view_deg=360.0,
+        depth_gain_m=1.5,
+        depth_softening_m=0.75,
+    ),
 }
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -68,6 +78,9 @@ def config_from_dict(kind: type[Config], values: Any) -> Config:
 def _from_json(hint: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast("type[Any]", hint), value)
+    if typing.get_origin(hint) is types.UnionType:  # a value or None
+        (hint,) = (one for one in typing.get_args(hint) if one is not type(None))
+        return None if value is None else _from_json(hint, value)
     if typing.get_origin(hint) is tuple:
         items = typing.get_args(hint)
         if not isinstance(value, list) or (items[-1] is not Ellipsis and len(value) != len(items)):
@@ -188,8 +201,8 @@ def write_untrained(weights: Path, world: str) -> None:
         LocalPoseConfig(
             image=image,
             width=0.125,
-            actions=3,
-            period_s=0.1 if world == "maze2d" else 2 / 35,
+            actions=0 if image.is_scan else 3,
+            period_s=2 / 35 if world == "maze3d" else 0.1,
             relative_std=std,
         )
     )

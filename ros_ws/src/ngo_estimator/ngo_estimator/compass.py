@@ -88,7 +88,7 @@ class Compass(nn.Module):
         return reading_of(both, self.config.block_m), 0.5 * (log_scale[0] + log_scale[1])
 
     def _read(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        hidden = torch.relu(self.hidden(self.convolutions(_inputs(images)).flatten(1)))
+        hidden = torch.relu(self.hidden(self.convolutions(_inputs(images, self.config.image)).flatten(1)))
         with torch.autocast(images.device.type, enabled=False):
             hidden = hidden.float()
             vectors = self.phases(hidden).unflatten(1, (5, 2))
@@ -106,13 +106,13 @@ class Compass(nn.Module):
 _CHANNELS = 6
 
 
-def _inputs(images: Tensor) -> Tensor:
+def _inputs(images: Tensor, image: ImageFormat) -> Tensor:
     """Scans ``(batch, 1, rays, 4)`` to what the convolutions see, ``(batch, _CHANNELS, rays)``.
 
     The first and second differences of nearness along the rays, scaled up so that they survive bfloat16, tell the
     directions of the walls and their edges.
     """
-    rays = to_network(images)[:, :, 0]
+    rays = to_network(images, image)[:, :, 0]
     near = pad(rays[:, 3:], (1, 1), mode="replicate")
     slope = 5.0 * (near[..., 2:] - near[..., :-2])
     bend = 50.0 * (near[..., 2:] - 2.0 * near[..., 1:-1] + near[..., :-2])

@@ -1,63 +1,174 @@
-"""How an observation becomes the input of a network."""
+"""How an observation becomes the input of a network: pictures, depth, and laser scans of any geometry."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-# Depth d (m) enters as DEPTH_NEAR / (DEPTH_SOFTENING + d): near walls, which say most about motion, get most of the
-# range.
-_DEPTH_GAIN_M = 0.6
-_DEPTH_SOFTENING_M = 0.3
+_KINDS = {
+    (1, "uint8"): "grey",
+    (3, "uint8"): "colour",
+    (1, "float32"): "depth",
+    (4, "float32"): "colour and depth",
+}
+# Neighbouring rays whose ranges differ by a larger share than this end on different surfaces, between which is nothing.
+_EDGE_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class ImageFormat:
     """Shape and type of one observation.
 
-    ``channels`` is 3 for colour, or 4 for colour (0 to 1) and depth in metres. ``dtype`` is ``uint8`` (0 to 255) or
-    ``float32``. A row scan is an image of height 1 whose first column is its leftmost ray.
+    ``channels`` and ``dtype`` are 1 (grey) or 3 (colour) of ``uint8``, 1 (depth) or 4 (colour from 0 to 1, and depth)
+    of ``float32``. Depth is in metres, ``+inf`` where nothing came back. A row scan is an image of height 1 whose first
+    column is its leftmost ray. ``field_of_view_deg`` says that the row is made from laser scans by ``scan_image``: the
+    angle from its first ray to its last, straight ahead in the middle.
+
+    Depth d enters a network as ``depth_gain_m / (depth_softening_m + d)``: near walls, which say most about motion, get
+    most of the range.
     """
 
     height: int
     width: int
     channels: int
     dtype: str
+    field_of_view_deg: float | None = None
+    depth_gain_m: float = 0.6
+    depth_softening_m: float = 0.3
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 8:
             raise ValueError(
                 f"image is {self.height} x {self.width}; expected a height of at least 1 and a width of at least 8"
             )
-        if (self.channels, self.dtype) not in ((3, "uint8"), (4, "float32")):
+        if (self.channels, self.dtype) not in _KINDS:
+            kinds = ", ".join(f"{channels} of {dtype} ({name})" for (channels, dtype), name in _KINDS.items())
+            raise ValueError(f"image has {self.channels} channels of {self.dtype}; expected one of {kinds}")
+        if not (0.0 < self.depth_gain_m < math.inf and 0.0 < self.depth_softening_m < math.inf):
             raise ValueError(
-                f"image has {self.channels} channels of {self.dtype}; expected 3 of uint8 (colour) or 4 of float32 "
-                "(colour and depth)"
+                f"depth_gain_m, depth_softening_m are {self.depth_gain_m}, {self.depth_softening_m}; "
+                "expected positive distances"
             )
+        if self.field_of_view_deg is not None:
+            if (self.height, self.channels, self.dtype) != (1, 1, "float32"):
+                raise ValueError(f"a scan is {self.shape} of {self.dtype}; expected (1, rays, 1) of float32")
+            if not 0.0 < self.field_of_view_deg <= 360.0:
+                raise ValueError(f"field_of_view_deg is {self.field_of_view_deg}; expected over 0 and at most 360")
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """``(height, width, channels)``."""
         return self.height, self.width, self.channels
 
+    @property
+    def is_scan(self) -> bool:
+        """Whether observations are made from laser scans by ``scan_image``."""
+        return self.field_of_view_deg is not None
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether the last channel is depth in metres."""
+        return self.dtype == "float32"
+
+    @property
+    def ray_angles_rad(self) -> np.ndarray:
+        """The angles of a scan's rays ``(width,)``, counter-clockwise from straight ahead, leftmost first."""
+        if self.field_of_view_deg is None:
+            raise ValueError("an image that is no scan has no ray angles; expected a field_of_view_deg")
+        half = math.radians(self.field_of_view_deg) / 2.0
+        return np.linspace(half, -half, self.width)
+
     def check(self, image: np.ndarray) -> None:
         """Raise ``ValueError`` unless ``image`` is an observation of this format with possible values."""
         if image.shape != self.shape or image.dtype != np.dtype(self.dtype):
             raise ValueError(f"image is {image.shape} of {image.dtype}; expected {self.shape} of {self.dtype}")
-        if self.dtype == "float32" and not np.isfinite(image).all():
-            raise ValueError(f"image has {int((~np.isfinite(image)).sum())} values that are not finite")
-        if self.channels == 4 and (wrong := int((image[..., 3] < 0.0).sum())):
+        if not self.has_depth:
+            return
+        colour, depth = image[..., :-1], image[..., -1]
+        if wrong := int((~np.isfinite(colour)).sum() + (np.isnan(depth) | (depth == -np.inf)).sum()):
+            raise ValueError(f"image has {wrong} values that are not finite; expected numbers, and +inf for no return")
+        if wrong := int((depth < 0.0).sum()):
             raise ValueError(f"image has {wrong} negative depths; expected metres from 0 on")
-        if self.dtype == "float32" and (wrong := int(((image[..., :3] < 0.0) | (image[..., :3] > 1.0)).sum())):
+        if not np.isfinite(depth).any():
+            raise ValueError(f"image has no return in {depth.size} depths; expected one at least")
+        if wrong := int(((colour < 0.0) | (colour > 1.0)).sum()):
             raise ValueError(f"image has {wrong} colours out of range; expected 0 to 1")
 
 
-def to_network(images: Tensor) -> Tensor:
-    """Images ``(..., height, width, channels)`` as float32 ``(..., channels, height, width)``, about -0.5 to 0.5."""
-    if images.dtype == torch.uint8:
-        values = images.float() / 255.0 - 0.5
+def to_network(images: Tensor, image: ImageFormat) -> Tensor:
+    """Observations ``(..., height, width, channels)`` as float32 ``(..., channels, height, width)`` for a network.
+
+    Colours, and depth beside them, are centred: about -0.5 to 0.5. Depth alone is not, so that rays without a return
+    enter as 0, as do the columns beyond the border.
+    """
+    if not image.has_depth:
+        return (images.float() / 255.0 - 0.5).movedim(-1, -3)
+    depth = image.depth_gain_m / (image.depth_softening_m + images[..., -1:].float())
+    if image.channels == 1:
+        return depth.movedim(-1, -3)
+    return torch.cat((images[..., :-1].float() - 0.5, depth - 0.5), dim=-1).movedim(-1, -3)
+
+
+def scan_image(
+    image: ImageFormat,
+    ranges: np.ndarray,
+    angle_min_rad: float,
+    angle_increment_rad: float,
+    range_min_m: float,
+    range_max_m: float,
+) -> np.ndarray:
+    """Resample a laser scan to the rays of a format.
+
+    Each ray gets the range of the scanner's nearest ray, interpolated towards the next one where both end on one
+    surface. Rays that the scanner does not look at, or whose range is NaN, 0, below ``range_min_m`` or above
+    ``range_max_m``, become ``+inf``. Angles count counter-clockwise from straight ahead, as in sensor_msgs/LaserScan;
+    the scanner may turn either way and begin anywhere.
+
+    Args:
+        image: the format, with a ``field_of_view_deg``.
+        ranges: ``(rays,)`` m.
+        angle_min_rad: angle of ``ranges[0]``.
+        angle_increment_rad: from each ray to the next, negative for a scanner that turns clockwise.
+        range_min_m, range_max_m: what the scanner can measure.
+
+    Returns:
+        ``(1, width, 1)`` float32.
+
+    Raises:
+        ValueError: a geometry that no scanner has.
+    """
+    ranges = np.asarray(ranges, dtype=np.float32)
+    step = abs(angle_increment_rad)
+    if ranges.ndim != 1 or len(ranges) < 2:
+        raise ValueError(f"scan has ranges of shape {ranges.shape}; expected (rays,) with two at least")
+    if not (math.isfinite(angle_min_rad) and 0.0 < step < math.pi):
+        raise ValueError(
+            f"scan has angle_min {angle_min_rad:g} and angle_increment {angle_increment_rad:g}; expected finite angles "
+            "(rad) and an increment other than 0, below pi"
+        )
+    if not 0.0 <= range_min_m < range_max_m:
+        raise ValueError(f"scan has range_min {range_min_m:g} and range_max {range_max_m:g} m; expected 0 <= min < max")
+    with np.errstate(invalid="ignore"):
+        measured = (ranges > 0.0) & (ranges >= range_min_m) & (ranges <= range_max_m) & np.isfinite(ranges)
+    ranges = np.where(measured, ranges, np.float32(np.inf))
+
+    # The place of each wanted ray among the scanner's, from half a ray before the first to just before a turn later.
+    turn = math.copysign(1.0, angle_increment_rad) * (image.ray_angles_rad - angle_min_rad)
+    place = (np.mod(turn + 0.5 * step, math.tau) - 0.5 * step) / step
+    nearest = np.floor(place + 0.5).astype(np.int64)
+    beside = nearest + np.where(place >= nearest, 1, -1)
+    count = len(ranges)
+    if count * step > math.tau - 0.5 * step:  # a whole turn: the last ray is the first one's neighbour
+        seen = np.ones(len(place), dtype=np.bool_)
+        nearest, beside_index = nearest % count, beside % count
     else:
-        depth = _DEPTH_GAIN_M / (_DEPTH_SOFTENING_M + images[..., 3:].float())
-        values = torch.cat((images[..., :3].float() - 0.5, depth - 0.5), dim=-1)
-    return values.movedim(-1, -3)
+        seen = nearest < count
+        nearest, beside_index = np.minimum(nearest, count - 1), np.clip(beside, 0, count - 1)
+    value, other = ranges[nearest], ranges[beside_index]
+    share = np.abs(place - np.floor(place + 0.5))
+    with np.errstate(invalid="ignore"):
+        together = np.abs(other - value) <= _EDGE_SHARE * np.minimum(value, other)
+        blended = np.where(together, value + share * (other - value), value)
+    return np.where(seen, blended, np.inf).astype(np.float32).reshape(1, -1, 1)

@@ -104,7 +104,7 @@ class LocalPoseNetwork(nn.Module):
         return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
 
     def _estimate(self, earlier: Tensor, later: Tensor, actions: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        frames = torch.cat((to_network(earlier), to_network(later)), dim=1)
+        frames = torch.cat([to_network(frame, self.config.image) for frame in (earlier, later)], dim=1)
         inputs = [self.convolutions(frames)]
         action_codes = []
         if actions is not None:

@@ -49,7 +49,7 @@ class PlaceEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Observations ``(batch, height, width, channels)`` to codes ``(batch, code_size)``."""
-        return self.code(self.convolutions(to_network(images))).float()
+        return self.code(self.convolutions(to_network(images, self.config.image))).float()
 
 
 class PairHead(nn.Module):
