@@ -7,7 +7,7 @@
 | ``.g2o`` | ``VERTEX_SE2`` for each pose, ``EDGE_SE2`` for each measurement between two of them |
 
 The KITTI format has no place for stamps: they lie beside it in ``NAME.times.txt``, a line each, in seconds. Its poses
-are those of the robot's base (x forward, y left), as in the other formats; KITTI's own are of a camera that looks along z.
+are those of the robot's base (x forward, y left), as in the other formats; KITTI's own are of a camera.
 """
 
 import os
