@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,7 +52,7 @@ class Scanner:
         )
 
 
-def drawn_config(rng: np.random.Generator, **size: int) -> Maze2DConfig:
+def drawn_config(rng: np.random.Generator, size: Mapping[str, int]) -> Maze2DConfig:
     """Corridors 0.8 to 2.5 m wide, and a robot in proportion that drives slowly or fast."""
     block_m = float(np.exp(rng.uniform(math.log(0.8), math.log(2.5))))
     usual = Maze2DConfig()
@@ -69,12 +70,14 @@ def drawn_config(rng: np.random.Generator, **size: int) -> Maze2DConfig:
 class ScannedMaze(gymnasium.Env[Any, Any]):
     """A Maze2D of drawn width and pace, observed as ``(width,)`` depths of a scan's format.
 
-    ``changes`` replace fields of the scanner that is drawn, and ``size`` are those of ``Maze2DConfig``. Every reset
-    needs a seed, of which all that is drawn is a function.
+    ``size`` are fields of ``Maze2DConfig``, ``changes`` replace fields of the scanner that is drawn. Every reset needs
+    a seed, of which all that is drawn is a function.
     """
 
-    def __init__(self, image: ImageFormat, changes: dict[str, Any] | None = None, **size: int) -> None:
-        self._image, self._changes, self._size = image, changes or {}, size
+    def __init__(
+        self, image: ImageFormat, size: Mapping[str, int] | None = None, changes: Mapping[str, Any] | None = None
+    ) -> None:
+        self._image, self._size, self._changes = image, size or {}, changes or {}
         self.scanner: Scanner
         self._world: Maze2D
         self.period_s = Maze2DConfig().period_s
@@ -91,7 +94,7 @@ class ScannedMaze(gymnasium.Env[Any, Any]):
         if seed is None:
             raise ValueError("reset() without a seed; expected one, from which width, pace and scanner are drawn")
         rng = np.random.default_rng((seed, _DRAWN))
-        self._world = Maze2D(drawn_config(rng, **self._size))
+        self._world = Maze2D(drawn_config(rng, self._size))
         self.scanner = dataclasses.replace(Scanner.drawn(rng), **self._changes)
         self._noise = np.random.default_rng((seed, _NOISE))
         observation, info = self._world.reset(seed=seed, options=options)

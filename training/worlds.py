@@ -73,7 +73,7 @@ class World:
         if self.name == "maze2d":
             return Maze2D(Maze2DConfig(**changes))
         if self.name == "scan":
-            return ScannedMaze(self.image, **changes)
+            return ScannedMaze(self.image, changes)
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
         return Maze3D(Maze3DConfig(**changes))

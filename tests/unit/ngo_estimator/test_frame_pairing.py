@@ -101,3 +101,54 @@ def test_bad_limits_are_errors() -> None:
         make(timeout_ns=0)
     with pytest.raises(ValueError, match="capacity 0"):
         make(capacity=0)
+
+
+def play_twists(pairing: FramePairing, *events: str) -> list[tuple[int, float | None]]:
+    """Feed `f3` (frame of step 3) and `t2.5=7` (velocity 7 m/s stamped in step 2.5); return (step, m/s) handed out."""
+    result = []
+    for event in events:
+        if event[0] == "f":
+            pairing.add_frame(int(float(event[1:]) * STEP_NS), IMAGE)
+        else:
+            when, speed = event[1:].split("=")
+            pairing.add_twist(int(float(when) * STEP_NS), np.array([float(speed), 0.0, 0.0]))
+        ready = list(pairing.ready())
+        result += [(pair.stamp_ns // STEP_NS, None if pair.twist is None else float(pair.twist[0])) for pair in ready]
+    return result
+
+
+def make_for_twists(**changes: int) -> FramePairing:
+    settings = {"timeout_ns": 10 * STEP_NS, "capacity": 64, "twist_tolerance_ns": 5 * STEP_NS, **changes}
+    return FramePairing(False, needs_twist=True, **settings)
+
+
+@pytest.mark.parametrize(
+    "order", ["f0 t0.5=1 f1 t1=3 t1.2=9", "t0=7 t0.5=1 t1=3 t1.2=9 f0 f1", "f0 f1 t0=7 t0.5=1 t1=3"]
+)
+def test_a_step_gets_the_mean_velocity_stamped_in_it(order: str) -> None:
+    assert play_twists(make_for_twists(), *order.split()) == [(0, None), (1, 2.0)]
+
+
+def test_a_velocity_that_comes_rarely_holds_until_the_next_one() -> None:
+    pairing = make_for_twists()
+    assert play_twists(pairing, "t0=4", "f0", "f1", "f2", "f3", "t3.5=6") == [(0, None), (1, 4.0), (2, 4.0), (3, 4.0)]
+    assert pairing.dropped == 0
+
+
+def test_a_velocity_that_stays_away_drops_the_frames_that_it_is_too_old_for() -> None:
+    pairing = make_for_twists(timeout_ns=2 * STEP_NS)
+    handed_out = play_twists(pairing, "t0=4", *(f"f{k}" for k in range(10)))
+    assert handed_out == [(0, None), *((k, 4.0) for k in range(1, 6))] and pairing.dropped == 2
+    assert play_twists(pairing, "t9=8") == [(9, 8.0)] and pairing.dropped == 3
+
+
+def test_velocities_of_a_restarted_source_are_its_own() -> None:
+    pairing = make_for_twists()
+    play_twists(pairing, "f100", "t100.5=5", "f101", "t101=5")
+    assert play_twists(pairing, "f0", "t0.5=1", "t1=1", "f1") == [(0, None), (1, 1.0)]
+
+
+@pytest.mark.parametrize("values", [[0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, 0.0, np.inf]])
+def test_a_velocity_that_makes_no_sense_is_refused(values: list[float]) -> None:
+    with pytest.raises(ValueError, match="expected three finite numbers"):
+        make_for_twists().add_twist(0, np.array(values))

@@ -55,3 +55,20 @@ def test_network_input_is_channels_first_and_near_zero() -> None:
     assert colour[0, :, 0, 0].tolist() == [-0.5] * 3 and colour[0, :, 0, 1].tolist() == [0.5] * 3
     scan = torch.tensor([[[1.0, 0.0, 0.5, 0.3]]])  # one pixel: red 1, green 0, blue a half, 0.3 m
     assert torch.allclose(to_network(scan, WORLD_IMAGES["maze2d"]).flatten(), torch.tensor([0.5, -0.5, 0.0, 0.5]))
+
+
+def test_grey_and_depth_images_enter_like_colour_and_like_scans() -> None:
+    grey = ImageFormat(2, 9, 1, "uint8")
+    values = to_network(torch.full((3, 2, 9, 1), 255, dtype=torch.uint8), grey)
+    assert values.shape == (3, 1, 2, 9) and (values == 0.5).all()
+    depth = ImageFormat(2, 9, 1, "float32", depth_gain_m=2.0, depth_softening_m=1.0)
+    values = to_network(torch.tensor([1.0, torch.inf]).reshape(1, 1, 2, 1), depth)
+    assert values.flatten().tolist() == [1.0, 0.0]
+
+
+def test_colour_with_a_depth_that_did_not_return_is_as_far_as_can_be() -> None:
+    image = WORLD_IMAGES["maze2d"]
+    scan = np.full((1, 241, 4), 0.5, np.float32)
+    scan[0, 0, 3] = np.inf
+    image.check(scan)
+    assert to_network(torch.from_numpy(scan), image)[:, 0, 0].tolist() == [0.0, 0.0, 0.0, -0.5]

@@ -231,6 +231,17 @@ def test_a_network_without_actions_needs_none() -> None:
     assert odometry.update(PERIOD_NS, images[1], None) is not None
 
 
+@pytest.mark.parametrize("twist", [None, np.zeros(2), np.array([0.1, np.nan, 0.0]), 0.3])
+def test_a_network_that_is_told_the_velocity_needs_it(twist: np.ndarray | None) -> None:
+    config, images = local_config("maze2d", actions=0, twist=True), frames(2)
+    odometry = LocalOdometry(LocalPoseNetwork(config), PlaceNetworks(place_config("maze2d")), "maze2d")
+    assert odometry.uses_twist and not make().uses_twist
+    odometry.update(0, images[0], None)
+    with pytest.raises(UnusableImage, match="expected three finite numbers"):
+        odometry.update(PERIOD_NS, images[1], None, twist)
+    assert odometry.update(PERIOD_NS, images[1], None, np.array([0.4, 0.0, 0.1])) is not None
+
+
 def test_a_long_drive_keeps_its_heading_wrapped() -> None:
     odometry, images = make(), frames(2)
     with torch.no_grad():

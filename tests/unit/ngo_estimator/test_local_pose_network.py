@@ -98,3 +98,27 @@ def test_the_scale_of_deviations_is_a_factor() -> None:
 def test_impossible_local_configurations_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="expected"):
         local_config("maze2d", **change)
+
+
+def test_the_velocity_matters_and_must_be_given_exactly_when_it_was_in_training() -> None:
+    images = observations("maze2d", 2)
+    told = LocalPoseNetwork(local_config("maze2d", actions=0, twist=True)).eval()
+    slow, fast = (told(images[:1], images[1:], None, torch.tensor([[v, 0.0, 0.1]]))[0] for v in (0.2, 1.0))
+    assert not torch.equal(slow, fast)
+    with pytest.raises(ValueError, match="twist is not given to a network with twist=True"):
+        told(images[:1], images[1:])
+    with pytest.raises(ValueError, match="twist is given to a network with twist=False"):
+        LocalPoseNetwork(local_config("maze2d"))(images[:1], images[1:], torch.tensor([1]), torch.zeros(1, 3))
+
+
+def test_the_velocity_is_told_in_its_own_units_and_the_mirrored_one_in_a_mirror() -> None:
+    torch.manual_seed(0)
+    images = observations("maze2d", 2)
+    network = LocalPoseNetwork(local_config("maze2d", actions=0, twist=True, symmetric=True)).eval()
+    scaled = LocalPoseNetwork(dataclasses.replace(network.config, twist_scale=(2.0, 4.0, 8.0))).eval()
+    scaled.load_state_dict(network.state_dict())
+    twist, flip = torch.tensor([[0.4, 0.1, -0.3]]), torch.tensor([1.0, -1.0, -1.0])
+    mean = network(images[:1], images[1:], None, twist)[0]
+    assert torch.allclose(scaled(images[:1], images[1:], None, twist * torch.tensor([2.0, 4.0, 8.0]))[0], mean)
+    in_the_mirror = network(images[:1].flip(-2), images[1:].flip(-2), None, twist * flip)[0]
+    assert torch.allclose(in_the_mirror, mean * flip, atol=1e-6)

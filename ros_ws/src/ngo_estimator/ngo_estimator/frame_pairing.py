@@ -1,4 +1,4 @@
-"""Pairs each frame with the action that led to it, when both arrive in any order (no ROS here)."""
+"""Pairs each frame with the action or the velocity that led to it, when they arrive in any order (no ROS here)."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -7,21 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.local_odometry import RESTART_AFTER_NS, DuplicateFrame, LateFrame
+from ngo_estimator.twist_history import TwistHistory
 
 _ACTIONS_KEPT = 4096
 
 
 @dataclass(frozen=True)
 class PairedFrame:
-    """A frame, and the action between the one before it and this one (None: not needed)."""
+    """A frame, and the action and the mean velocity ``(3,)`` between the one before and it (None: not needed)."""
 
     stamp_ns: int
     image: np.ndarray
     action: int | None
+    twist: np.ndarray | None = None
 
 
 class FramePairing:
-    """Holds frames back until the action that led to them is known.
+    """Holds frames back until the action, or the velocity, that led to them is known.
 
     An action carries the stamp of the frame at which it was taken. A frame is ready when the action of the
     last frame handed out is here; if that one is known to be lost, the first action between the two frames
@@ -29,27 +31,40 @@ class FramePairing:
     says that no action between can come any more: the frame is dropped. It is also dropped once newer frames
     are ``timeout_ns`` ahead, or more than ``capacity`` frames wait. Nothing is made up for a lost action: the
     next frame spans the gap.
+
+    Velocities are those of ``TwistHistory.mean`` between two frames, known once one from the later frame's time or
+    after it is here, or the frame has waited as long as it may.
     """
 
-    def __init__(self, needs_action: bool, timeout_ns: int, capacity: int) -> None:
+    def __init__(
+        self,
+        needs_action: bool,
+        timeout_ns: int,
+        capacity: int,
+        needs_twist: bool = False,
+        twist_tolerance_ns: int = 500_000_000,
+    ) -> None:
         if timeout_ns <= 0 or capacity < 1:
             raise ValueError(f"timeout is {timeout_ns} ns, capacity {capacity}; expected more than 0, at least 1")
         self._needs_action = needs_action
+        self._needs_twist = needs_twist
+        self._twists = TwistHistory(twist_tolerance_ns)
         self._timeout_ns = timeout_ns
         self._capacity = capacity
         self.dropped = 0
-        """Frames given up because their action did not come."""
+        """Frames given up because their action or velocity did not come."""
         self.reset()
 
     def reset(self) -> None:
-        """Forget all frames and actions; ``dropped`` goes on."""
+        """Forget all frames, actions and velocities; ``dropped`` goes on."""
+        self._twists.clear()
         self._waiting: deque[tuple[int, np.ndarray]] = deque()
         self._actions: deque[tuple[int, int]] = deque(maxlen=_ACTIONS_KEPT)
         self._last_ns: int | None = None
 
     @property
     def waiting(self) -> int:
-        """How many frames wait for their action."""
+        """How many frames wait for their action or velocity."""
         return len(self._waiting)
 
     def add_action(self, stamp_ns: int, action: int) -> None:
@@ -59,6 +74,10 @@ class FramePairing:
                 return
             self._actions.clear()
         self._actions.append((stamp_ns, action))
+
+    def add_twist(self, stamp_ns: int, twist_xyyaw: np.ndarray) -> None:
+        """Take a velocity ``(3,)`` (m/s, m/s, rad/s); raises ``ValueError`` unless it is finite."""
+        self._twists.add(stamp_ns, twist_xyyaw)
 
     def add_frame(self, stamp_ns: int, image: np.ndarray) -> None:
         """Take a frame.
@@ -78,24 +97,30 @@ class FramePairing:
             # Actions of the new run may be here already; those of the old one are further ahead.
             of_new_run = [entry for entry in self._actions if entry[0] < stamp_ns + RESTART_AFTER_NS]
             self._actions = deque(of_new_run, maxlen=_ACTIONS_KEPT)
+            self._twists.forget_from(stamp_ns + RESTART_AFTER_NS)
         self._waiting.append((stamp_ns, image))
 
     def ready(self) -> Iterator[PairedFrame]:
-        """Hand out, in order, every frame whose action is known by now."""
+        """Hand out, in order, every frame whose action and velocity are known by now."""
         while self._waiting:
             stamp_ns, image = self._waiting[0]
-            action = None
-            if self._needs_action and self._last_ns is not None:
-                action = self._action_between(self._last_ns, stamp_ns)
-                if action is None:
-                    if not self._is_lost(stamp_ns):
+            action = twist = None
+            if self._last_ns is not None:
+                if self._needs_action:
+                    action = self._action_between(self._last_ns, stamp_ns)
+                    if action is None and not self._is_lost(stamp_ns):
                         return
+                if self._needs_twist:
+                    if not self._twists.reaches(stamp_ns) and not self._has_waited(stamp_ns):
+                        return
+                    twist = self._twists.mean(self._last_ns, stamp_ns)
+                if (self._needs_action and action is None) or (self._needs_twist and twist is None):
                     self._waiting.popleft()
                     self.dropped += 1
                     continue
             self._waiting.popleft()
             self._last_ns = stamp_ns
-            yield PairedFrame(stamp_ns, image, action)
+            yield PairedFrame(stamp_ns, image, action, twist)
 
     def _action_between(self, from_ns: int, to_ns: int) -> int | None:
         """The first action in ``[from_ns, to_ns)``; older ones are of no use any more and are forgotten."""
@@ -108,6 +133,7 @@ class FramePairing:
         return None
 
     def _is_lost(self, stamp_ns: int) -> bool:
-        overtaken = bool(self._actions) and self._actions[-1][0] >= stamp_ns
-        timed_out = self._waiting[-1][0] - stamp_ns >= self._timeout_ns
-        return overtaken or timed_out or len(self._waiting) > self._capacity
+        return (bool(self._actions) and self._actions[-1][0] >= stamp_ns) or self._has_waited(stamp_ns)
+
+    def _has_waited(self, stamp_ns: int) -> bool:
+        return self._waiting[-1][0] - stamp_ns >= self._timeout_ns or len(self._waiting) > self._capacity

@@ -8,6 +8,7 @@ import torch
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local, load_place
+from ngo_estimator.images import ImageFormat
 from ngo_estimator.local_pose_network import LocalPoseNetwork
 
 RESTART_AFTER_NS = 1_000_000_000
@@ -27,7 +28,7 @@ class LateFrame(RejectedFrame):
 
 
 class UnusableImage(RejectedFrame):
-    """An image of the wrong size or type, or with values that make no sense, or an unknown action."""
+    """An image of the wrong size or type, or with values that make no sense, or an unknown action or velocity."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,11 @@ class LocalOdometry:
         return cls(network, place, place_description["world"])
 
     @property
+    def image_format(self) -> ImageFormat:
+        """What the networks take: frames must be of this format."""
+        return self._network.config.image
+
+    @property
     def image_shape(self) -> tuple[int, int, int]:
         """``(height, width, channels)`` of the frames that the networks were trained on."""
         return self._network.config.image.shape
@@ -89,6 +95,11 @@ class LocalOdometry:
         return self._network.config.actions > 0
 
     @property
+    def uses_twist(self) -> bool:
+        """Whether each frame after the first needs the mean velocity that led to it."""
+        return self._network.config.twist
+
+    @property
     def period_s(self) -> float:
         """Time between frames in training."""
         return self._network.config.period_s
@@ -100,13 +111,16 @@ class LocalOdometry:
         self._last_image = torch.empty(0)
         self._odom = torch.zeros(3, dtype=torch.float64)
 
-    def update(self, stamp_ns: int, image: np.ndarray, action: int | None) -> LocalEstimate | None:
+    def update(
+        self, stamp_ns: int, image: np.ndarray, action: int | None, twist: np.ndarray | None = None
+    ) -> LocalEstimate | None:
         """Take the next frame.
 
         Args:
             stamp_ns: time of the frame.
             image: ``image_shape`` of ``image_dtype``.
             action: the action between the last frame and this one; of no account for the first frame.
+            twist: ``(3,)`` mean velocity (m/s, m/s, rad/s) between the two, where the networks take it; likewise.
 
         Returns:
             The motion since the last frame, or None for the first one, and after the source restarted (a stamp that
@@ -137,8 +151,13 @@ class LocalOdometry:
             if action is None or not 0 <= action < self._network.config.actions:
                 raise UnusableImage(f"action is {action}; expected 0 to {self._network.config.actions - 1}")
             actions = torch.tensor([action])
+        twists = None
+        if self.uses_twist:
+            if twist is None or np.shape(twist) != (3,) or not np.isfinite(twist).all():
+                raise UnusableImage(f"twist is {twist}; expected three finite numbers (m/s, m/s, rad/s)")
+            twists = torch.tensor(np.asarray(twist)[None], dtype=torch.float32)
         with torch.inference_mode():
-            relative, log_std, feature = self._network(self._last_image, frame, actions)
+            relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
             code = self._encoder(frame)
         missed = max(0, round((stamp_ns - last) * 1e-9 / self.period_s) - 1)
         variance = torch.exp(2.0 * log_std[0].double())

@@ -16,7 +16,8 @@ class LocalPoseConfig:
 
     ``relative_mean`` and ``relative_std`` (m, m, rad) normalise the output: the network works on poses of mean 0 and
     deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of
-    discrete actions, 0 for a network that sees images alone; ``period_s`` is the time between frames in training.
+    discrete actions, 0 for none; with ``twist`` the network is told the mean velocity between the frames, which it
+    divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between frames in training.
     With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror images, in which action
     ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard deviations that the heads give.
     """
@@ -32,6 +33,8 @@ class LocalPoseConfig:
     symmetric: bool = False
     mirrored_actions: tuple[int, ...] = ()
     deviation_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    twist: bool = False
+    twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -47,6 +50,8 @@ class LocalPoseConfig:
             raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
         if min(self.deviation_scale) <= 0.0:
             raise ValueError(f"deviation_scale is {self.deviation_scale}; expected three positive numbers")
+        if min(self.twist_scale) <= 0.0:
+            raise ValueError(f"twist_scale is {self.twist_scale}; expected three positive numbers")
         if self.symmetric and sorted(self.mirrored_actions) != list(range(self.actions)):
             raise ValueError(
                 f"mirrored_actions is {self.mirrored_actions}; expected each of the {self.actions} actions once"
@@ -54,13 +59,13 @@ class LocalPoseConfig:
 
 
 class LocalPoseNetwork(nn.Module):
-    """Relative pose of a frame with respect to the one before, from the two frames and the action between them.
+    """Relative pose of a frame with respect to the one before, from the two and what is known of the step between.
 
     Two frames are stacked and passed through the convolutions of FlowNetS; one fully connected layer takes these and
-    the action; a translational and a rotational head read it. Beyond the paper each head also gives the logarithm
-    of its standard deviation, and the input of the heads is the motion feature that the pose aggregation reads. A
-    symmetric network estimates both the frames and their mirror image, in evaluation mode: errors to the left and to
-    the right then cancel wherever the two differ.
+    the action or velocity; a translational and a rotational head read it. Beyond the paper each head also gives the
+    logarithm of its standard deviation, and the input of the heads is the motion feature that the pose aggregation
+    reads. A symmetric network estimates both the frames and their mirror image, in evaluation mode: errors to the left
+    and to the right then cancel wherever the two differ.
     """
 
     def __init__(self, config: LocalPoseConfig) -> None:
@@ -68,25 +73,31 @@ class LocalPoseNetwork(nn.Module):
         self.config = config
         image = config.image
         self.convolutions = FlowNetConvolutions(2 * image.channels, (image.height, image.width), config.width)
-        self.hidden = nn.Linear(self.convolutions.output_size + config.actions, config.hidden_size)
+        told = config.actions + 3 * config.twist
+        self.hidden = nn.Linear(self.convolutions.output_size + told, config.hidden_size)
         self.feature = nn.Linear(config.hidden_size, config.feature_size)
-        self.translation = nn.Linear(config.feature_size + config.actions, 4)
-        self.rotation = nn.Linear(config.feature_size + config.actions, 2)
+        self.translation = nn.Linear(config.feature_size + told, 4)
+        self.rotation = nn.Linear(config.feature_size + told, 2)
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
         self.register_buffer("log_deviation_scale", torch.tensor(config.deviation_scale).log(), persistent=False)
         self.register_buffer("mirrored_actions", torch.tensor(config.mirrored_actions).long(), persistent=False)
+        self.register_buffer("twist_scale", torch.tensor(config.twist_scale), persistent=False)
         self.relative_mean: Tensor
         self.relative_std: Tensor
         self.log_deviation_scale: Tensor
         self.mirrored_actions: Tensor
+        self.twist_scale: Tensor
 
-    def forward(self, earlier: Tensor, later: Tensor, actions: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, earlier: Tensor, later: Tensor, actions: Tensor | None = None, twist: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Estimate relative poses.
 
         Args:
             earlier, later: observations ``(batch, height, width, channels)`` as the sensor gives them.
             actions: ``(batch,)`` int64, the action between the two, or None for a network without actions.
+            twist: ``(batch, 3)`` mean velocity (m/s, m/s, rad/s) between the two, or None for a network without.
 
         Returns:
             Relative pose ``(batch, 3)`` of the later frame in the earlier one (m, m, rad), the logarithm of its
@@ -95,23 +106,30 @@ class LocalPoseNetwork(nn.Module):
         if (actions is None) != (self.config.actions == 0):
             given = "no actions were given" if actions is None else "actions were given"
             raise ValueError(f"{given} to a network trained with {self.config.actions} actions")
+        if (twist is None) == self.config.twist:
+            raise ValueError(f"twist is {'not ' * (twist is None)}given to a network with twist={self.config.twist}")
         if self.training or not self.config.symmetric:
-            return self._estimate(earlier, later, actions)
+            return self._estimate(earlier, later, actions, twist)
         both = [torch.cat((frames, frames.flip(-2))) for frames in (earlier, later)]
         actions = actions if actions is None else torch.cat((actions, self.mirrored_actions[actions]))
-        mean, log_std, feature = (values.chunk(2) for values in self._estimate(both[0], both[1], actions))
-        flip = mean[0].new_tensor([1.0, -1.0, -1.0])
+        flip = self.relative_std.new_tensor([1.0, -1.0, -1.0])
+        twist = twist if twist is None else torch.cat((twist, twist * flip))
+        mean, log_std, feature = (values.chunk(2) for values in self._estimate(both[0], both[1], actions, twist))
         return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
 
-    def _estimate(self, earlier: Tensor, later: Tensor, actions: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _estimate(
+        self, earlier: Tensor, later: Tensor, actions: Tensor | None, twist: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         frames = torch.cat([to_network(frame, self.config.image) for frame in (earlier, later)], dim=1)
         inputs = [self.convolutions(frames)]
-        action_codes = []
+        told = []
         if actions is not None:
-            action_codes = [one_hot(actions, self.config.actions).to(frames.dtype)]
-        hidden = torch.relu(self.hidden(torch.cat(inputs + action_codes, dim=1)))
+            told.append(one_hot(actions, self.config.actions).to(frames.dtype))
+        if twist is not None:
+            told.append(twist.to(frames.dtype) / self.twist_scale)
+        hidden = torch.relu(self.hidden(torch.cat(inputs + told, dim=1)))
         feature = torch.relu(self.feature(hidden)).float()
-        heads_input = torch.cat([feature, *action_codes], dim=1)
+        heads_input = torch.cat([feature, *told], dim=1)
         translation, rotation = self.translation(heads_input).float(), self.rotation(heads_input).float()
         mean = torch.cat((translation[:, :2], rotation[:, :1]), dim=1) * self.relative_std + self.relative_mean
         log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1).clamp(-7.0, 3.0)
