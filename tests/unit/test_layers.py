@@ -19,7 +19,7 @@ ROS = ("rclpy", "builtin_interfaces", "ament_index_python", "rosidl_runtime_py",
 
 # A module may import, directly or through others, none of a later layer of its package.
 LAYERS = {
-    "ngo_recordings": [{"errors"}, {"recording", "writer"}, {"topics"}, {"frames"}],
+    "ngo_recordings": [{"errors"}, {"definitions", "images", "poses"}, {"recording", "writer"}, {"topics"}, {"frames"}],
     "ngo_sim": [{"mazes"}, {"drivers", "maze2d", "maze3d"}, {"episodes"}],
     "ngo_estimator": [
         {"se2"},

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_recordings.recording import Recording
-from ngo_recordings.topics import RecordingTopics
+from ngo_recordings.association import (
+    RESTART_NS,
+    Actions,
+    Depths,
+    Side,
+    TruePoses,
+    TrueTransforms,
+    Twists,
+    header_stamp_ns,
+)
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.images import IMAGE_TYPE, ScanGeometry, picture, with_depth
+from ngo_recordings.poses import read_tum
+from ngo_recordings.recording import Message, Recording
+from ngo_recordings.topics import TF_TYPE, RecordingTopics
 
+__all__ = ["Frame", "ScanGeometry", "frames"]
 
-@dataclass(frozen=True)
-class ScanGeometry:
-    """Of a scan whose rays run counter-clockwise from angle_min_rad; its image has them the other way round.
-
-    Column c of an image of n rays looks at ``angle_min_rad + (n - 1 - c) * angle_increment_rad`` from straight ahead,
-    counter-clockwise; angle_increment_rad is positive.
-    """
-
-    angle_min_rad: float
-    angle_increment_rad: float
-    range_min_m: float
-    range_max_m: float
+# How far the recording is read on for what belongs to an image, before the image is taken without it.
+_WAIT_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -50,9 +54,120 @@ class Frame:
 def frames(recording: Recording, topics: RecordingTopics, skipped: Counter[str] | None = None) -> Iterator[Frame]:
     """The frames of a recording in the order of its images; stamps are the recording's own and may jump.
 
-    skipped counts images that gave no frame, by the reason.
+    Reads the recording once. An image waits for what belongs to it, at most 2 s of the recording, so memory is bounded.
+
+    Args:
+        skipped: counts images that gave no frame, by the reason.
 
     Raises:
         RecordingError: an image of an encoding that is not supported, or of another size than the one before.
     """
-    raise NotImplementedError
+    return _Frames(recording, topics, Counter() if skipped is None else skipped).run()
+
+
+class _Frames:
+    """One pass over a recording."""
+
+    def __init__(self, recording: Recording, topics: RecordingTopics, skipped: Counter[str]) -> None:
+        self._recording, self._topics, self._skipped = recording, topics, skipped
+        tolerance_ns, gap_ns = round(topics.tolerance_s * 1e9), round(topics.interpolation_s * 1e9)
+        self._depth = Depths(tolerance_ns)
+        self._actions = Actions(tolerance_ns)
+        self._twists = Twists(round(topics.twist_tolerance_s * 1e9))
+        self._truth: TruePoses | TrueTransforms | None = None
+        self._sides: list[tuple[Side, tuple[str, ...]]] = []
+        if topics.depth is not None:
+            self._sides.append((self._depth, (topics.depth,)))
+        if topics.action is not None:
+            self._sides.append((self._actions, (topics.action,)))
+        if topics.twist is not None:
+            self._sides.append((self._twists, (topics.twist,)))
+        truth = topics.ground_truth
+        if truth is not None and truth.tum is not None:
+            self._truth = TruePoses(gap_ns, read_tum(truth.tum, gap_ns))
+        elif truth is not None and truth.tf is not None:
+            names = tuple(name for name, info in recording.topics.items() if info.type_name == TF_TYPE)
+            self._truth = TrueTransforms(*truth.tf, gap_ns)
+            self._sides.append((self._truth, names))
+        elif truth is not None and truth.topic is not None:
+            self._truth = TruePoses(gap_ns)
+            self._sides.append((self._truth, (truth.topic,)))
+        self._ends_ns = [max(recording.topics[name].last_ns for name in names) for _, names in self._sides]
+        self._pending: deque[Message] = deque()
+        self._newest_ns: int | None = None  # of the images that were read
+        self._before_ns: int | None = None  # of the image before the first that is pending; None: there is no step
+        self._shape: tuple[int, ...] | None = None
+
+    def run(self) -> Iterator[Frame]:
+        names = {self._topics.image, *(name for _, names in self._sides for name in names)}
+        for message in self._recording.messages(names):
+            for side, topics in self._sides:
+                if message.topic in topics:
+                    if side.restarts(message):
+                        yield from self._take_all()
+                        side.clear()
+                    side.add(message)
+            if message.topic == self._topics.image:
+                yield from self._arrived(message)
+            while self._pending and self._complete(self._pending[0], message.log_time_ns):
+                yield from self._take()
+        yield from self._take_all()
+
+    def _arrived(self, message: Message) -> Iterator[Frame]:
+        stamp_ns = header_stamp_ns(message.value)
+        if stamp_ns == 0 and self._newest_ns == 0:
+            raise RecordingError(
+                f"images of {self._topics.image} have no stamps (all are 0): the driver must stamp them, or record anew"
+            )
+        if self._newest_ns is not None and stamp_ns <= self._newest_ns - RESTART_NS:
+            yield from self._take_all()
+            self._before_ns = None
+        self._newest_ns = stamp_ns
+        self._pending.append(message)
+
+    def _complete(self, image: Message, now_ns: int) -> bool:
+        """Whether all that belongs to an image is there, or is no longer waited for."""
+        if now_ns - image.log_time_ns > _WAIT_NS:
+            return True
+        stamp_ns = header_stamp_ns(image.value)
+        return all(
+            side.knows(self._before_ns, stamp_ns) or now_ns >= end_ns
+            for (side, _), end_ns in zip(self._sides, self._ends_ns, strict=True)
+        )
+
+    def _take_all(self) -> Iterator[Frame]:
+        while self._pending:
+            yield from self._take()
+
+    def _take(self) -> Iterator[Frame]:
+        """The frame of the first image that is pending, if it gives one."""
+        message = self._pending.popleft()
+        stamp_ns, before_ns = header_stamp_ns(message.value), self._before_ns
+        self._before_ns = stamp_ns
+        type_name = self._recording.topics[message.topic].type_name
+        image, scan = picture(message.value, type_name, message.topic)
+        if self._topics.depth is not None:
+            depth = self._depth.at(stamp_ns)
+            if depth is None:
+                self._skipped["no depth within the tolerance"] += 1
+                self._before_ns = None  # no single step leads over the gap
+                return
+            image = with_depth(image, picture(depth, IMAGE_TYPE, self._topics.depth)[0], self._topics.depth)
+        if scan is None and self._shape not in (None, image.shape):
+            raise RecordingError(
+                f"the image of {message.topic} at {stamp_ns / 1e9:.9f} s is {image.shape} after images of "
+                f"{self._shape} (height, width, channels): split the recording there"
+            )
+        self._shape = image.shape
+        yield self._frame(stamp_ns, before_ns, image, scan)
+        for side, _ in self._sides:
+            side.forget_before(stamp_ns)
+
+    def _frame(self, stamp_ns: int, before_ns: int | None, image: np.ndarray, scan: ScanGeometry | None) -> Frame:
+        pose = residual = action = twist = None
+        if self._truth is not None and (true := self._truth.at(stamp_ns)) is not None:
+            pose, residual = true.planar()
+        if before_ns is not None and stamp_ns > before_ns:
+            action, twist = self._actions.step(before_ns, stamp_ns), self._twists.step(before_ns, stamp_ns)
+        return Frame(stamp_ns, image, scan, action, twist, pose, residual)
+

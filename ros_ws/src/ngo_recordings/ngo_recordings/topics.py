@@ -2,31 +2,61 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.images import COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, SCAN_TYPE, SENSOR_TYPES
 from ngo_recordings.recording import Recording
+
+ACTION_TYPE = "ngo_msgs/msg/DiscreteAction"
+ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+TWIST_TYPES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist", ODOMETRY_TYPE)
+POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+
+_NONE = "none"
+_TRUTH_NAMES = re.compile(r"ground_?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class GroundTruth:
     """Where the true poses come from: exactly one of a topic, two TF frames, or a file.
 
-    topic: of nav_msgs/Odometry or geometry_msgs/PoseStamped (also PoseWithCovarianceStamped). tf: parent and child
-    frame, looked up through the tree. tum: file in the TUM format, stamps of the same clock as the images'.
+    topic: of nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped. tf: parent and child frame,
+    looked up through the tree. tum: file in the TUM format, stamps of the same clock as the images'.
     """
 
     topic: str | None = None
     tf: tuple[str, str] | None = None
     tum: Path | None = None
 
+    def __post_init__(self) -> None:
+        if sum(field is not None for field in (self.topic, self.tf, self.tum)) != 1:
+            raise RecordingError("ground truth is exactly one of a topic, two TF frames, or a file in the TUM format")
+
     @classmethod
     def parse(cls, text: str) -> GroundTruth:
-        """From the command line: `tf:PARENT:CHILD`, a file ending in .tum or .txt, or else a topic."""
-        raise NotImplementedError
+        """From the command line: `tf:PARENT:CHILD`, a file ending in .tum or .txt, or else a topic.
+
+        Raises RecordingError for a tf: of another form.
+        """
+        if text.startswith("tf:"):
+            frames = [name.strip("/") for name in text.split(":")[1:]]
+            if len(frames) != 2 or not all(frames):
+                raise RecordingError(f"ground truth is {text!r}; expected tf:PARENT:CHILD, as in tf:map:base_link")
+            return cls(tf=(frames[0], frames[1]))
+        if text.endswith((".tum", ".txt")):
+            return cls(tum=Path(text))
+        return cls(topic=text)
 
     def __str__(self) -> str:
-        raise NotImplementedError
+        if self.tf is not None:
+            return f"tf:{self.tf[0]}:{self.tf[1]}"
+        return str(self.topic if self.tum is None else self.tum)
 
 
 @dataclass(frozen=True)
@@ -36,7 +66,7 @@ class TopicArguments:
     image: str | None = None
     """Topic of the pictures or scans: Image, CompressedImage or LaserScan."""
     depth: str | None = None
-    """Topic of a depth image (32FC1, 16UC1) that becomes one more channel of the pictures."""
+    """Topic of a depth image (32FC1, 16UC1) that becomes one more channel of the pictures; none unless given."""
     action: str | None = None
     """Topic of the actions, ngo_msgs/DiscreteAction."""
     twist: str | None = None
@@ -44,7 +74,14 @@ class TopicArguments:
     ground_truth: str | None = None
     """True poses: a topic of Odometry or PoseStamped, tf:PARENT:CHILD, or a file in the TUM format."""
     tolerance_s: float = 0.05
-    """How far the stamps of what belongs together may be apart."""
+    """How far the stamps of an image and of its action or depth may be apart, s."""
+    interpolation_s: float = 0.25
+    """True poses are interpolated between two that are at most this far apart, s."""
+    twist_tolerance_s: float = 0.5
+    """How old a velocity may be that is used for a step during which none came, s."""
+
+    def __post_init__(self) -> None:
+        _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
 
 
 @dataclass(frozen=True)
@@ -52,7 +89,7 @@ class RecordingTopics:
     """What is used for what; None: nothing. `choose_topics` makes one that fits the recording.
 
     image: Image, CompressedImage or LaserScan. depth: Image of depth, one more channel. action: DiscreteAction. twist:
-    Twist, TwistStamped or Odometry. tolerance_s: how far the stamps of what belongs together may be apart.
+    Twist, TwistStamped or Odometry. The times are those of TopicArguments.
     """
 
     image: str
@@ -61,12 +98,113 @@ class RecordingTopics:
     twist: str | None = None
     ground_truth: GroundTruth | None = None
     tolerance_s: float = 0.05
+    interpolation_s: float = 0.25
+    twist_tolerance_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
 
 
 def choose_topics(recording: Recording, given: TopicArguments | None = None) -> RecordingTopics:
     """What is given, and for the rest what the types and names of the recording's topics make clear.
 
+    Not given, the image is the only colour or grey Image, else the only CompressedImage, else the only LaserScan; the
+    action is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped;
+    the ground truth an Odometry or pose topic whose name says so. Nothing else is guessed.
+
     Raises:
-        RecordingError: a topic that is given is not there or of another type, or the image topic is not clear.
+        RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
     """
-    raise NotImplementedError
+    given = given or TopicArguments()
+    image = _given(recording, "image", given.image, SENSOR_TYPES) or _choose_image(recording)
+    action = _given(recording, "action", given.action, (ACTION_TYPE,))
+    if given.action is None:
+        action = _only(name for name in _filled(recording, (ACTION_TYPE,)) if not name.endswith("command"))
+    twist = _given(recording, "twist", given.twist, TWIST_TYPES)
+    if given.twist is None and action is None:
+        twist = _only(_filled(recording, TWIST_TYPES[:2]))
+    return RecordingTopics(
+        image=image,
+        depth=_given(recording, "depth", given.depth, (IMAGE_TYPE,)),
+        action=action,
+        twist=twist,
+        ground_truth=_choose_truth(recording, given.ground_truth),
+        tolerance_s=given.tolerance_s,
+        interpolation_s=given.interpolation_s,
+        twist_tolerance_s=given.twist_tolerance_s,
+    )
+
+
+def _given(recording: Recording, use: str, name: str | None, types: Collection[str]) -> str | None:
+    """The topic that was given for a use, if one was and it fits."""
+    if name is None or name == _NONE:
+        return None
+    # A person may leave out the slash that every topic begins with.
+    name = name if name in recording.topics or name.startswith("/") else f"/{name}"
+    if name not in recording.topics:
+        raise RecordingError(
+            f"there is no topic {name} for the {use}; of a type that fits: {_listed(_filled(recording, types))}"
+        )
+    info = recording.topics[name]
+    if info.type_name not in types:
+        raise RecordingError(
+            f"topic {name} for the {use} is {info.type_name}; expected {' or '.join(types)}: "
+            f"{_listed(_filled(recording, types))}"
+        )
+    if not info.count:
+        raise RecordingError(f"topic {name} for the {use} has no message: name another, or {_NONE}")
+    return name
+
+
+def _choose_image(recording: Recording) -> str:
+    raw = _filled(recording, (IMAGE_TYPE,))
+    coloured = [name for name in raw if _encoding(recording, name) not in DEPTH_ENCODINGS]
+    for names in (coloured, _filled(recording, (COMPRESSED_TYPE,)), _filled(recording, (SCAN_TYPE,)), raw):
+        if len(names) > 1:
+            raise RecordingError(f"several topics may be the image ({', '.join(names)}): name one (--image)")
+        if names:
+            return names[0]
+    raise RecordingError(
+        f"no topic is an image: expected {', '.join(SENSOR_TYPES)}; there are {_listed(recording.topics)}"
+    )
+
+
+def _choose_truth(recording: Recording, given: str | None) -> GroundTruth | None:
+    if given == _NONE:
+        return None
+    if given is None:
+        found = _only(name for name in _filled(recording, POSE_TYPES) if _TRUTH_NAMES.search(name))
+        return None if found is None else GroundTruth(topic=found)
+    truth = GroundTruth.parse(given)
+    if truth.topic is not None:
+        return GroundTruth(topic=_given(recording, "ground truth", truth.topic, POSE_TYPES))
+    if truth.tf is not None and not _filled(recording, (TF_TYPE,)):
+        raise RecordingError(f"ground truth is {truth}, and no topic holds transforms ({TF_TYPE})")
+    if truth.tum is not None and not truth.tum.is_file():
+        raise RecordingError(f"there is no file {truth.tum} for the ground truth")
+    return truth
+
+
+def _filled(recording: Recording, types: Collection[str]) -> list[str]:
+    """Topics of these types that have messages."""
+    return [name for name, info in recording.topics.items() if info.type_name in types and info.count]
+
+
+def _encoding(recording: Recording, name: str) -> str:
+    first = next(iter(recording.messages([name])))
+    return str(first.value.encoding)
+
+
+def _only(names: Iterable[str]) -> str | None:
+    found = list(names)
+    return found[0] if len(found) == 1 else None
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _check_times(*values: float) -> None:
+    for value in values:
+        if not 0.0 <= value < math.inf:
+            raise RecordingError(f"a tolerance is {value:g} s; expected a number of at least 0")
