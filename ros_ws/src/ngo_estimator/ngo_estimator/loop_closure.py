@@ -14,11 +14,11 @@ from ngo_estimator import se2
 from ngo_estimator.gauss_newton import pick
 from ngo_estimator.place_encoder import PairHead
 
-_VIEWS = ((0, 0), (-4, -4), (4, -4), (-2, -2), (2, -2), (-4, 0), (4, 0), (0, -3), (0, -6))
+VIEWS = ((0, 0), (-4, -4), (4, -4), (-2, -2), (2, -2), (-4, 0), (4, 0), (0, -3), (0, -6))
 """Steps from the frames of a candidate to those of its views: at the earlier frame, and at the later one."""
 
 _REWEIGHTINGS = 3
-_SMALLEST_SPREAD = 1e-4  # m or rad
+SMALLEST_SPREAD = 1e-4  # m or rad
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class LoopSearch:
                 f"per_pose, most, min_separation, min_apart are {self.per_pose}, {self.most}, {self.min_separation}, "
                 f"{self.min_apart}; expected at least 1, 1, 1, 0"
             )
-        if not 1 <= self.views <= len(_VIEWS):
-            raise ValueError(f"views is {self.views}; expected 1 to {len(_VIEWS)}")
+        if not 1 <= self.views <= len(VIEWS):
+            raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,9 @@ class Loops:
     logarithm of how far its views disagree (m, rad), ``logit`` the belief that it is the same place, ``similarity`` the
     inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false for fill. ``embeddings``
     ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
+
+    ``length`` ``(batch, loops)`` counts the meta-poses on a loop, where those between its ends stand for several each;
+    ``most_drift`` ``(batch, loops, 3)`` is how far at most its residual varies by what is known without it.
     """
 
     start: Tensor
@@ -69,6 +72,14 @@ class Loops:
     similarity: Tensor
     valid: Tensor
     embeddings: Tensor
+    length: Tensor | None = None
+    most_drift: Tensor | None = None
+
+    @property
+    def log_length(self) -> Tensor:
+        """Logarithm of how many meta-poses lie on each loop ``(batch, loops)``."""
+        length = self.end - self.start + 1 if self.length is None else self.length
+        return torch.log(length.to(self.measured.dtype))
 
     @property
     def nodes(self) -> Tensor:
@@ -99,9 +110,10 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     frame, end, logit, similarity = (value.gather(1, keep) for value in (frame, end, logit, similarity))
     measured, log_scale = pick(measured, keep), pick(log_scale, keep)
     last = end * block + block - 1
-    spread = torch.full_like(log_scale, math.log(_SMALLEST_SPREAD))
+    spread = torch.full_like(log_scale, math.log(SMALLEST_SPREAD))
     if search.views > 1:
-        measured, log_scale, spread = fused_measurements(pair_head, codes, in_blocks, frame, last, search.views)
+        seen = (measured, log_scale)
+        measured, log_scale, spread = fused_measurements(pair_head, codes, in_blocks, frame, last, search.views, seen)
     return Loops(
         # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
         start=torch.minimum(frame // block, end),
@@ -118,7 +130,13 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
 
 
 def fused_measurements(
-    pair_head: PairHead, codes: Tensor, in_blocks: Tensor, earlier: Tensor, later: Tensor, views: int
+    pair_head: PairHead,
+    codes: Tensor,
+    in_blocks: Tensor,
+    earlier: Tensor,
+    later: Tensor,
+    views: int,
+    first: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Measure each candidate from several pairs of frames near it, and fuse them robustly.
 
@@ -126,34 +144,50 @@ def fused_measurements(
 
     Args:
         earlier, later: the frames of each candidate ``(batch, loops)``.
+        first: pose and logarithm of scales of the frames themselves, where they were measured already.
 
     Returns:
-        Pose of the later frame in the earlier one ``(batch, loops, 3)``, logarithm of its scales ``(batch, loops, 2)``
-        as if the views erred independently, and logarithm of their spread ``(batch, loops, 2)``.
+        As ``fuse_views``.
     """
     steps = codes.shape[1]
     poses = _with_starts(in_blocks)
     start = pick(poses, earlier)
-    results, precisions = [], []
-    for at_earlier, at_later in _VIEWS[:views]:
+    results, log_scales = [], []
+    for number, (at_earlier, at_later) in enumerate(VIEWS[:views]):
         a = (earlier + at_earlier).clamp(0, steps - 1)
         b = (later + at_later).clamp(0, steps - 1)
-        measured, log_scale, _ = pair_head(pick(codes, a), pick(codes, b))
+        if number == 0 and first is not None:
+            measured, log_scale = first
+        else:
+            measured, log_scale, _ = pair_head(pick(codes, a), pick(codes, b))
         measured = se2.compose(se2.between(start, pick(poses, a)), measured)
         results.append(se2.compose(measured, se2.between(pick(poses, b), pick(poses, later))))
-        precisions.append(torch.exp(-2.0 * log_scale))
-    all_results, precision = torch.stack(results), torch.stack(precisions)
-    error = all_results - results[0]
+        log_scales.append(log_scale)
+    return fuse_views(torch.stack(results), torch.stack(log_scales))
+
+
+def fuse_views(measured: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Fuse measurements of the same pair of frames robustly.
+
+    Args:
+        measured: ``(views, ..., 3)``; log_scale: logarithm of their scales ``(views, ..., 2)``.
+
+    Returns:
+        Pose of the later frame in the earlier one ``(..., 3)``, logarithm of its scales ``(..., 2)`` as if the views
+        erred independently, and logarithm of their spread ``(..., 2)``.
+    """
+    precision = torch.exp(-2.0 * log_scale)
+    error = measured - measured[0]
     error = torch.cat((error[..., :2], se2.wrap(error[..., 2:])), dim=-1)
-    weight, mean = precision, torch.zeros_like(results[0])
+    weight, mean = precision, torch.zeros_like(measured[0])
     for _ in range(_REWEIGHTINGS + 1):
         by_component = weight[..., [0, 0, 1]]
         mean = (by_component * error).sum(0) / by_component.sum(0)
         left = (error - mean).square()
         squares = torch.stack((left[..., 0] + left[..., 1], left[..., 2]), dim=-1)
         weight = precision / (1.0 + 0.25 * precision * squares)
-    spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=_SMALLEST_SPREAD).log()
-    fused = results[0] + mean
+    spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=SMALLEST_SPREAD).log()
+    fused = measured[0] + mean
     return torch.cat((fused[..., :2], se2.wrap(fused[..., 2:])), dim=-1), -0.5 * weight.sum(0).log(), spread
 
 

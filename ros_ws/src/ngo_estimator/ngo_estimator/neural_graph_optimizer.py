@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ngo_estimator import se2
 from ngo_estimator.compass_closure import CompassFixes, CompassGate, compass_factors
-from ngo_estimator.gauss_newton import Factors, chain_factors, gauss_newton_step, node_covariance, pair_factors
+from ngo_estimator.gauss_newton import chain_factors, gauss_newton_step, node_covariance, pair_factors
 from ngo_estimator.loop_closure import (
     Loops,
     LoopSearch,
@@ -17,6 +17,7 @@ from ngo_estimator.loop_closure import (
     odometry_variances,
     spread_over_span,
 )
+from ngo_estimator.normal_equations import GraphStructure, NormalEquations
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import (
     PoseAggregation,
@@ -84,13 +85,26 @@ class NeuralGraphOptimizerConfig:
 
 
 @dataclass(frozen=True)
+class History:
+    """Poses from before the steps that are optimised, which move with them.
+
+    ``relative`` ``(batch, poses, 3)``: each as seen from the one before, the first from the origin; the last is where
+    the steps begin. ``std`` ``(batch, poses, 3)``: their standard deviations, along the axes of the pose before.
+    """
+
+    relative: Tensor
+    std: Tensor
+
+
+@dataclass(frozen=True)
 class OptimizedTrajectory:
     """What the optimizer gives for ``(batch, steps)``, on whole blocks of steps.
 
     ``poses`` ``(batch, steps, 3)``: corrected global poses of all frames after the origin. ``meta_relative``: one
-    ``(batch, blocks, 3)`` for each iteration, first to last. ``loops`` with ``loop_weights`` ``(batch, loops)`` of
-    the last iteration, zero to one. ``loop_information`` ``(batch, loops, 3)`` and ``step_std`` ``(batch, blocks,
-    3)``: the belief in the loops and in the relative meta-poses.
+    ``(batch, blocks, 3)`` for each iteration, first to last; a history's poses stand in front. ``loops`` with
+    ``loop_weights`` ``(batch, loops)`` of the last iteration, zero to one. ``loop_information`` ``(batch, loops, 3)``
+    and ``step_std`` ``(batch, blocks, 3)``: the belief in the loops and in the relative meta-poses. ``equations``:
+    those of the last Gauss-Newton step, where no gradient was asked for.
     """
 
     poses: Tensor
@@ -99,9 +113,13 @@ class OptimizedTrajectory:
     loop_weights: Tensor | None
     loop_information: Tensor | None
     step_std: Tensor
+    equations: NormalEquations | None = None
 
     def end_covariance(self) -> Tensor:
         """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
+        if self.equations is not None:
+            # Linearised before the last step, which was small, and all else alike.
+            return torch.from_numpy(self.equations.covariance([self.step_std.shape[1]])).unsqueeze(0)
         poses = _with_origin(se2.r2g(self.meta_relative[-1].double()))
         step_std = self.step_std.double()
         factors = [chain_factors(poses, torch.zeros_like(step_std), step_std)]
@@ -154,7 +172,7 @@ class RobustLoopGate(nn.Module):
                 loops.log_scale[..., 0],
                 loops.log_scale[..., 1],
                 *(loops.spread - loops.log_scale).unbind(-1),
-                torch.log((loops.end - loops.start + 1).to(residuals.dtype)) / 3.0,
+                loops.log_length / 3.0,
                 torch.log1p(position_error / (2.0 * position_variance)) / 3.0,
                 torch.log1p(heading_error / heading_variance) / 3.0,
                 torch.log1p(squared),
@@ -196,7 +214,7 @@ class LearnedLoopGate(nn.Module):
                 loops.logit / 5.0,
                 loops.log_scale[..., 0],
                 loops.log_scale[..., 1],
-                torch.log((loops.end - loops.start + 1).to(residuals.dtype)) / 3.0,
+                loops.log_length / 3.0,
                 torch.log1p(position_error / (2.0 * position_variance)) / 3.0,
                 torch.log1p(heading_error / heading_variance) / 3.0,
                 torch.log1p(position_error / (expected_position + 2.0 * position_variance)),
@@ -251,7 +269,7 @@ class NeuralGraphOptimizer(nn.Module):
         self.convolutions, self.norms = nn.ModuleList(), nn.ModuleList()
         for dilation in config.dilations:
             self.convolutions.append(nn.Conv1d(channels, width, 3, 1, dilation, dilation))
-            self.norms.append(_ChannelNorm(width) if config.residual else nn.Identity())
+            self.norms.append(nn.LayerNorm(width) if config.residual else nn.Identity())
             channels = width
         self.feature = nn.Conv1d(width, width, 1)
         self.gate = nn.Conv1d(width, 1, 1)
@@ -273,10 +291,10 @@ class NeuralGraphOptimizer(nn.Module):
         return torch.softmax(logits, dim=-1)
 
     def convolve(self, inputs: Tensor) -> Tensor:
-        """The optimisation phase's convolutions: ``(batch, poses, channels)`` to ``(batch, width, poses)``."""
-        hidden = normed = inputs.mT
+        """The optimisation phase's convolutions: ``(batch, poses, channels)`` to ``(batch, poses, width)``."""
+        hidden = normed = inputs
         for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            out = torch.relu(layer(normed))
+            out = torch.relu(_convolution(layer, normed))
             hidden = out + hidden if self.config.residual and out.shape == hidden.shape else out
             # Without it nine layers, run five times, let the features grow until gates and stiffness saturate.
             normed = norm(hidden)
@@ -298,6 +316,7 @@ class NeuralGraphOptimizer(nn.Module):
         motion_features: Tensor,
         loops: Loops | None = None,
         fixes: CompassFixes | None = None,
+        history: History | None = None,
     ) -> OptimizedTrajectory:
         """Optimise trajectories whose number of steps is a multiple of the block.
 
@@ -306,6 +325,7 @@ class NeuralGraphOptimizer(nn.Module):
             motion_features: ``(batch, steps, motion_feature_size)``.
             loops: what ``find_loops`` found, for an optimizer with loops.
             fixes: what ``compass_fixes`` chose, for an optimizer with a compass.
+            history: poses from before the first step; the indices of loops and fixes count them, too.
         """
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
@@ -316,37 +336,50 @@ class NeuralGraphOptimizer(nn.Module):
         in_blocks = poses_in_blocks(relative, self.block)
         odometry = in_blocks[..., -1, :]
         base_std = block_variances(in_blocks, log_std).sqrt()
+        before = 0
+        if history is not None:
+            before = history.relative.shape[1]
+            odometry = torch.cat((history.relative, odometry), dim=1)
+            base_std = torch.cat((history.std, base_std), dim=1)
         features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
         similarity = None if loops is None or features is None else loops.embeddings @ loops.embeddings.mT
         adjusted, deviation, step_std = odometry, torch.zeros_like(odometry), base_std
         lattice = None if fixes is None else fixes.lattice.double()
+        structure = self._structure(loops, odometry) if fixes is None else None
         results: list[Tensor] = []
         weights: Tensor | None = None
         information: Tensor | None = None
+        equations: NormalEquations | None = None
         for iteration in range(self.config.iterations):
             poses = _with_origin(se2.r2g(adjusted + deviation))
             inputs: list[Tensor] = []
             if loops is not None:
                 residuals = loop_residuals(loops, poses)
                 expected = odometry_variances(loops.start, loops.end + 1, poses, step_std.square()).to(poses.dtype)
+                if loops.most_drift is not None:
+                    expected = torch.minimum(expected, loops.most_drift)
                 weights, information = self.loop_gate(loops, residuals, expected, iteration)
                 spread, support = spread_over_span(loops, residuals, weights, odometry.shape[1])
-                local = torch.cat((se2.rotate(-poses[:, :-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
+                spread, support = spread[:, before:], support[:, before:]
+                local = torch.cat((se2.rotate(-poses[:, before:-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
                 # Residuals of many standard deviations are the rule at first: they enter by their logarithm.
-                inputs.append(torch.asinh(torch.cat((local, deviation), dim=-1) / self.correction_std.repeat(2)))
+                bent = torch.cat((local, deviation[:, before:]), dim=-1)
+                inputs.append(torch.asinh(bent / self.correction_std.repeat(2)))
                 inputs.append(torch.log1p(support))
             log_scale: Tensor | None = None
             if features is not None:
                 attended = self.attend(features, similarity) @ features
                 hidden = self.convolve(torch.cat([features, attended, *inputs], dim=-1))
-                beta = torch.sigmoid(self.gate(hidden)).mT
-                adjusted = adjusted + beta * self.adjustment(hidden).mT * self.correction_std
-                features = torch.relu(self.feature(hidden)).mT
-                log_scale = self.stiffness(hidden).mT if loops is not None else None
+                beta = torch.sigmoid(_convolution(self.gate, hidden))
+                adjustment = beta * _convolution(self.adjustment, hidden) * self.correction_std
+                adjusted = torch.cat((adjusted[:, :before], adjusted[:, before:] + adjustment), dim=1)
+                features = torch.relu(_convolution(self.feature, hidden))
+                log_scale = _convolution(self.stiffness, hidden) if loops is not None else None
             elif loops is not None:
                 log_scale = self.log_scale
             if loops is not None and information is not None and log_scale is not None:
-                step_std = base_std * torch.exp(3.0 * torch.tanh(log_scale / 3.0)) * self.odometry_noise
+                own = base_std[:, before:] * torch.exp(3.0 * torch.tanh(log_scale / 3.0)) * self.odometry_noise
+                step_std = torch.cat((base_std[:, :before], own), dim=1)
                 factors = [
                     chain_factors(poses.double(), deviation.double(), step_std.double()),
                     pair_factors(loops.nodes, poses.double(), residuals.double(), information.double()),
@@ -356,22 +389,35 @@ class NeuralGraphOptimizer(nn.Module):
                     drift = odometry_variances(origin, fixes.node, poses, step_std.square())
                     drift = drift * RobustLoopGate.ANNEALING ** (2 * iteration)
                     factors.append(compass_factors(fixes, self.compass_gate, lattice, poses.double(), drift))
-                change, lattice = self._closing(factors, poses.double(), lattice)
-                deviation = deviation + change.to(deviation.dtype)
+                nodes = poses.shape[1]
+                if structure is not None:
+                    equations = NormalEquations(factors, structure)
+                    step = equations.step()
+                else:
+                    step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
+                step = step if self.config.robust else self.loop_gain * step
+                deviation = deviation + _change(poses.double(), step[:, :nodes]).to(deviation.dtype)
+                lattice = None if lattice is None else lattice + step[:, nodes]
             results.append(adjusted + deviation)
-        poses = frame_poses(in_blocks, results[-1])
-        return OptimizedTrajectory(poses, results, loops, weights, information, step_std)
+        poses = frame_poses(in_blocks, results[-1][:, before:])
+        if history is not None:
+            poses = se2.compose(se2.r2g(results[-1])[:, before - 1 : before], poses)
+        return OptimizedTrajectory(poses, results, loops, weights, information, step_std, equations)
 
-    def _closing(
-        self, factors: list[Factors], poses: Tensor, lattice: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """What a Gauss-Newton step at ``poses`` adds to the relative meta-poses, and where it moves the lattice."""
-        nodes = poses.shape[1]
-        step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
-        step = step if self.config.robust else self.loop_gain * step
-        change = se2.g2r((poses + step[:, :nodes])[:, 1:]) - se2.g2r(poses[:, 1:])
-        change = torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
-        return change, None if lattice is None else lattice + step[:, nodes]
+    def _structure(self, loops: Loops | None, odometry: Tensor) -> GraphStructure | None:
+        """Of the graph that every iteration solves, where a single one is optimised and no gradient asked for."""
+        if loops is None or torch.is_grad_enabled() or odometry.shape[0] != 1 or odometry.device.type != "cpu":
+            return None
+        blocks = odometry.shape[1]
+        index = torch.arange(blocks)
+        nodes = torch.cat((torch.stack((index, index + 1), dim=-1), loops.nodes[0]))
+        return GraphStructure(nodes.numpy(), blocks + 1)
+
+
+def _change(poses: Tensor, step: Tensor) -> Tensor:
+    """What a Gauss-Newton step at global poses with the origin in front adds to the relative ones."""
+    change = se2.g2r((poses + step)[:, 1:]) - se2.g2r(poses[:, 1:])
+    return torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
 
 
 def _zero(layer: nn.Conv1d) -> nn.Conv1d:
@@ -380,11 +426,15 @@ def _zero(layer: nn.Conv1d) -> nn.Conv1d:
     return layer
 
 
-class _ChannelNorm(nn.LayerNorm):
-    """Layer normalisation over the channels of ``(batch, channels, poses)``."""
-
-    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 (the name that torch uses)
-        return super().forward(input.mT).mT
+def _convolution(layer: nn.Module, values: Tensor) -> Tensor:
+    """A convolution of ``(batch, poses, channels)`` as one product: several times as fast as dilated ones of torch."""
+    assert isinstance(layer, nn.Conv1d)
+    size, dilation = layer.kernel_size[0], layer.dilation[0]
+    if size > 1:
+        poses, reach = values.shape[1], dilation * (size // 2)
+        padded = nn.functional.pad(values, (0, 0, reach, reach))
+        values = torch.cat([padded[:, dilation * k : dilation * k + poses] for k in range(size)], dim=-1)
+    return nn.functional.linear(values, layer.weight.transpose(1, 2).flatten(1), layer.bias)
 
 
 def _with_origin(poses: Tensor) -> Tensor:
