@@ -1,12 +1,17 @@
-"""Measure a world's shipped networks on whole trajectories of a split, odometry against corrected.
+"""Measure how far estimated trajectories are from the truth.
 
     python -m training.evaluate --world maze2d --split validation
+    python -m training.evaluate --estimate odometry.tum online.tum corrected.tum --truth truth.tum
 
-The last line printed is the table as one JSON object.
+With `--world`, a world's networks drive through whole trajectories of a split: their odometry, the online estimate
+(each pose as it was first published) and the corrected one (the final path). With `--estimate`, trajectories in the TUM
+format are compared by ATE, RPE and KITTI's segment errors, as evo does. The last line printed is the table as one JSON
+object.
 """
 
 import dataclasses
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,21 +25,25 @@ from tqdm import tqdm
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
-from ngo_estimator.online_trajectory import optimize_offline
+from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep, optimize_offline
+from ngo_estimator.trajectory_errors import KITTI_LENGTHS_M, RelativeDelta
+from ngo_estimator.trajectory_report import ReportSettings
 from training import runs
+from training.evaluate_files import evaluate_files
 from training.featurise import features_of
 from training.metrics import TrajectoryError, trajectory_error
 from training.streams import simulate
 from training.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
 
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+_FEATURES = ("relative", "log_std", "motion", "codes")
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Settings of an evaluation."""
+    """Settings of an evaluation, of a world or of files."""
 
-    world: WorldName
+    world: WorldName | None = None
     """World to measure in."""
     split: Literal["validation", "test"] = "validation"
     """Mazes to measure on."""
@@ -44,39 +53,73 @@ class Arguments:
     """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/*.safetensors."""
+    online: bool = True
+    """Whether to measure the online estimate, too, which runs the optimizer at every eighth frame."""
+    estimate: tuple[Path, ...] = ()
+    """Estimated trajectories in the TUM format, to be compared with `--truth` instead of measuring in a world."""
+    truth: Path | None = None
+    """True trajectory in the TUM format."""
+    tolerance_s: float = 0.01
+    """Files: how far apart in time an estimated and a true pose of one moment may be."""
+    delta: float = 1.0
+    """Files: between poses how far apart the RPE is taken."""
+    delta_unit: Literal["frames", "metres"] = "frames"
+    """Files: what delta counts."""
+    all_pairs: bool = False
+    """Files: whether the RPE is taken from every pose, or from the end of one pair to the next."""
+    segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
+    """Files: lengths of KITTI's segments."""
+
+    def __post_init__(self) -> None:
+        if (self.world is None) == (not self.estimate) or bool(self.estimate) != (self.truth is not None):
+            raise ValueError("expected either --world, or --estimate FILES and --truth FILE")
+
+    @property
+    def report_settings(self) -> ReportSettings:
+        """What is measured of files."""
+        delta = RelativeDelta(self.delta, self.delta_unit, self.all_pairs)
+        return ReportSettings(self.tolerance_s, delta, self.segment_lengths_m)
 
 
 def main(arguments: Arguments) -> dict[str, object]:
     """Print the table and return it."""
+    if arguments.world is None:
+        assert arguments.truth is not None
+        return {**evaluate_files(arguments.estimate, arguments.truth, arguments.report_settings)}
     world = world_named(arguments.world)
     folder = arguments.weights / world.name
     local, place = load_local(folder, world.name)[0], load_place(folder, world.name)[0]
     optimizer = load_optimizer(folder, world.name)[0]
     seeds = list(_SPLITS[arguments.split][: arguments.trajectories])
     frames = arguments.frames or world.episode_frames
-    errors: dict[str, list[TrajectoryError]] = {"odometry": [], "corrected": []}
+    core = OnlineTrajectory(optimizer, place.pair_head, max(frames, 2 * optimizer.block))
+    names = ("odometry", *(("online",) if arguments.online else ()), "corrected")
+    errors: dict[str, list[TrajectoryError]] = {name: [] for name in names}
     with tqdm(total=len(seeds), desc=f"{world.name} {arguments.split}") as bar:
         for group in (seeds[i : i + 8] for i in range(0, len(seeds), 8)):
             for episode in simulate(world, group, frames):
-                arrays = {
-                    k: torch.from_numpy(v) for k, v in features_of(world, episode, folder, (local, place)).items()
+                features = features_of(world, episode, folder, (local, place))
+                arrays = [torch.from_numpy(features[name]) for name in _FEATURES]
+                corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
+                poses = {
+                    "odometry": _with_origin(se2.r2g(arrays[0]).numpy()),
+                    "corrected": _with_origin(corrected.numpy()),
                 }
-                order = ("relative", "log_std", "motion", "codes")
-                corrected = optimize_offline(optimizer, place.pair_head, *(arrays[name] for name in order)).poses[0]
-                for name, poses in (("odometry", se2.r2g(arrays["relative"])), ("corrected", corrected)):
-                    from_origin = np.concatenate((np.zeros((1, 3)), poses.numpy()))
-                    errors[name].append(trajectory_error(from_origin, episode.poses_xyyaw))
+                if arguments.online:
+                    poses["online"] = online_poses(core, features)
+                for name in names:
+                    errors[name].append(trajectory_error(poses[name], episode.poses_xyyaw))
                 bar.update()
-    table = Table(title=f"{world.name}, {len(seeds)} {arguments.split} mazes of {frames} frames: mean (median)")
-    columns = [field.name for field in dataclasses.fields(TrajectoryError)]
-    for column in ("", *columns):
-        table.add_column(column)
     result: dict[str, object] = {
         "world": world.name,
         "split": arguments.split,
         "trajectories": len(seeds),
         "frames": frames,
     }
+    table = Table(title=f"{world.name}, {len(seeds)} {arguments.split} mazes of {frames} frames: mean (median)")
+    columns = [field.name for field in dataclasses.fields(TrajectoryError)]
+    for column in ("", *columns):
+        table.add_column(column)
     for name, found in errors.items():
         values = np.array([dataclasses.astuple(error) for error in found])
         table.add_row(name, *(f"{m:.3f} ({d:.3f})" for m, d in zip(values.mean(0), np.median(values, 0), strict=True)))
@@ -90,5 +133,45 @@ def main(arguments: Arguments) -> dict[str, object]:
     return result
 
 
+def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
+    """Each pose ``(steps + 1, 3)`` as it was first published, the origin in front, of the steps in ``features``.
+
+    ``features`` are those of ``features_of``, ``core`` forgets what it held.
+    """
+    core.reset()
+    odometry = se2.r2g(torch.from_numpy(features["relative"]).double()).numpy()
+    variances = np.exp(2.0 * features["log_std"].astype(np.float64))
+    for k, relative in enumerate(features["relative"]):
+        core.update(
+            RelativeStep(
+                stamp_ns=k + 1,
+                from_stamp_ns=k,
+                relative_xyyaw=relative.astype(np.float64),
+                covariance=np.diag(variances[k]),
+                origin_stamp_ns=0,
+                odom_xyyaw=odometry[k],
+                motion_feature=features["motion"][k].astype(np.float32),
+                place_code=features["codes"][k].astype(np.float32),
+            )
+        )
+    trajectory = core.trajectory()
+    assert trajectory is not None
+    return trajectory.online_xyyaw.copy()
+
+
+def _with_origin(poses: np.ndarray) -> np.ndarray:
+    return np.concatenate((np.zeros((1, 3)), poses))
+
+
+def command_line() -> int:
+    """Run with the command line's arguments; returns the exit code, 2 with one line for what cannot be measured."""
+    try:
+        main(tyro.cli(Arguments, description=__doc__))
+    except (ValueError, OSError) as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    sys.exit(command_line())
