@@ -76,6 +76,12 @@ def test_what_is_no_measurement_has_no_return(value: float) -> None:
     assert np.isinf(seen[4]) and seen[4] > 0 and (np.delete(seen, 4) == 2.0).all()
 
 
+@pytest.mark.parametrize("range_max_m", [0.0, -1.0, math.nan])
+def test_a_greatest_range_that_the_driver_leaves_open_is_none(range_max_m: float) -> None:
+    seen = scan_image(EIGHT, np.full(9, 50.0), math.pi, -math.pi / 4, 0.1, range_max_m)
+    assert (seen == 50.0).all()
+
+
 def test_between_two_rays_one_surface_is_interpolated_and_an_edge_is_not() -> None:
     # Rays 22.5 degrees beside those of the format: each of its rays lies in the middle of two.
     ranges = np.array([2.0, 2.2, 2.0, 2.0, 4.0, 4.0, 4.0, 2.0])
@@ -114,8 +120,6 @@ def test_a_scan_is_checked() -> None:
         ({"ranges": np.ones(1)}, "two at least"),
         ({"angle_increment_rad": 0.0}, "angle_increment 0; expected"),
         ({"angle_min_rad": math.nan}, "angle_min nan"),
-        ({"range_max_m": 0.0}, "range_max 0 m; expected 0 <= min < max"),
-        ({"range_min_m": -1.0}, "range_min -1"),
     ],
 )
 def test_a_geometry_that_no_scanner_has_is_refused(change: dict[str, object], words: str) -> None:

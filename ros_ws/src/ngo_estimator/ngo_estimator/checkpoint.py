@@ -36,6 +36,7 @@ WORLD_IMAGES = {
         depth_softening_m=0.75,
     ),
 }
+ACTION_WORLDS = ("maze2d", "maze3d")
 
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config")
@@ -190,18 +191,22 @@ def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraph
     return load_network(path, OPTIMIZER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig, world)
 
 
-def write_untrained(weights: Path, world: str) -> None:
-    """Write freshly initialised networks for ``world`` into a folder: what training starts from, and tests use."""
-    if world not in WORLD_IMAGES:
-        raise ValueError(f"world is {world!r}; expected one of {sorted(WORLD_IMAGES)}")
-    image = WORLD_IMAGES[world]
+def write_untrained(weights: Path, world: str, image: ImageFormat | None = None) -> None:
+    """Write freshly initialised networks for ``world`` into a folder: what training starts from, and tests use.
+
+    ``image`` is what they take, by default that of a shipped world.
+    """
+    if image is None:
+        if world not in WORLD_IMAGES:
+            raise ValueError(f"world is {world!r}; expected one of {sorted(WORLD_IMAGES)}, or an image format")
+        image = WORLD_IMAGES[world]
     std = (0.1, 0.02, 0.05)
     details = {"training": "none: freshly initialised"}
     local = LocalPoseNetwork(
         LocalPoseConfig(
             image=image,
             width=0.125,
-            actions=0 if image.is_scan else 3,
+            actions=3 if world in ACTION_WORLDS else 0,
             period_s=2 / 35 if world == "maze3d" else 0.1,
             relative_std=std,
         )

@@ -131,7 +131,8 @@ def scan_image(
         ranges: ``(rays,)`` m.
         angle_min_rad: angle of ``ranges[0]``.
         angle_increment_rad: from each ray to the next, negative for a scanner that turns clockwise.
-        range_min_m, range_max_m: what the scanner can measure.
+        range_min_m, range_max_m: what the scanner can measure; a maximum that is not above the minimum, which some
+            drivers leave at 0, is none.
 
     Returns:
         ``(1, width, 1)`` float32.
@@ -148,10 +149,10 @@ def scan_image(
             f"scan has angle_min {angle_min_rad:g} and angle_increment {angle_increment_rad:g}; expected finite angles "
             "(rad) and an increment other than 0, below pi"
         )
-    if not 0.0 <= range_min_m < range_max_m:
-        raise ValueError(f"scan has range_min {range_min_m:g} and range_max {range_max_m:g} m; expected 0 <= min < max")
     with np.errstate(invalid="ignore"):
-        measured = (ranges > 0.0) & (ranges >= range_min_m) & (ranges <= range_max_m) & np.isfinite(ranges)
+        measured = (ranges > 0.0) & (ranges >= range_min_m) & (ranges < math.inf)
+        if range_max_m > range_min_m:
+            measured &= ranges <= range_max_m
     ranges = np.where(measured, ranges, np.float32(np.inf))
 
     # The place of each wanted ray among the scanner's, from half a ray before the first to just before a turn later.
