@@ -50,7 +50,8 @@ class SessionConfig:
             "relative_pose_depth": window["relative_pose_depth"],
         }
         return [
-            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, **window, **weights}),
+            # A path after every frame, for the latency.
+            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
             NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
         ]
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose, Trajectory
 from rclpy.serialization import deserialize_message, serialize_message
@@ -155,3 +156,42 @@ def test_loops_are_lines_between_their_poses() -> None:
 def test_without_loops_the_lines_are_deleted() -> None:
     (marker,) = messages.loop_markers(update(loops=0), "map").markers
     assert marker.action == Marker.DELETE
+
+
+def given_pose(**changes: Any) -> PoseWithCovarianceStamped:
+    """A pose as of RViz, with some fields of it changed."""
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = "map"
+    message.pose.pose = messages.planar_pose(np.array([1.0, -2.0, 3.0]))
+    message.pose.covariance[0], message.pose.covariance[7], message.pose.covariance[35] = 0.25, 0.5, 0.07
+    for path, value in changes.items():
+        *holders, name = path.split("__")
+        holder: Any = message
+        for each in holders:
+            holder = getattr(holder, each)
+        setattr(holder, name, value)
+    return message
+
+
+def test_an_initial_pose_is_read() -> None:
+    pose, covariance = messages.planar_estimate(over_the_wire(given_pose()), "map")
+    np.testing.assert_allclose(pose, [1.0, -2.0, 3.0])
+    np.testing.assert_array_equal(covariance, np.diag([0.25, 0.5, 0.07]))
+    messages.planar_estimate(given_pose(header__frame_id=""), "map")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"header__frame_id": "odom"}, "is in the frame 'odom'; expected 'map'"),
+        ({"pose__pose__position__x": float("nan")}, "has values that are not finite"),
+        ({"pose__covariance": [float("inf")] * 36}, "has values that are not finite"),
+        ({"pose__pose__orientation__w": 0.0, "pose__pose__orientation__z": 0.0}, "has an orientation of length 0"),
+        ({"pose__covariance": [-1.0] + [0.0] * 35}, "has a covariance"),
+        ({"pose__covariance": [1.0, 1.0] + [0.0] * 34}, "has a covariance"),
+    ],
+)
+def test_what_is_wrong_with_an_initial_pose_is_named(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValueError, match=f"^pose {reason}") as error:
+        messages.planar_estimate(given_pose(**changes), "map")
+    assert "\n" not in str(error.value)

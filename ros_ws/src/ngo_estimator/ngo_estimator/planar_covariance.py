@@ -32,3 +32,13 @@ def to_spatial(covariance: np.ndarray) -> np.ndarray:
     spatial = np.zeros((6, 6))
     spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
     return spatial.ravel()
+
+
+def to_planar(spatial: np.ndarray) -> np.ndarray:
+    """The covariance ``(3, 3)`` of x, y and yaw in a row-major one ``(36,)`` of x, y, z, roll, pitch, yaw."""
+    return np.asarray(spatial.reshape(6, 6)[np.ix_(_PLANAR, _PLANAR)])
+
+
+def position_std(covariance: np.ndarray) -> float:
+    """Standard deviation (m) of the position in its most uncertain direction, of a covariance ``(3, 3)``."""
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance[:2, :2])[-1])))

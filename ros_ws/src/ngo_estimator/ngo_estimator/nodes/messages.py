@@ -23,7 +23,7 @@ from std_msgs.msg import ColorRGBA, Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ngo_estimator.planar_covariance import to_spatial
+from ngo_estimator.planar_covariance import to_planar, to_spatial
 
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
     from ngo_estimator.local_odometry import LocalEstimate
@@ -127,6 +127,27 @@ def pose_message(
     message.pose.pose = planar_pose(pose_xyyaw)
     message.pose.covariance = to_spatial(covariance)
     return message
+
+
+def planar_estimate(message: PoseWithCovarianceStamped, frame: str) -> tuple[np.ndarray, np.ndarray]:
+    """The pose ``(3,)`` and its covariance ``(3, 3)`` of a message.
+
+    Raises ``ValueError`` unless it is given in ``frame`` (or in none), is finite, has an orientation, and a covariance
+    that is one.
+    """
+    if message.header.frame_id not in ("", frame):
+        raise ValueError(f"pose is in the frame '{message.header.frame_id}'; expected '{frame}'")
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    covariance = to_planar(np.array(message.pose.covariance))
+    if not np.isfinite([position.x, position.y, q.x, q.y, q.z, q.w, *covariance.ravel()]).all():
+        raise ValueError("pose has values that are not finite")
+    norm = q.x**2 + q.y**2 + q.z**2 + q.w**2
+    if not 0.5 < norm < 2.0:
+        raise ValueError(f"pose has an orientation of length {norm**0.5:g}; expected 1")
+    if np.abs(covariance - covariance.T).max() > 1e-6 or np.linalg.eigvalsh(covariance)[0] < -1e-9:
+        raise ValueError("pose has a covariance of x, y and yaw that is not symmetric and positive")
+    yaw = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), norm - 2.0 * (q.y**2 + q.z**2))
+    return np.array([position.x, position.y, yaw]), covariance
 
 
 def transform_message(stamp_ns: int, parent: str, child: str, parent_from_child: np.ndarray) -> TFMessage:

@@ -1,6 +1,10 @@
 """Node that re-optimises the whole trajectory with every relative pose, and publishes it corrected."""
 
 import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,120 +12,315 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset, SaveTrajectory
-from rclpy.node import Node
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.lifecycle import LifecycleNode, LifecyclePublisher, LifecycleState, TransitionCallbackReturn
+from rclpy.qos_overriding_options import InvalidQosOverridesError
+from rclpy.task import Future
+from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
-from ngo_estimator.nodes.parameters import declare_settings
+from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.parameters import BadParameter, LiveSettings
 from ngo_estimator.nodes.process import run_node
+from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.weights import load_core
-from ngo_estimator.trajectory_file import write_tum
+from ngo_estimator.planar_covariance import position_std
+from ngo_estimator.trajectory_file import edges_of, write_trajectory
 
 if TYPE_CHECKING:
-    from ngo_estimator.online_trajectory import TrajectoryUpdate
+    from ngo_estimator.online_trajectory import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
+_SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class NgoNode(Node):
-    """Subscribes relative poses; publishes the corrected trajectory in several forms, and map -> odom."""
+class NgoNode(LifecycleNode):
+    """Subscribes relative poses; publishes the corrected trajectory in several forms, and map -> odom.
+
+    A managed node: configured it has its networks, its topics and its services, active it takes relative poses.
+    """
 
     def __init__(self) -> None:
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
-        self._settings = settings = declare_settings(self, NgoNodeSettings)
+        self._live = LiveSettings(self, NgoNodeSettings)
+        self._live.on_change(self._on_settings)
+        self._built, self._listening = ExitStack(), ExitStack()  # what cleanup and deactivate undo
+        self._failure: Exception | None = None
+        self._inputs: list[Input] = []
+        if not self._settings.autostart:
+            self.get_logger().info("unconfigured: waits to be told, as with ros2 lifecycle set")
+
+    @property
+    def _settings(self) -> NgoNodeSettings:
+        return self._live.values
+
+    def start(self) -> "NgoNode":
+        """Configure and activate, where ``autostart`` says so; raises what keeps the node from starting."""
+        if self._settings.autostart:
+            for transition in (self.trigger_configure, self.trigger_activate):
+                if transition() != _SUCCESS and self._failure is not None:
+                    raise self._failure
+        return self
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load the networks, make topics and services."""
+        return self._attempt(self._configure, self._built)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to take relative poses."""
+        super().on_activate(state)
+        return self._attempt(self._listen, self._listening)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take no more; what comes meanwhile is a gap that the odometry bridges."""
+        self._listening.close()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the trajectory and the networks."""
+        self._built.close()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End everything."""
+        self._listening.close()
+        self._built.close()
+        return super().on_shutdown(state)
+
+    def _attempt(self, work: Callable[[], None], undo: ExitStack) -> TransitionCallbackReturn:
+        """Do the work of a transition; one that fails is undone, and its reason said in one line."""
+        try:
+            work()
+        except Exception as error:  # rclpy itself would say nothing about it
+            undo.close()
+            self._failure = error
+            if not self._settings.autostart:
+                self.get_logger().error(" ".join(str(error).split()) or repr(error))
+            return _FAILURE
+        return _SUCCESS
+
+    def _configure(self) -> None:
+        settings, built = self._settings, self._built
         # Imported here because torch takes seconds: a bad parameter is said at once.
+        from ngo_estimator.map_origin import MapOrigin
         from ngo_estimator.online_trajectory import OnlineTrajectory
+        from ngo_estimator.tf_smoothing import SmoothedCorrection
 
         self._core = load_core(
             lambda folder, world: OnlineTrajectory.load(folder, settings.window_frames, world), settings
         )
-        self._latest: TrajectoryUpdate | None = None
-        self._gaps = 0
-        self._status = NodeStatus(self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, settings.pose_topic, _DEPTH)
-        self._whole = TrajectoryPublishers(
-            self, settings.map_frame, settings.path_topic, settings.trajectory_topic, settings.loops_topic
+        self._origin_of = MapOrigin
+        self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
+        self._paused = False
+        self._gaps = self._restarts = self._new_gaps = 0
+        self._begin_anew()
+        self._live.lock()
+        built.callback(self._live.lock, False)
+        try:
+            self._create_outputs(settings)
+        except InvalidQosOverridesError as error:
+            raise BadParameter(str(error)) from error
+        self._files = built.enter_context(ThreadPoolExecutor(1))
+        for kind, name, callback, group in (
+            # One of its own: while a file is written, the others go on.
+            (SaveTrajectory, "~/save_trajectory", self._on_save, MutuallyExclusiveCallbackGroup()),
+            (Reset, "~/reset", self._on_reset, None),
+            (SetBool, "~/pause", self._on_pause, None),
+        ):
+            built.callback(self.destroy_service, self.create_service(kind, name, callback, callback_group=group))
+
+    def _create_outputs(self, settings: NgoNodeSettings) -> None:
+        self._status = NodeStatus(
+            self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
         )
+        self._status.idle = "inactive"
+        self._built.callback(self._status.close)
+        self._pose = self._publisher(PoseWithCovarianceStamped, settings.pose_topic)
+        self._whole = TrajectoryPublishers(self, settings, self._trajectory)
+        self._built.callback(self._whole.close)
         if settings.publish_tf:
-            self._tf = self.create_publisher(TFMessage, settings.tf_topic, _DEPTH)
-        self.create_service(SaveTrajectory, "~/save_trajectory", self._on_save)
-        self.create_service(Reset, "~/reset", self._on_reset)
-        self.create_subscription(
-            RelativePose, settings.relative_pose_topic, self._on_relative_pose, settings.relative_pose_depth
-        )
+            self._tf = self._publisher(TFMessage, settings.tf_topic)
+
+    def _publisher(self, message_type: type, topic: str) -> LifecyclePublisher:
+        publisher = self.create_lifecycle_publisher(message_type, topic, _DEPTH, qos_overriding_options=overridable())
+        self._built.callback(self.destroy_lifecycle_publisher, publisher)
+        return publisher
+
+    def _listen(self) -> None:
+        settings, listening = self._settings, self._listening
+        try:
+            steps = Input(
+                self,
+                self._status,
+                RelativePose,
+                settings.relative_pose_topic,
+                settings.relative_pose_depth,
+                self._on_relative_pose,
+                lambda message: messages.to_ns(message.origin_stamp),
+                settings.source_timeout_s,
+            )
+            listening.callback(steps.close)
+            initial = self.create_subscription(
+                PoseWithCovarianceStamped,
+                settings.initial_pose_topic,
+                self._on_initial_pose,
+                _DEPTH,
+                qos_overriding_options=overridable(),
+            )
+            listening.callback(self.destroy_subscription, initial)
+        except InvalidQosOverridesError as error:
+            raise BadParameter(str(error)) from error
+        self._inputs = [steps]
+        listening.callback(self._inputs.clear)
+        self._status.idle = ""
+        listening.callback(setattr, self._status, "idle", "inactive")
         self.get_logger().info(f"ready: {settings.world}, the last {settings.window_frames} frames")
 
+    def _begin_anew(self) -> None:
+        """What belongs to one trajectory."""
+        self._latest: TrajectoryUpdate | None = None
+        self._last_correction_m = 0.0
+        self._origin = self._origin_of.of_first_pose(np.array(self._settings.initial_pose))
+        self._smoothing.reset()
+
     def _on_relative_pose(self, message: RelativePose) -> None:
+        step = messages.relative_step(message)
         try:
-            step = messages.relative_step(message)
-            with self._status.timed():
+            with self._status.timed("time an update"):
                 update = self._core.update(step)
         except ValueError as error:
             self._status.dropped("relative pose", error)
             return
         self._status.received(step.stamp_ns)
         if update.restarted:
+            self._begin_anew()
+            self._restarts += 1
             self.get_logger().info(
-                "the relative poses have a new origin: their source restarted, so the map starts anew "
-                "(again and again: two local estimators publish on one topic)"
+                "the relative poses have a new origin: their source restarted, so the map starts anew"
             )
         self._gaps += update.gap
+        self._new_gaps += update.gap
+        if update.optimized:
+            self._last_correction_m = update.largest_move_m
+        begins = self._latest is None
         self._latest = update
-        self._publish(update)
+        self._publish(update, step.odom_xyyaw)
+        # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last one.
+        self._whole.changed(loops=update.optimized or begins)
 
-    def _publish(self, update: "TrajectoryUpdate") -> None:
-        settings = self._settings
+    def _publish(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
+        settings, stamp_ns, origin = self._settings, update.stamp_ns, self._origin
+        map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
         if settings.publish_tf:
-            stamped = (update.stamp_ns, settings.map_frame, settings.odom_frame, update.map_from_odom_xyyaw)
-            self._tf.publish(messages.transform_message(*stamped))
-        self._whole.publish(self._core, update)
-        self._pose.publish(
-            messages.pose_message(update.stamp_ns, settings.map_frame, update.pose_xyyaw, update.covariance)
-        )
+            newest = origin.poses(update.map_from_odom_xyyaw)
+            map_from_odom = self._smoothing.update(stamp_ns, newest, odom_xyyaw)
+            self._tf.publish(messages.transform_message(stamp_ns, map_frame, odom_frame, map_from_odom))
+        pose = origin.poses(update.pose_xyyaw)
+        covariance = origin.covariance_of(pose, update.covariance)
+        self._pose.publish(messages.pose_message(stamp_ns, map_frame, pose, covariance))
 
-    def _on_save(self, request: SaveTrajectory.Request, response: SaveTrajectory.Response) -> SaveTrajectory.Response:
-        path = Path(request.path).expanduser().absolute()
-        stamps_ns, poses_xyyaw = np.zeros(0, np.int64), np.zeros((0, 3))
-        if (trajectory := self._core.trajectory()) is not None:
-            stamps_ns, poses_xyyaw = trajectory.stamps_ns, trajectory.poses_xyyaw
+    def _trajectory(self) -> "Trajectory | None":
+        """The whole trajectory, with its poses in map."""
+        trajectory = self._core.trajectory()
+        return trajectory and replace(trajectory, poses_xyyaw=self._origin.poses(trajectory.poses_xyyaw))
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         try:
-            write_tum(path, stamps_ns, poses_xyyaw)
-        except (ValueError, OSError) as error:
-            response.success, response.message = False, str(error)
-        else:
-            response.success, response.message = True, f"wrote {len(stamps_ns)} poses to {path}"
+            given = messages.planar_estimate(message, self._settings.framed(self._settings.map_frame))
+        except ValueError as error:
+            self._status.dropped("initial pose", error)
+            return
+        own = np.zeros(3) if self._latest is None else self._latest.pose_xyyaw
+        self._origin = self._origin_of.of_pose(own, *given)
+        self._smoothing.reset()
+        x, y, yaw = given[0].tolist()
+        self.get_logger().info(f"the robot is at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad: the map moves with it")
+        if self._latest is not None:
+            self._whole.changed(loops=True)
+
+    async def _on_save(
+        self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
+    ) -> SaveTrajectory.Response:
+        """Have a thread write the file: relative poses go on meanwhile."""
+        path, trajectory = Path(request.path).expanduser().absolute(), self._trajectory()
+        done, executor = Future(), self.executor
+
+        def write() -> None:
+            done.set_result(_written(path, trajectory))
+            executor.wake()
+
+        self._files.submit(write)
+        response.success, response.message = await done
         return response
 
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
         frames = 0 if self._latest is None else self._latest.frames
         self._core.reset()
-        self._latest = None
-        self._whole.publish(self._core, None)
+        self._begin_anew()
         response.success, response.message = True, f"forgot {frames} poses"
         return response
 
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused = request.data
+        response.success = True
+        response.message = "paused: poses follow the odometry" if self._paused else "corrections go on"
+        return response
+
+    def _on_settings(self, settings: NgoNodeSettings) -> None:
+        if not self._inputs:
+            return
+        self._status.set_period(settings.diagnostics_period_s)
+        self._whole.set_rate(settings.path_rate_hz)
+        self._smoothing.time_constant_s = settings.tf_smoothing_s
+        for entry in self._inputs:
+            entry.set_timeout(settings.source_timeout_s)
+
     def _details(self) -> dict[str, str]:
+        values = {"paused": str(self._paused).lower(), "gaps": str(self._gaps), "restarts": str(self._restarts)}
         if self._latest is None:
-            return {}
+            return values
         update = self._latest
-        x, y, yaw = update.map_from_odom_xyyaw.tolist()
-        return {
+        x, y, yaw = self._origin.poses(update.map_from_odom_xyyaw).tolist()
+        return values | {
             "frames": str(update.frames),
             "window fill": f"{update.window_fill:.3f}",
-            "gaps": str(self._gaps),
             "loops": str(update.closed_loops),
-            "largest move in the last update (m)": f"{update.largest_move_m:.3f}",
+            "last correction, largest move (m)": f"{self._last_correction_m:.3f}",
+            "standard deviation of the position (m)": f"{position_std(update.covariance):.3g}",
             "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",
         }
+
+    def _problems(self) -> list[str]:
+        found = [line for entry in self._inputs for line in entry.problems()]
+        if self._new_gaps:
+            found.append(f"{self._new_gaps} gaps in the relative poses, bridged by the odometry")
+            self._new_gaps = 0
+        std_m = 0.0 if self._latest is None else position_std(self._latest.covariance)
+        if std_m >= self._settings.lost_position_std_m:
+            found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
+        return found
+
+
+def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
+    """Write a file; returns whether that went well, and what to say."""
+    try:
+        if trajectory is None:
+            raise ValueError("the trajectory is empty; nothing was written")
+        edges = edges_of(trajectory) if path.suffix == ".g2o" else ()
+        write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw, edges)
+    except Exception as error:  # whatever it is, whoever called must get an answer
+        return False, " ".join(str(error).split()) or repr(error)
+    return True, f"wrote {len(trajectory.stamps_ns)} poses to {path}"
 
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(NAME, NgoNode))
+    sys.exit(run_node(NAME, lambda: NgoNode().start()))
 
 
 if __name__ == "__main__":

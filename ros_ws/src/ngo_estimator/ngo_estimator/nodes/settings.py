@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ngo_estimator.nodes.parameters import BadParameter, Settings, frame, setting, topic
+from ngo_estimator.nodes.parameters import BadParameter, Settings, frame, frame_prefix, pose, setting, topic
 
 WORLDS = ("maze2d", "maze3d")
 
@@ -14,15 +14,28 @@ class EstimatorSettings(Settings):
     world: str = setting("maze3d", "World whose weights are used.", choices=WORLDS)
     weights: str = setting("", "Folder of weights for that world; empty: the ones that ship with the package.")
     threads: int = setting(1, "Threads that the networks compute with.", minimum=1, maximum=64)
+    frame_prefix: str = frame_prefix("", "Put before the names of all frames, for several robots on one tf_topic.")
     odom_frame: str = frame("odom", "Frame in which the odometry is smooth and drifts.")
     publish_tf: bool = setting(True, "Whether to publish the transform on tf_topic.")
     relative_pose_topic: str = topic("relative_pose", "Steps of the odometry, from local_node to ngo_node.")
     relative_pose_depth: int = setting(
         2000, "Queue of relative_pose_topic, at least ngo_node's window_frames.", minimum=1, maximum=100_000
     )
+    source_timeout_s: float = setting(
+        1.0,
+        "How long, of several publishers on an input topic, the one that was first may be silent before another takes "
+        "its place.",
+        minimum=0.01,
+        maximum=3600.0,
+        live=True,
+    )
     tf_topic: str = topic("/tf", "Transforms.")
     diagnostics_topic: str = topic("/diagnostics", "Rates, drops and durations of the node.")
-    diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0)
+    diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0, live=True)
+
+    def framed(self, name: str) -> str:
+        """The name of a frame with this robot's prefix."""
+        return self.frame_prefix + name
 
 
 @dataclass(frozen=True)
@@ -63,17 +76,45 @@ class LocalNodeSettings(EstimatorSettings):
 class NgoNodeSettings(EstimatorSettings):
     """Parameters of ``ngo_node``."""
 
+    autostart: bool = setting(True, "Whether the node configures and activates itself, or waits to be told.")
     window_frames: int = setting(
         2000,
         "How many of the newest frames are optimised together; older ones stay.",
         minimum=2,
         maximum=100_000,
     )
-    map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump; its origin is the first frame.")
+    map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump.")
+    initial_pose: tuple[float, float, float] = pose(
+        (0.0, 0.0, 0.0), "Where in map_frame the first frame of a trajectory lies, from the next one on.", live=True
+    )
+    initial_pose_topic: str = topic(
+        "initialpose", "Where in map_frame the robot is now: the whole trajectory moves there."
+    )
     path_topic: str = topic("ngo/path", "Corrected trajectory.")
     pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, for every relative pose.")
     trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory in flat arrays, and how far each pose moved.")
     loops_topic: str = topic("ngo/loops", "Lines between poses that the optimizer takes for the same place.")
+    path_rate_hz: float = setting(
+        10.0,
+        "How often path_topic, trajectory_topic and loops_topic are published at most; 0: after every relative pose.",
+        minimum=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    tf_smoothing_s: float = setting(
+        0.0,
+        "Time constant with which the transform on tf_topic moves toward the newest correction; 0: at once.",
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
+    lost_position_std_m: float = setting(
+        2.0,
+        "Standard deviation of the newest position from which on diagnostics call the robot lost.",
+        minimum=0.001,
+        maximum=1e6,
+        live=True,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

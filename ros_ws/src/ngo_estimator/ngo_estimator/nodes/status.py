@@ -1,5 +1,6 @@
 """What a node tells about itself: counts, rates and durations on /diagnostics, and throttled warnings."""
 
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from ngo_estimator.nodes.messages import to_time
+from ngo_estimator.nodes.qos import overridable
 
 _QUIET_S = 5.0
 """Least time between two warnings of one kind."""
@@ -22,23 +24,41 @@ class NodeStatus:
     The period is one of real time, so that a silent input shows; the stamp is that of the newest input.
     """
 
-    def __init__(self, node: Node, topic: str, period_s: float, details: Callable[[], dict[str, str]]) -> None:
-        """Publish on ``topic`` every ``period_s``; ``details`` adds the node's own values."""
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        period_s: float,
+        details: Callable[[], dict[str, str]],
+        problems: Callable[[], list[str]] = list,
+    ) -> None:
+        """Publish on ``topic`` every ``period_s``; ``details`` adds the node's own values, ``problems`` lines."""
         self._node = node
-        self._details = details
+        self._details, self._problems = details, problems
         self._totals: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
         self._warned_at: dict[str, float] = {}
         self._unsaid: Counter[str] = Counter()
         self._newest_ns = 0
+        self.idle = ""
+        """Why no input is expected now; empty: it is."""
         self._start_period()
-        self._publisher = node.create_publisher(DiagnosticArray, topic, 10)
-        node.create_timer(period_s, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._publisher = node.create_publisher(DiagnosticArray, topic, 10, qos_overriding_options=overridable())
+        self._timer = node.create_timer(period_s, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+    def set_period(self, period_s: float) -> None:
+        """Publish every ``period_s`` from now on."""
+        self._timer.timer_period_ns = int(period_s * 1e9)
 
     def _start_period(self) -> None:
         self._since = time.perf_counter()
         self._received = self._dropped_now = 0
-        self._durations_s: list[float] = []
+        self._durations_s: dict[str, list[float]] = {}
 
     def received(self, stamp_ns: int) -> None:
         """Count one good input."""
@@ -46,23 +66,31 @@ class NodeStatus:
         self._received += 1
         self._totals["received"] += 1
 
+    def took(self, what: str, seconds: float) -> None:
+        """Count how long something took, for mean and maximum."""
+        self._durations_s.setdefault(what, []).append(seconds)
+
     @contextmanager
-    def timed(self) -> Iterator[None]:
-        """Measure the node's main computation."""
+    def timed(self, what: str) -> Iterator[None]:
+        """Measure how long something takes; what fails does not count."""
         started = time.perf_counter()
         yield
-        self._durations_s.append(time.perf_counter() - started)
+        self.took(what, time.perf_counter() - started)
 
     def dropped(self, kind: str, reason: object, count: int = 1) -> None:
-        """Count ``count`` inputs as dropped, and warn: at once, then at most every few seconds a kind."""
-        self._dropped[kind] += count
+        """Count ``count`` inputs as dropped, and warn: at once, then at most every few seconds a kind and reason.
+
+        They are counted by ``kind`` and, where ``reason`` is an error with a name of its own, by that, too.
+        """
+        key = kind + _short(reason)
+        self._dropped[key] += count
         self._dropped_now += count
         now = time.perf_counter()
-        if now - self._warned_at.get(kind, -_QUIET_S) < _QUIET_S:
-            self._unsaid[kind] += count
+        if now - self._warned_at.get(key, -_QUIET_S) < _QUIET_S:
+            self._unsaid[key] += count
             return
-        self._warned_at[kind] = now
-        more = f" ({self._unsaid.pop(kind)} more before this one)" if self._unsaid[kind] else ""
+        self._warned_at[key] = now
+        more = f" ({self._unsaid.pop(key)} more before this one)" if self._unsaid[key] else ""
         self._node.get_logger().warning(f"dropped {kind}: {reason}{more}")
 
     def _publish(self) -> None:
@@ -71,16 +99,18 @@ class NodeStatus:
             "input rate (Hz)": f"{self._received / elapsed_s:.1f}",
             "received": str(self._totals["received"]),
             "dropped": str(self._dropped.total()),
-            **{f"dropped: {kind}": str(count) for kind, count in sorted(self._dropped.items())},
+            **{f"dropped: {key}": str(count) for key, count in sorted(self._dropped.items())},
         }
-        if self._durations_s:
-            mean_s = sum(self._durations_s) / len(self._durations_s)
-            values["time an update, mean (ms)"] = f"{1e3 * mean_s:.2f}"
-            values["time an update, max (ms)"] = f"{1e3 * max(self._durations_s):.2f}"
-        level, message = DiagnosticStatus.OK, "running"
+        for what, durations_s in self._durations_s.items():
+            values[f"{what}, mean (ms)"] = f"{1e3 * sum(durations_s) / len(durations_s):.2f}"
+            values[f"{what}, max (ms)"] = f"{1e3 * max(durations_s):.2f}"
+        problems = self._problems()
         if self._dropped_now:
-            level, message = DiagnosticStatus.WARN, f"{self._dropped_now} inputs dropped in {elapsed_s:.1f} s"
-        elif not self._received:
+            problems.append(f"{self._dropped_now} inputs dropped in {elapsed_s:.1f} s")
+        level, message = DiagnosticStatus.OK, self.idle or "running"
+        if problems:
+            level, message = DiagnosticStatus.WARN, "; ".join(problems)
+        elif not self._received and not self.idle:
             level, message = DiagnosticStatus.STALE, f"no input for {elapsed_s:.1f} s"
         status = DiagnosticStatus(level=level, name=self._node.get_fully_qualified_name(), message=message)
         status.values = [KeyValue(key=key, value=value) for key, value in {**values, **self._details()}.items()]
@@ -88,3 +118,10 @@ class NodeStatus:
         array.header.stamp = to_time(self._newest_ns)
         self._publisher.publish(array)
         self._start_period()
+
+
+def _short(reason: object) -> str:
+    """The name of an error's class in words, in brackets: `` (late frame)`` of ``LateFrame``."""
+    if not isinstance(reason, ValueError) or type(reason) is ValueError:
+        return ""
+    return f" ({re.sub('(?<!^)(?=[A-Z])', ' ', type(reason).__name__).lower()})"

@@ -1,67 +1,108 @@
 """The corrected trajectory in the forms that cost more the longer it is."""
 
+import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from nav_msgs.msg import Path
 from ngo_msgs.msg import Trajectory
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import PublisherEventCallbacks, QoSPublisherMatchedInfo
-from rclpy.node import Node
-from rclpy.publisher import Publisher
+from rclpy.lifecycle import LifecycleNode, LifecyclePublisher
+from rclpy.timer import Timer
 from visualization_msgs.msg import MarkerArray
 
 from ngo_estimator.nodes.messages import loop_markers, trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
+from ngo_estimator.nodes.qos import overridable
+from ngo_estimator.nodes.settings import NgoNodeSettings
+from ngo_estimator.publication_pace import PublicationPace
 
 if TYPE_CHECKING:
-    from ngo_estimator.online_trajectory import OnlineTrajectory, TrajectoryUpdate
+    from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
 
 _DEPTH = 10
-_FIRST_POSES = 2
 
 
 class TrajectoryPublishers:
     """Publishes a path, a flat trajectory and the loops, each made only while somebody subscribes to it.
 
-    A subscriber that comes later gets the newest ones at once.
+    They come at a pace of their own: after a change at once or, where that would be too often, when it is time. A
+    subscriber that comes later gets the newest ones at once.
     """
 
-    def __init__(self, node: Node, frame_id: str, path_topic: str, trajectory_topic: str, loops_topic: str) -> None:
-        """Publish on the three topics, with poses in ``frame_id``."""
+    def __init__(
+        self,
+        node: LifecycleNode,
+        settings: NgoNodeSettings,
+        snapshot: Callable[[], "WholeTrajectory | None"],
+    ) -> None:
+        """Publish what ``snapshot`` gives on the three topics of ``settings``."""
         self._node = node
-        self._frame_id = frame_id
-        self._writer = PathWriter(frame_id)
-        self._core: OnlineTrajectory | None = None
-        self._path = self._create(Path, path_topic)
-        self._trajectory = self._create(Trajectory, trajectory_topic)
-        self._loops = self._create(MarkerArray, loops_topic)
+        self._snapshot = snapshot
+        self._frame_id = settings.framed(settings.map_frame)
+        self._writer = PathWriter(self._frame_id)
+        self._path = self._create(Path, settings.path_topic)
+        self._trajectory = self._create(Trajectory, settings.trajectory_topic)
+        self._loops = self._create(MarkerArray, settings.loops_topic)
+        self._outdated: set[LifecyclePublisher] = set()
+        self._timer: Timer | None = None
+        self.set_rate(settings.path_rate_hz)
 
-    def publish(self, core: "OnlineTrajectory", update: "TrajectoryUpdate | None") -> None:
-        """Publish the trajectory of ``core`` after ``update`` to those who listen or come before the next one."""
-        self._core = core
-        # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last
-        # one.
-        loops_changed = update is not None and (update.optimized or update.frames == _FIRST_POSES)
-        for publisher in (self._path, self._trajectory, *((self._loops,) if loops_changed else ())):
-            if publisher.get_subscription_count():
-                self._send_latest(publisher)
+    def close(self) -> None:
+        """Publish no more."""
+        self._end_timer()
+        for publisher in (self._path, self._trajectory, self._loops):
+            self._node.destroy_lifecycle_publisher(publisher)
 
-    def _create(self, message_type: type, name: str) -> Publisher:
+    def set_rate(self, rate_hz: float) -> None:
+        """Publish so often at most; 0: after every change."""
+        self._end_timer()
+        self._pace = PublicationPace(rate_hz)
+        if rate_hz > 0.0:
+            steady = Clock(clock_type=ClockType.STEADY_TIME)
+            self._timer = self._node.create_timer(1.0 / rate_hz, self._publish_if_due, clock=steady)
+
+    def changed(self, loops: bool) -> None:
+        """The trajectory has changed, and with it the loops, or not."""
+        self._outdated |= {self._path, self._trajectory, *((self._loops,) if loops else ())}
+        self._publish_if_due()
+
+    def _publish_if_due(self) -> None:
+        if not self._outdated or not self._pace.is_due(time.monotonic()):
+            return
+        started = time.monotonic()
+        wanted = [publisher for publisher in self._outdated if publisher.get_subscription_count()]
+        self._outdated.clear()
+        self._send(wanted)
+        self._pace.published(started, time.monotonic())
+
+    def _create(self, message_type: type, name: str) -> LifecyclePublisher:
         def on_matched(info: QoSPublisherMatchedInfo) -> None:
             if info.current_count_change > 0:
-                self._send_latest(publisher)
+                self._send([publisher])
 
         events = PublisherEventCallbacks(matched=on_matched)
-        publisher = self._node.create_publisher(message_type, name, _DEPTH, event_callbacks=events)
+        publisher = self._node.create_lifecycle_publisher(
+            message_type, name, _DEPTH, event_callbacks=events, qos_overriding_options=overridable()
+        )
         return publisher
 
-    def _send_latest(self, publisher: Publisher) -> None:
-        trajectory = None if self._core is None else self._core.trajectory()
+    def _send(self, publishers: list[LifecyclePublisher]) -> None:
+        trajectory = self._snapshot() if publishers else None
         if trajectory is None:
             return
-        if publisher is self._path:
-            stamps_ns = trajectory.stamps_ns
-            publisher.publish(self._writer.write(int(stamps_ns[-1]), stamps_ns, trajectory.poses_xyyaw))
-        elif publisher is self._trajectory:
-            publisher.publish(trajectory_message(trajectory, self._frame_id))
-        else:
-            publisher.publish(loop_markers(trajectory, self._frame_id))
+        stamps_ns = trajectory.stamps_ns
+        for publisher in publishers:
+            if publisher is self._path:
+                publisher.publish(self._writer.write(int(stamps_ns[-1]), stamps_ns, trajectory.poses_xyyaw))
+            elif publisher is self._trajectory:
+                publisher.publish(trajectory_message(trajectory, self._frame_id))
+            else:
+                publisher.publish(loop_markers(trajectory, self._frame_id))
+
+    def _end_timer(self) -> None:
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None

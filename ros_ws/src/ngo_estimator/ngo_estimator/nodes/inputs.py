@@ -1,0 +1,103 @@
+"""Subscriptions that notice who publishes: others on the same topic, and those whose QoS does not fit."""
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible, qos_policy_name_from_kind
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from ngo_estimator.nodes.qos import overridable
+from ngo_estimator.nodes.status import NodeStatus
+from ngo_estimator.source_guard import SourceGuard
+
+
+class OtherPublisher(ValueError):
+    """A message of another publisher than the one that is held on to."""
+
+
+class Input:
+    """A subscription that takes the messages of one publisher, the first, and says so where there are more.
+
+    What others publish meanwhile on the same topic is dropped and counted. Publishers whose quality of service does not
+    fit are named, for nothing comes from them.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        status: NodeStatus,
+        message_type: type,
+        topic: str,
+        qos: QoSProfile | int,
+        callback: Callable[[Any], None],
+        identity: Callable[[Any], Hashable],
+        timeout_s: float,
+    ) -> None:
+        """Have ``callback`` called with each message; ``identity`` is what a message says of its source."""
+        self._node, self._status = node, status
+        self._callback, self._identity = callback, identity
+        self._guard = SourceGuard(timeout_s)
+        self._kind = f"message on {topic}"
+        self._others = ""  # who published beside the one that is held on to, since the last call of problems()
+        self._misfit = ""
+        self._subscription = node.create_subscription(
+            message_type,
+            topic,
+            self._on_message,
+            qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos),
+            qos_overriding_options=overridable(),
+        )
+
+    def close(self) -> None:
+        """Take no more messages."""
+        self._node.destroy_subscription(self._subscription)
+
+    def set_timeout(self, timeout_s: float) -> None:
+        """How long the publisher that is held on to may be silent."""
+        self._guard.timeout_s = timeout_s
+
+    def problems(self) -> list[str]:
+        """A line for each thing that is wrong with those who publish, the first of them since the last call."""
+        if not self._misfit_publishers():
+            self._misfit = ""
+        found = [line for line in (self._others, self._misfit) if line]
+        self._others = ""
+        return found
+
+    def _on_message(self, message: Any, info: dict[str, Any]) -> None:
+        publishers, identity = self._subscription.get_publisher_count(), self._identity(message)
+        received_ns, sequence = info["received_timestamp"], info.get("publication_sequence_number")
+        if self._guard.admits(publishers, identity, sequence, received_ns):
+            self._callback(message)
+            return
+        if not self._others:
+            names = " and ".join(sorted(map(_name, self._publishers())))
+            self._others = f"{names} publish on '{self._subscription.topic_name}': only the first that was heard counts"
+        self._status.dropped(self._kind, OtherPublisher(self._others))
+
+    def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        names = " and ".join(self._misfit_publishers()) or "a publisher"
+        self._misfit = (
+            f"nothing comes from {names} on '{self._subscription.topic_name}': its QoS policy {policy} does not fit"
+        )
+        self._node.get_logger().warning(self._misfit)
+
+    def _publishers(self) -> list[TopicEndpointInfo]:
+        return list(self._node.get_publishers_info_by_topic(self._subscription.topic_name))
+
+    def _misfit_publishers(self) -> list[str]:
+        """Names of those from whom nothing comes."""
+        own = self._subscription.qos_profile
+        return sorted(
+            _name(info)
+            for info in self._publishers()
+            if qos_check_compatible(info.qos_profile, own)[0] == QoSCompatibility.ERROR
+        )
+
+
+def _name(publisher: TopicEndpointInfo) -> str:
+    return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
