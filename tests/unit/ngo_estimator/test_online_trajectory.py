@@ -254,6 +254,23 @@ def test_reset_forgets_everything() -> None:
         assert_same_updates(take(core, step), take(fresh, step))
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_without_optimizing_it_follows_the_odometry_and_then_catches_up(form: str) -> None:
+    core, other, steps = make(form), make(form), make_steps(64)
+    for count, step in enumerate(steps, start=1):
+        paused = 20 < count < 50
+        before = None if count == 1 else core.trajectory()
+        update, expected = core.update(step, optimize=not paused), other.update(step)
+        assert update.optimized == (count % 8 == 0 and not paused)
+        if paused and before is not None:
+            now = core.trajectory()
+            assert now is not None
+            np.testing.assert_array_equal(now.poses_xyyaw[:-1], before.poses_xyyaw)
+            assert update.frames == count + 1 and not update.gap
+        elif count >= 56:
+            assert_same_poses(update.pose_xyyaw[None], expected.pose_xyyaw[None])
+
+
 # ---- refused steps
 
 

@@ -27,6 +27,14 @@ class RejectedStep(ValueError):
     """A relative pose that cannot be used; the trajectory is as it was before."""
 
 
+class DuplicateStep(RejectedStep):
+    """A step to the frame that is the newest already."""
+
+
+class LateStep(RejectedStep):
+    """A step to a frame that is a little older than the newest one."""
+
+
 @dataclass(frozen=True)
 class RelativeStep:
     """One step of the local odometry; the fields are those of ``LocalEstimate``."""
@@ -148,12 +156,13 @@ class OnlineTrajectory:
         self._loop_weights = np.zeros(0)
         self._covariance = np.zeros((3, 3))
 
-    def update(self, step: RelativeStep) -> TrajectoryUpdate:
+    def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
         """Take the next step.
 
         A step that begins after the last frame means lost steps: the motion between is composed from the odometry
         poses. A step of an odometry with another origin begins a new trajectory, for the motion between is unknown;
-        so does one that lies ``RESTART_AFTER_NS`` or more in the past.
+        so does one that lies ``RESTART_AFTER_NS`` or more in the past. Without ``optimize`` the newest frame follows the
+        one before it by odometry alone; the next meta-pose that is optimised takes all of them in.
 
         Raises:
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
@@ -168,14 +177,15 @@ class OnlineTrajectory:
                 self.reset()
                 restarted = True
             elif step.stamp_ns <= last:
-                raise RejectedStep(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
+                kind = DuplicateStep if step.stamp_ns == last else LateStep
+                raise kind(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
             elif step.from_stamp_ns != last:
                 relative, variance = self._over_gap(step, last)
                 gap = True
         if self._count == 0:
             self._begin(step)
         self._append(step, relative, np.clip(variance, *_VARIANCES))
-        optimized = self._count % self._block == 0
+        optimized = optimize and self._count % self._block == 0
         self._moved = np.zeros(self._count + 1)
         if optimized:
             self._moved[:-1] = self._optimize()

@@ -192,7 +192,7 @@ class NgoNode(LifecycleNode):
         step = messages.relative_step(message)
         try:
             with self._status.timed("time an update"):
-                update = self._core.update(step)
+                update = self._core.update(step, optimize=not self._paused)
         except ValueError as error:
             self._status.dropped("relative pose", error)
             return
