@@ -16,11 +16,12 @@ from rclpy.serialization import deserialize_message
 
 from demo.graph import Graph, GraphError, NodeSpec
 from demo.picture import save_picture
-from demo.recording import Recorder, StampTimes
+from demo.recording import ALL_TOPICS, StampTimes
 from demo.trajectories import Poses, evaluate, match
 from ngo_estimator.trajectory_file import write_tum
 from ngo_sim.flow_control import header_stamp_ns
 from ngo_sim.mazes import Maze
+from training.recorder import Recorder
 
 START_TIMEOUT_S = 90.0
 SILENCE_TIMEOUT_S = 60.0
@@ -84,7 +85,10 @@ class Session:
     def run(self, show: Show, with_latency: bool = False) -> dict[str, Any]:
         """Run, write recording.mcap, picture.png, the trajectories and the logs, and return the result."""
         config = self._config
-        with Graph(self._out / "logs") as graph, Recorder(self._out / "recording.mcap", graph.domain_id) as recorder:
+        with (
+            Graph(self._out / "logs") as graph,
+            Recorder(self._out / "recording.mcap", graph.domain_id, ALL_TOPICS) as recorder,
+        ):
             recorder.listen("ground_truth", self._on_truth)
             recorder.listen("odom", self._on_odometry)
             recorder.listen("ngo/path", self._on_path)

@@ -15,9 +15,11 @@ from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from demo.recording import ALL_TOPICS, Recorder, StampTimes, message_definition
+from demo.recording import ALL_TOPICS, StampTimes
+from ngo_recordings.definitions import message_definition
 from ngo_sim.episodes import record_episode
 from ngo_sim.maze2d import Maze2D
+from training.recorder import Recorder
 
 from .processes import NodeProcess, wait_until
 
@@ -32,7 +34,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "recording.mcap"
     times = StampTimes()
     parameters = {"seed": 7, "frames": FRAMES, "rate": 0, "wait_for_subscribers": 1}
-    with Recorder(path, int(os.environ["ROS_DOMAIN_ID"]), chunk_bytes=20_000) as recorder:
+    with Recorder(path, int(os.environ["ROS_DOMAIN_ID"]), ALL_TOPICS, chunk_bytes=20_000) as recorder:
         recorder.listen("image", times)
         with NodeProcess("ngo_sim", "maze2d", parameters) as node:
 

@@ -38,7 +38,7 @@ def header(stamp_ns: int, frame: str = "base_link") -> Any:
 
 
 def image(stamp_ns: int, pixels: np.ndarray, encoding: str = "rgb8", padding: int = 0, big: bool = False) -> Any:
-    height, width, channels = pixels.shape
+    height, width = pixels.shape[:2]
     rows = np.frombuffer(pixels.astype(pixels.dtype.newbyteorder(">" if big else "<")).tobytes(), np.uint8)
     rows = np.pad(rows.reshape(height, -1), ((0, 0), (0, padding)), constant_values=99)
     return make(

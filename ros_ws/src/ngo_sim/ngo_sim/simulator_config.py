@@ -77,6 +77,11 @@ class SimulatorConfig:
     )
     use_wall_stamps: bool = _setting(False, "Stamp every frame with the wall clock instead of simulated time.")
     publish_clock: bool = _setting(False, "Publish /clock with the stamp of every frame; not with use_wall_stamps.")
+    record: str = _setting(
+        "",
+        "Recording of everything that is published: a new .mcap file, or a new folder for the layout of rosbag2; "
+        "empty: none.",
+    )
     ground_truth_frame: str = _setting(
         "maze", "Frame of the ground truth: origin at the maze's corner, x along columns."
     )
@@ -102,7 +107,7 @@ def _check(name: str, value: Any, default: Any, metadata: Any) -> None:
     if isinstance(default, tuple):
         good = isinstance(value, tuple) and all(isinstance(item, str) and item for item in value)
     elif isinstance(default, str):
-        good = isinstance(value, str) and (value in choices if choices else value != "")
+        good = isinstance(value, str) and (value in choices if choices else value != "" or default == "")
     elif isinstance(default, bool):
         good = isinstance(value, bool)
     else:
@@ -117,7 +122,9 @@ def allowed_values(default: Any, metadata: Any) -> str:
     if isinstance(default, tuple):
         return "a list of topic names"
     if isinstance(default, str):
-        return "one of " + ", ".join(metadata["choices"]) if metadata["choices"] else "a name that is not empty"
+        if metadata["choices"]:
+            return "one of " + ", ".join(metadata["choices"])
+        return "a text" if default == "" else "a name that is not empty"
     if isinstance(default, bool):
         return "true or false"
     kind = "a number" if isinstance(default, float) else "a whole number"

@@ -27,8 +27,9 @@ class Maze2DNode(SimulatorNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self._scan = self.create_publisher(LaserScan, "scan", self.qos)
-        self.image_publisher = self.create_publisher(Image, "image", self.qos)
+        self._scan = self.outputs.create(LaserScan, "scan")
+        self._image = self.outputs.create(Image, "image")
+        self.image_publisher = self._image.publisher
 
     def make_world(self) -> World:
         """The world of the parameters."""
@@ -54,7 +55,7 @@ class Maze2DNode(SimulatorNode):
         )
         image.header.stamp, image.header.frame_id = stamp, self.config.camera_frame
         image.data = array.array("B", frame.observation.tobytes())
-        self.image_publisher.publish(image)
+        self._image.publish(image)
 
 
 def main(args: list[str] | None = None) -> int:

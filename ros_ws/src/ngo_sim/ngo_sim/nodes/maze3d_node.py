@@ -27,8 +27,9 @@ class Maze3DNode(SimulatorNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self._camera_info = self.create_publisher(CameraInfo, "camera_info", self.qos)
-        self.image_publisher = self.create_publisher(Image, "image", self.qos)
+        self._camera_info = self.outputs.create(CameraInfo, "camera_info")
+        self._image = self.outputs.create(Image, "image")
+        self.image_publisher = self._image.publisher
         config: Maze3DConfig = self.world_config
         focal_x, focal_y = config.focal_lengths_px
         # The middle of the picture, where the centre of pixel 0 is 0.
@@ -60,7 +61,7 @@ class Maze3DNode(SimulatorNode):
         height, width, channels = frame.observation.shape
         image = Image(header=self._camera.header, height=height, width=width, encoding="rgb8", step=width * channels)
         image.data = array.array("B", frame.observation.tobytes())
-        self.image_publisher.publish(image)
+        self._image.publish(image)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -21,6 +21,7 @@ from rosgraph_msgs.msg import Clock
 
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
+from ngo_sim.nodes.outputs import Outputs
 from ngo_sim.nodes.parameters import BadParameter, ConfigParameters, changed
 from ngo_sim.simulation import Frame, Simulation, World, yaw_quaternion_zw
 from ngo_sim.simulator_config import SimulatorConfig
@@ -48,10 +49,11 @@ class SimulatorNode(Node):
         self.add_on_set_parameters_callback(self._on_parameters)
         self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
         # Deep enough that a reliable reader may be late with its acknowledgement by far more than what is in flight.
-        self.qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
-        self._truth = self.create_publisher(Odometry, "ground_truth", self.qos)
-        self._action = self.create_publisher(DiscreteAction, "action", self.qos)
-        self._clock_out = self.create_publisher(Clock, "/clock", self.qos) if self.config.publish_clock else None
+        qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
+        self.outputs = Outputs(self, qos, self.config.record)
+        self._truth = self.outputs.create(Odometry, "ground_truth")
+        self._action = self.outputs.create(DiscreteAction, "action")
+        self._clock_out = self.outputs.create(Clock, "/clock") if self.config.publish_clock else None
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
         self._pacer = Pacer()
@@ -60,7 +62,8 @@ class SimulatorNode(Node):
         self._stamp = Time()
 
     def destroy_node(self) -> None:
-        """End the world, too."""
+        """End the world and the recording, too."""
+        self.outputs.close()
         self.simulation.world.close()
         super().destroy_node()
 
@@ -87,6 +90,7 @@ class SimulatorNode(Node):
                 idle_s = _IDLE_S
             elif (idle_s := self._idle_s(now_s)) == 0.0:
                 self._publish_next(now_s)
+            self.outputs.flush_if_due()
             executor.spin_once(timeout_sec=idle_s)
         self.image_publisher.wait_for_all_acked(Duration(seconds=5))
         self.get_logger().info(f"published all {self._published} frames")
@@ -118,6 +122,7 @@ class SimulatorNode(Node):
         simulated_ns = config.stamp_ns(frame.index, simulation.world.period_s)
         stamp_ns = time.time_ns() if config.use_wall_stamps else simulated_ns
         self._stamp = Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        self.outputs.set_time(stamp_ns)
         if self._clock_out is not None:
             self._clock_out.publish(Clock(clock=self._stamp))
         self._publish_truth(frame)

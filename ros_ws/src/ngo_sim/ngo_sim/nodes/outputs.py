@@ -1,0 +1,87 @@
+"""What a node publishes, and on request a recording of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.writer import RecordingWriter
+from ngo_sim.nodes.parameters import BadParameter
+
+
+class Output:
+    """One topic; where there is a recording, a message is serialised once for both."""
+
+    def __init__(self, publisher: Publisher, recording: Recording | None) -> None:
+        self.publisher = publisher
+        self._recording = recording
+
+    def publish(self, message: Any) -> None:
+        """Publish a message, and record it."""
+        if self._recording is None:
+            self.publisher.publish(message)
+            return
+        cdr = serialize_message(message)
+        self._recording.writer.write(self.publisher.topic_name, cdr, self._recording.now_ns)
+        self.publisher.publish(cdr)
+
+
+class Recording:
+    """A file being written, and the log time of what is written next."""
+
+    def __init__(self, path: Path) -> None:
+        self.writer = RecordingWriter(path, library="ngo_sim")
+        self.now_ns = 0
+
+
+class Outputs:
+    """All topics of a node. record: a file ending in .mcap, or a folder for rosbag2's layout; empty: no recording.
+
+    Log times are the stamps of the frames, so a recording does not depend on how fast it was made. Raises BadParameter
+    where something is there already, or nothing can be written.
+    """
+
+    def __init__(self, node: Node, qos: QoSProfile, record: str) -> None:
+        self._node, self._qos = node, qos
+        self._recording: Recording | None = None
+        if record:
+            path = Path(record).expanduser()
+            if path.exists():
+                raise BadParameter(f"record is {record!r}, which exists; allowed: a new .mcap file or a new folder")
+            try:
+                self._recording = Recording(path)
+            except (OSError, RecordingError) as error:
+                raise BadParameter(f"record is {record!r}, which cannot be written: {error}") from None
+
+    def create(self, message_type: type, topic: str) -> Output:
+        """A topic to publish on."""
+        publisher = self._node.create_publisher(message_type, topic, self._qos)
+        if self._recording is not None:
+            package = message_type.__module__.partition(".")[0]
+            type_name = f"{package}/msg/{message_type.__name__}"
+            try:
+                self._recording.writer.add_topic(publisher.topic_name, type_name, depth=self._qos.depth)
+            except RecordingError as error:
+                raise BadParameter(f"record is set, but {error}") from None
+        return Output(publisher, self._recording)
+
+    def set_time(self, stamp_ns: int) -> None:
+        """What is published from now on has this log time."""
+        if self._recording is not None:
+            self._recording.now_ns = stamp_ns
+
+    def flush_if_due(self) -> None:
+        """Let what is recorded get to the file now and then."""
+        if self._recording is not None:
+            self._recording.writer.flush_if_due()
+
+    def close(self) -> None:
+        """End the recording."""
+        if self._recording is not None:
+            self._recording.writer.close()
