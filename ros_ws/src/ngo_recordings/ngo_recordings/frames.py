@@ -95,7 +95,8 @@ class _Frames:
         self._ends_ns = [max(recording.topics[name].last_ns for name in names) for _, names in self._sides]
         self._pending: deque[Message] = deque()
         self._newest_ns: int | None = None  # of the images that were read
-        self._before_ns: int | None = None  # of the image before the first that is pending; None: there is no step
+        # Newest of the images that were taken, from which the next step begins; None: there is no step.
+        self._before_ns: int | None = None
         self._shape: tuple[int, ...] | None = None
 
     def run(self) -> Iterator[Frame]:
@@ -143,7 +144,7 @@ class _Frames:
         """The frame of the first image that is pending, if it gives one."""
         message = self._pending.popleft()
         stamp_ns, before_ns = header_stamp_ns(message.value), self._before_ns
-        self._before_ns = stamp_ns
+        self._before_ns = stamp_ns if before_ns is None else max(before_ns, stamp_ns)
         type_name = self._recording.topics[message.topic].type_name
         image, scan = picture(message.value, type_name, message.topic)
         if self._topics.depth is not None:
