@@ -153,9 +153,9 @@ def test_doubled_and_late_frames_change_nothing(graph: Graph) -> None:
 
 
 def unusable_images() -> list[Image]:
-    """Images of the wrong size, encoding or length, or with values that are not finite."""
+    """Images of the wrong size, encoding or length, or with colours that are not finite."""
     with_nan = scan(2)
-    with_nan[0, 100, 3] = np.nan
+    with_nan[0, 100, 1] = np.nan
     wrong_encoding, short = image_message(scan(2), 0), image_message(scan(2), 0)
     wrong_encoding.encoding = "rgb8"
     short.data = short.data[:-16]
@@ -404,7 +404,7 @@ def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path, number: sig
 
 
 BAD_STARTS = """
-local_node world:=mars             parameter 'world' is 'mars'; allowed: maze2d or maze3d
+local_node world:=mars             parameter 'world' is 'mars'; allowed: maze2d, maze3d or scan
 local_node wrld:=maze2d            parameter 'wrld' is 'maze2d', but unknown; allowed: .*world
 local_node image_topic:='a/'       parameter 'image_topic' is 'a/'; allowed: a topic name
 local_node image_depth:=5.5        parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000

@@ -22,6 +22,7 @@ from ngo_estimator.checkpoint import (
     save_checkpoint,
     write_untrained,
 )
+from ngo_estimator.images import ImageFormat
 
 LOADERS: dict[str, Callable[..., Any]] = {LOCAL: load_local, PLACE: load_place, OPTIMIZER: load_optimizer}
 
@@ -50,7 +51,7 @@ def assert_one_line(error: BaseException, name: str) -> None:
     assert name in str(error)
 
 
-@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
+@pytest.mark.parametrize("world", ["maze2d", "maze3d", "scan"])
 def test_untrained_networks_load_for_their_world(world: str, tmp_path: Path) -> None:
     write_untrained(tmp_path, world)
     for load in LOADERS.values():
@@ -59,6 +60,24 @@ def test_untrained_networks_load_for_their_world(world: str, tmp_path: Path) -> 
         assert not network.training and not any(p.requires_grad for p in network.parameters())
     assert load_local(tmp_path)[0].config.image == checkpoint.WORLD_IMAGES[world]
     assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        ImageFormat(48, 64, 1, "uint8"),
+        ImageFormat(48, 64, 1, "float32", depth_gain_m=4.0, depth_softening_m=2.0),
+        ImageFormat(1, 90, 1, "float32", field_of_view_deg=270.0),
+    ],
+    ids=["grey", "depth", "scan"],
+)
+def test_a_world_of_ones_own_may_have_any_sensor(image: ImageFormat, tmp_path: Path) -> None:
+    write_untrained(tmp_path, "our_robot", image)
+    for load in (load_local, load_place):
+        network, description = load(tmp_path, "our_robot")
+        assert network.config.image == image and description["world"] == "our_robot"
+    with pytest.raises(CheckpointError, match="for the world 'our_robot'; expected 'scan'"):
+        load_local(tmp_path, "scan")
 
 
 def test_an_unknown_world_is_refused(tmp_path: Path) -> None:
@@ -191,6 +210,9 @@ def test_a_description_that_is_none_is_refused(content: bytes, weights: Path) ->
         (("relative_std",), [0.0, 1.0, 1.0], "relative_std"),
         (("image",), 7, "ImageFormat is 7; expected an object"),
         (("image", "dtype"), "float16", "channels"),
+        (("image", "field_of_view_deg"), 90.0, "a scan is"),
+        (("image", "field_of_view_deg"), "wide", "'wide' is given where float is expected"),
+        (("twist_scale",), [1.0, 0.0, 1.0], "twist_scale"),
     ],
 )
 def test_a_wrong_configuration_is_refused(where: tuple[str, ...], value: object, message: str, weights: Path) -> None:

@@ -1,41 +1,22 @@
 """Between ROS messages and arrays: what goes in comes out, over the wire, and what cannot be used is named."""
 
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped, Vector3
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose, Trajectory
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_estimator.local_odometry import LocalEstimate
 from ngo_estimator.nodes import messages
 from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
 
-SCAN_SHAPE, PICTURE_SHAPE = (1, 7, 4), (3, 5, 3)
-
 
 def over_the_wire(message: Any) -> Any:
     return deserialize_message(serialize_message(message), type(message))
-
-
-def image(pixels: np.ndarray, encoding: str, padding: int = 0) -> Image:
-    """A message of these pixels; rows may be longer than the pixels in them."""
-    height, width = pixels.shape[:2]
-    rows = [row.tobytes() + bytes(padding) for row in pixels]
-    return Image(height=height, width=width, encoding=encoding, step=len(rows[0]), data=b"".join(rows))
-
-
-def scan() -> np.ndarray:
-    return np.random.default_rng(0).uniform(0.0, 9.0, SCAN_SHAPE).astype(np.float32)
-
-
-def picture() -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, PICTURE_SHAPE, dtype=np.uint8)
 
 
 def update(loops: int) -> WholeTrajectory:
@@ -52,43 +33,21 @@ def update(loops: int) -> WholeTrajectory:
     )
 
 
-@pytest.mark.parametrize("padding", [0, 4, 13])
-def test_images_are_read_whatever_the_length_of_their_rows(padding: int) -> None:
-    read = messages.image_array(over_the_wire(image(picture(), "rgb8", padding)), PICTURE_SHAPE, "uint8")
-    np.testing.assert_array_equal(read, picture())
-    read = messages.image_array(over_the_wire(image(scan(), "32FC4", padding)), SCAN_SHAPE, "float32")
-    np.testing.assert_array_equal(read, scan())
+def twist_messages() -> list[Any]:
+    """One motion in each type that has it, stamped at 7.5 s where there is a stamp."""
+    twist = Twist(linear=Vector3(x=0.5, y=-0.25, z=9.0), angular=Vector3(x=9.0, y=9.0, z=0.125))
+    stamped, odometry = TwistStamped(twist=twist), Odometry()
+    odometry.twist.twist = twist
+    for message in (stamped, odometry):
+        message.header.stamp = messages.to_time(7_500_000_000)
+    return [twist, stamped, odometry]
 
 
-def test_images_of_the_other_byte_order_are_read() -> None:
-    message = image(scan().byteswap(), "32FC4")
-    message.is_bigendian = int(sys.byteorder == "little")
-    np.testing.assert_array_equal(messages.image_array(message, SCAN_SHAPE, "float32"), scan())
-
-
-def unusable_images() -> list[tuple[Image, str]]:
-    """Images that the 2D world's node cannot use, with what it says about them."""
-    with_nan, with_infinity = scan(), scan()
-    with_nan[0, 2, 3], with_infinity[0, 5:, 0] = np.nan, -np.inf
-    short, long = image(scan(), "32FC4"), image(scan(), "32FC4")
-    short.data, long.data = short.data[:-16], long.data.tobytes() + bytes(16)
-    return [
-        (image(scan()[:, :6], "32FC4"), "is 6 x 1 pixels; expected 7 x 1"),
-        (image(np.concatenate((scan(), scan())), "32FC4"), "is 7 x 2 pixels; expected 7 x 1"),
-        (Image(encoding="32FC4"), "is 0 x 0 pixels; expected 7 x 1"),
-        (image(scan(), "rgb8"), "has the encoding 'rgb8'; expected '32FC4'"),
-        (short, "has 96 bytes in 1 rows of 112; expected 112 a row"),
-        (long, "has 128 bytes in 1 rows of 112; expected 112 a row"),
-        (image(with_nan, "32FC4"), "has 1 values that are not finite"),
-        (image(with_infinity, "32FC4"), "has 2 values that are not finite"),
-    ]
-
-
-@pytest.mark.parametrize(("message", "reason"), unusable_images(), ids=[reason for _, reason in unusable_images()])
-def test_what_is_wrong_with_an_image_is_named(message: Image, reason: str) -> None:
-    with pytest.raises(ValueError, match="image") as error:
-        messages.image_array(message, SCAN_SHAPE, "float32")
-    assert str(error.value) == f"image {reason}"
+@pytest.mark.parametrize("message", twist_messages(), ids=lambda message: type(message).__name__)
+def test_a_velocity_is_planar_and_has_the_stamp_of_its_message_or_of_now(message: Any) -> None:
+    stamp_ns, twist_xyyaw = messages.stamped_twist(over_the_wire(message), now_ns=3)
+    assert stamp_ns == (3 if isinstance(message, Twist) else 7_500_000_000)
+    assert twist_xyyaw.tolist() == [0.5, -0.25, 0.125]
 
 
 def test_a_relative_pose_keeps_every_number() -> None:

@@ -155,3 +155,12 @@ def test_frames_that_would_coincide_and_a_short_queue_are_errors() -> None:
         NgoNodeSettings(map_frame="odom")
     with pytest.raises(BadParameter, match="at least window_frames, which is 3000"):
         NgoNodeSettings(window_frames=3000)
+
+
+def test_any_world_may_be_named_together_with_its_weights() -> None:
+    for world in ("maze2d", "maze3d", "scan"):
+        assert LocalNodeSettings(world=world).world == world
+    assert NgoNodeSettings(world="our_robot-2", weights="/weights").world == "our_robot-2"
+    for world, weights in (("our_robot", ""), ("../maze2d", "/weights"), ("", "/weights")):
+        with pytest.raises(BadParameter, match=f"'world' is '{world}'; allowed: maze2d, maze3d or scan, or the name"):
+            LocalNodeSettings(world=world, weights=weights)

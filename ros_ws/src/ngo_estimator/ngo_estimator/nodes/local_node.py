@@ -1,10 +1,13 @@
-"""Node that turns images and actions into relative poses, odometry and odom -> base_link."""
+"""Node that turns images or laser scans into relative poses, odometry and odom -> base_link."""
 
+import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset
@@ -12,13 +15,12 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError
-from sensor_msgs.msg import Image
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.parameters import BadParameter, LiveSettings
-from ngo_estimator.nodes.process import run_node
+from ngo_estimator.nodes.process import StartError, run_node
 from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
@@ -30,11 +32,15 @@ if TYPE_CHECKING:
 
 NAME = "local_node"
 _ACTIONS = (DiscreteAction.FORWARD, DiscreteAction.TURN_LEFT, DiscreteAction.TURN_RIGHT)
+_TWISTS = {"TwistStamped": TwistStamped, "Twist": Twist, "Odometry": Odometry}
 _DEPTH = 100
 
 
 class LocalNode(Node):
-    """Subscribes images and actions; publishes relative poses, odometry and odom -> base_link."""
+    """Publishes relative poses, odometry and odom -> base_link.
+
+    What it subscribes is what the networks of its weights take: images or laser scans; actions, velocities or neither.
+    """
 
     def __init__(self) -> None:
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
@@ -43,10 +49,25 @@ class LocalNode(Node):
         # Imported here because torch takes seconds: a bad parameter is said at once.
         from ngo_estimator.frame_pairing import FramePairing
         from ngo_estimator.local_odometry import LocalOdometry
+        from ngo_estimator.nodes.sensors import sensor_array, sensor_topic
 
         self._core = load_core(LocalOdometry.load, settings)
+        image_format = self._core.image_format
+        topics = settings.image_topic, settings.scan_topic
+        try:
+            self._sensor_type, topic = sensor_topic(image_format, *topics, settings.image_transport == "compressed")
+        except ValueError as error:
+            raise StartError(f"parameter 'image_transport': {error}") from error
+        self._sensor_topic, self._sensor = topic, "scan" if image_format.is_scan else "image"
+        self._observe: Callable[[Any], np.ndarray] = partial(
+            sensor_array, image_format=image_format, topic=topic, scan_yaw_rad=math.radians(settings.scan_yaw_deg)
+        )
         self._pairing = FramePairing(
-            self._core.uses_action, int(settings.action_timeout_s * 1e9), settings.action_capacity
+            self._core.uses_action,
+            int(settings.action_timeout_s * 1e9),
+            settings.action_capacity,
+            self._core.uses_twist,
+            int(settings.twist_tolerance_s * 1e9),
         )
         self._covariance = np.zeros((3, 3))
         self._missed = self._newly_missed = 0
@@ -58,7 +79,7 @@ class LocalNode(Node):
         self.create_service(Reset, "~/reset", self._on_reset)
         self._live.on_change(self._on_settings)
         self._live.lock()
-        self.get_logger().info(f"ready: {settings.world}, images {self._core.image_shape}")
+        self.get_logger().info(f"ready: {settings.world}, {self._sensor_type.__name__} on '{topic}'")
 
     def _create_topics(self) -> None:
         settings = self._settings
@@ -72,27 +93,27 @@ class LocalNode(Node):
             self._tf = self._publisher(TFMessage, settings.tf_topic)
         reliability = ReliabilityPolicy[settings.image_reliability.upper()]
         image_qos = QoSProfile(depth=settings.image_depth, reliability=reliability)
-        self._listen(Image, settings.image_topic, self._on_image, image_qos)
+        self._listen(self._sensor_type, self._sensor_topic, self._on_sensor, image_qos)
         if self._core.uses_action:
             self._listen(DiscreteAction, settings.action_topic, self._on_action, QoSProfile(depth=10 * _DEPTH))
+        if self._core.uses_twist:
+            twist = _TWISTS[settings.twist_type]
+            self._listen(twist, settings.twist_topic, self._on_twist, QoSProfile(depth=10 * _DEPTH))
 
     def _publisher(self, message_type: type, topic: str, depth: int = _DEPTH) -> Publisher:
         return self.create_publisher(message_type, topic, depth, qos_overriding_options=overridable())
 
     def _listen(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
-        """Take stamped messages of one publisher, which its frame tells from others."""
+        """Take messages of one publisher, which its frame tells from others where they have one."""
         timeout_s = self._settings.source_timeout_s
-        self._inputs.append(
-            Input(self, self._status, message_type, topic, qos, callback, lambda m: m.header.frame_id, timeout_s)
-        )
+        self._inputs.append(Input(self, self._status, message_type, topic, qos, callback, _frame_of, timeout_s))
 
-    def _on_image(self, message: Image) -> None:
+    def _on_sensor(self, message: Any) -> None:
         stamp_ns = messages.to_ns(message.header.stamp)
         try:
-            image = messages.image_array(message, self._core.image_shape, self._core.image_dtype)
-            self._pairing.add_frame(stamp_ns, image)
+            self._pairing.add_frame(stamp_ns, self._observe(message))
         except ValueError as error:
-            self._status.dropped("image", error)
+            self._status.dropped(self._sensor, error)
             return
         self._status.received(stamp_ns)
         self._update()
@@ -104,25 +125,37 @@ class LocalNode(Node):
         self._pairing.add_action(messages.to_ns(message.header.stamp), message.action)
         self._update()
 
+    def _on_twist(self, message: Twist | TwistStamped | Odometry) -> None:
+        stamp_ns, twist_xyyaw = messages.stamped_twist(message, self.get_clock().now().nanoseconds)
+        try:
+            self._pairing.add_twist(stamp_ns, twist_xyyaw)
+        except ValueError as error:
+            self._status.dropped("twist", error)
+            return
+        self._update()
+
     def _update(self) -> None:
         dropped, restarts = self._pairing.dropped, self._core.restarts
         for pair in self._pairing.ready():
             try:
                 with self._status.timed("time an update"):
-                    estimate = self._core.update(pair.stamp_ns, pair.image, pair.action)
+                    estimate = self._core.update(pair.stamp_ns, pair.image, pair.action, pair.twist)
             except ValueError as error:
-                self._status.dropped("image", error)
+                self._status.dropped(self._sensor, error)
                 continue
             if estimate is None:
                 self._covariance = np.zeros((3, 3))
             else:
                 self._publish(estimate)
         if self._pairing.dropped > dropped:
-            reason = f"the action on '{self._settings.action_topic}' that led to it did not come"
-            self._status.dropped("image without action", reason, self._pairing.dropped - dropped)
+            told = [f"action on '{self._settings.action_topic}'"] if self._core.uses_action else []
+            told += [f"velocity on '{self._settings.twist_topic}'"] if self._core.uses_twist else []
+            kind = f"{self._sensor} without {'action' if self._core.uses_action else 'velocity'}"
+            reason = f"the {' or the '.join(told)} that led to it did not come"
+            self._status.dropped(kind, reason, self._pairing.dropped - dropped)
         if self._core.restarts > restarts:
             self.get_logger().info(
-                "the images' stamps jumped back: their source restarted, so the odometry starts anew"
+                f"the {self._sensor}s' stamps jumped back: their source restarted, so the odometry starts anew"
             )
 
     def _publish(self, estimate: "LocalEstimate") -> None:
@@ -154,7 +187,9 @@ class LocalNode(Node):
 
     def _details(self) -> dict[str, str]:
         return {
-            "images waiting for actions": str(self._pairing.waiting),
+            f"{self._sensor}s waiting for {'velocities' if self._core.uses_twist else 'actions'}": str(
+                self._pairing.waiting
+            ),
             "missed frames": str(self._missed),
             "restarts": str(self._core.restarts),
             "standard deviation of the position (m)": f"{position_std(self._covariance):.3g}",
@@ -166,6 +201,10 @@ class LocalNode(Node):
             found.append(f"{self._newly_missed} frames missing between images, bridged with a larger covariance")
             self._newly_missed = 0
         return found
+
+
+def _frame_of(message: Any) -> str:
+    return message.header.frame_id if hasattr(message, "header") else ""
 
 
 def main() -> None:

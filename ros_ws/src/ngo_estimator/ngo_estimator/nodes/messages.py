@@ -1,6 +1,5 @@
 """Between ROS messages and the arrays of the cores."""
 
-import sys
 from array import array
 from typing import TYPE_CHECKING
 
@@ -14,11 +13,11 @@ from geometry_msgs.msg import (
     Transform,
     TransformStamped,
     Twist,
+    TwistStamped,
     Vector3,
 )
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose, Trajectory
-from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA, Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
@@ -31,7 +30,6 @@ if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import th
     from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
-_ENCODINGS = {"uint8": "rgb8", "float32": "32FC4"}
 _LOOP_WIDTH_M = 0.03
 
 
@@ -45,30 +43,11 @@ def to_time(stamp_ns: int) -> Time:
     return Time(sec=stamp_ns // _NS, nanosec=stamp_ns % _NS)
 
 
-def image_array(message: Image, shape: tuple[int, int, int], dtype: str) -> np.ndarray:
-    """The pixels of ``message`` as ``(height, width, channels)`` of ``dtype``.
-
-    Raises ``ValueError`` unless the image has this size and its encoding (``rgb8`` for uint8, ``32FC4`` for
-    float32), its data is as long as it says, and all its values are finite.
-    """
-    height, width, channels = shape
-    encoding = _ENCODINGS[dtype]
-    if message.encoding != encoding:
-        raise ValueError(f"image has the encoding '{message.encoding}'; expected '{encoding}'")
-    if (message.height, message.width) != (height, width):
-        raise ValueError(f"image is {message.width} x {message.height} pixels; expected {width} x {height}")
-    row = width * channels * np.dtype(dtype).itemsize
-    if message.step < row or len(message.data) != message.step * height:
-        raise ValueError(
-            f"image has {len(message.data)} bytes in {height} rows of {message.step}; expected {row} a row"
-        )
-    pixels = np.frombuffer(message.data, np.uint8).reshape(height, message.step)[:, :row]
-    image = np.ascontiguousarray(pixels).view(dtype).reshape(shape)
-    if bool(message.is_bigendian) != (sys.byteorder == "big"):
-        image = image.byteswap() if dtype == "float32" else image
-    if dtype == "float32" and not np.isfinite(image).all():
-        raise ValueError(f"image has {int((~np.isfinite(image)).sum())} values that are not finite")
-    return image
+def stamped_twist(message: Twist | TwistStamped | Odometry, now_ns: int) -> tuple[int, np.ndarray]:
+    """The stamp of a velocity, ``now_ns`` where the message has none, and its ``(3,)`` m/s forward, m/s left, rad/s."""
+    stamp_ns = now_ns if isinstance(message, Twist) else to_ns(message.header.stamp)
+    twist = message.twist.twist if isinstance(message, Odometry) else getattr(message, "twist", message)
+    return stamp_ns, np.array([twist.linear.x, twist.linear.y, twist.angular.z])
 
 
 def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> RelativePose:

@@ -1,17 +1,29 @@
 """The parameters of the estimator nodes: names, defaults, meanings and limits."""
 
+import re
 from dataclasses import dataclass
 
 from ngo_estimator.nodes.parameters import BadParameter, Settings, frame, frame_prefix, pose, setting, topic
 
-WORLDS = ("maze2d", "maze3d")
+SHIPPED_WORLDS = ("maze2d", "maze3d", "scan")
+"""Worlds whose weights are in the package."""
+_WORLD_NAMES = "maze2d, maze3d or scan, or the name of another one and its folder in 'weights'"
+
+
+_TRANSPORTS = ("raw", "compressed")
+_TWISTS = ("TwistStamped", "Twist", "Odometry")
 
 
 @dataclass(frozen=True)
 class EstimatorSettings(Settings):
     """What every estimator node needs."""
 
-    world: str = setting("maze3d", "World whose weights are used.", choices=WORLDS)
+    world: str = setting(
+        "maze3d",
+        "World whose weights are used; scan: any 2D lidar.",
+        allowed=_WORLD_NAMES,
+        check=lambda value: re.fullmatch(r"[\w-]+", value) is not None,
+    )
     weights: str = setting("", "Folder of weights for that world; empty: the ones that ship with the package.")
     threads: int = setting(1, "Threads that the networks compute with.", minimum=1, maximum=64)
     frame_prefix: str = frame_prefix("", "Put before the names of all frames, for several robots on one tf_topic.")
@@ -33,6 +45,11 @@ class EstimatorSettings(Settings):
     diagnostics_topic: str = topic("/diagnostics", "Rates, drops and durations of the node.")
     diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0, live=True)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.weights and self.world not in SHIPPED_WORLDS:
+            raise BadParameter(f"parameter 'world' is {self.world!r}; allowed: {_WORLD_NAMES}")
+
     def framed(self, name: str) -> str:
         """The name of a frame with this robot's prefix."""
         return self.frame_prefix + name
@@ -42,23 +59,43 @@ class EstimatorSettings(Settings):
 class LocalNodeSettings(EstimatorSettings):
     """Parameters of ``local_node``."""
 
-    image_topic: str = topic("image", "Images to estimate motion from.")
-    image_reliability: str = setting(
-        "best_effort", "Whether lost images are sent again.", choices=("best_effort", "reliable")
+    image_topic: str = topic("image", "Images to estimate motion from, with weights that take images.")
+    image_transport: str = setting(
+        "raw", "Whether images come as Image, or as CompressedImage on image_topic/compressed.", choices=_TRANSPORTS
     )
-    image_depth: int = setting(5, "Queue of image_topic.", minimum=1, maximum=10_000)
+    scan_topic: str = topic("scan", "Laser scans to estimate motion from, with weights that take scans.")
+    scan_yaw_deg: float = setting(
+        0.0,
+        "Where angle 0 of a scan points, counter-clockwise from straight ahead.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
+    image_reliability: str = setting(
+        "best_effort", "Whether lost images or scans are sent again.", choices=("best_effort", "reliable")
+    )
+    image_depth: int = setting(5, "Queue of image_topic or scan_topic.", minimum=1, maximum=10_000)
     action_topic: str = topic("action", "Actions, stamped with the image at which they were taken.")
     action_timeout_s: float = setting(
         1.0,
-        "How far newer images run ahead before one whose action is missing is dropped.",
+        "How far newer images run ahead before one whose action or velocity is missing is dropped.",
         minimum=0.001,
         maximum=60.0,
     )
     action_capacity: int = setting(
         64,
-        "How many images may wait for their actions before the oldest is dropped.",
+        "How many images may wait for their actions or velocities before the oldest is dropped.",
         minimum=1,
         maximum=10_000,
+    )
+    twist_topic: str = topic("twist", "Velocities of the robot, with weights that take them.")
+    twist_type: str = setting(
+        "TwistStamped", "Type of twist_topic; a Twist has no stamp: the time of its arrival counts.", choices=_TWISTS
+    )
+    twist_tolerance_s: float = setting(
+        0.5,
+        "How much older than an image a velocity may be, where none came since the image before.",
+        minimum=0.0,
+        maximum=60.0,
     )
     base_frame: str = frame("base_link", "Frame of the robot.")
     odometry_topic: str = topic("odom", "Pose in odom_frame with covariance, and velocity.")
