@@ -105,7 +105,7 @@ def found_loops(
             for rows in np.array_split(np.arange(len(arrays["relative"])), -(-len(arrays["relative"]) // _TOGETHER)):
                 relative, codes = (torch.from_numpy(arrays[n][rows, :whole]).float() for n in ("relative", "codes"))
                 parts.append(find_loops(pair_head, codes, poses_in_blocks(relative, block), search))
-        fields = [field.name for field in dataclasses.fields(Loops)]
+        fields = [field.name for field in dataclasses.fields(Loops) if getattr(parts[0], field.name) is not None]
         values = {_LOOP + name: torch.cat([getattr(part, name) for part in parts]).numpy() for name in fields}
         partial = path.with_name(f"{path.name}.{os.getpid()}.npz")
         np.savez(partial, **values)  # type: ignore[arg-type]

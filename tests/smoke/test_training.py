@@ -39,7 +39,7 @@ class Killed(RuntimeError):
 
 @pytest.mark.parametrize(
     ("world", "frames", "place_frames"),
-    [("maze2d", 161, 400), pytest.param("maze3d", 161, 700, marks=pytest.mark.slow)],
+    [("maze2d", 161, 400), ("scan", 161, 700), pytest.param("maze3d", 161, 700, marks=pytest.mark.slow)],
 )
 def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     world: str,
