@@ -40,6 +40,7 @@ setup(
         "console_scripts": [
             "local_node = ngo_estimator.nodes.local_node:main",
             "ngo_node = ngo_estimator.nodes.ngo_node:main",
+            "run_recording = ngo_estimator.nodes.run_recording:main",
         ],
     },
 )

@@ -1,7 +1,7 @@
 """Estimated trajectories against the truth: everything that is reported about them, as JSON and as a table."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -75,13 +75,13 @@ def trajectory_report(estimate: SpatialPoses, truth: SpatialPoses, settings: Rep
     }
 
 
-def report_table(title: str, reports: Mapping[str, Report]) -> Table:
-    """One column for each estimate."""
+def report_table(title: str, reports: Mapping[str, Report], alignments: Sequence[Alignment] = ALIGNMENTS) -> Table:
+    """One column for each estimate; of the ATE the rows of ``alignments``."""
     table = Table(title=title)
     table.add_column("")
     for name in reports:
         table.add_column(name, justify="right")
-    for label, cell in _rows(next(iter(reports.values()))):
+    for label, cell in _rows(next(iter(reports.values())), alignments):
         table.add_row(label, *(cell(report) for report in reports.values()))
     return table
 
@@ -127,7 +127,7 @@ def _segments(ours: SpatialPoses, true: SpatialPoses, lengths_m: tuple[float, ..
     }
 
 
-def _rows(report: Report) -> list[tuple[str, Any]]:
+def _rows(report: Report, alignments: Sequence[Alignment]) -> list[tuple[str, Any]]:
     """Label of each row, and what gives its cell."""
 
     def rmse(*keys: str) -> Any:
@@ -143,7 +143,7 @@ def _rows(report: Report) -> list[tuple[str, Any]]:
         ("true path, m", lambda of: f"{of['path_m']:.2f}"),
         ("final error, % of the path", lambda of: f"{of['final_percent']:.3f}"),
     ]
-    for how in ALIGNMENTS:
+    for how in alignments:
         rows.append((f"ATE, RMSE, m ({_ALIGNED[how]})", rmse("ate", how, "translation_m")))
         rows.append((f"ATE, RMSE, deg ({_ALIGNED[how]})", rmse("ate", how, "rotation_deg")))
     delta = f"{report['rpe']['delta']:g} {report['rpe']['unit']}"

@@ -1,0 +1,143 @@
+"""What a run over a recording leaves behind: trajectories, a recording of both paths, a plot and the errors."""
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.path_message import PathWriter
+from ngo_estimator.planar_covariance import propagate
+from ngo_estimator.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.trajectory_errors import aligned, associate
+from ngo_estimator.trajectory_file import SpatialPoses, write_trajectory
+from ngo_estimator.trajectory_plot import save_plot
+from ngo_estimator.trajectory_report import Report, ReportSettings, trajectory_report
+from ngo_recordings.writer import RecordingWriter
+
+ODOMETRY, POSE, TF = "/odom", "/ngo/pose", "/tf"
+PATHS = {"odometry": "/odom/path", "corrected": "/ngo/path", "truth": "/ground_truth/path"}
+PART = "part"
+"""Folders of the second trajectory of a recording and those after it have this name, and a number."""
+
+_FILES = (
+    "odometry.tum",
+    "online.tum",
+    "corrected.tum",
+    "truth.tum",
+    "trajectories.mcap",
+    "plot.png",
+    "metrics.json",
+    "run.json",
+)
+_TYPES = {ODOMETRY: Odometry, POSE: PoseWithCovarianceStamped, TF: TFMessage}
+
+
+def remove_results(folder: Path) -> None:
+    """Remove the results of an earlier run, so that none of them passes for one of the next."""
+    for place in (folder, *folder.glob(f"{PART}[0-9]*")):
+        for name in _FILES:
+            (place / name).unlink(missing_ok=True)
+
+
+class RecordedOutput:
+    """Writes the results of one trajectory into a folder; a context manager.
+
+    ``trajectories.mcap`` grows with every step; the other files are written when the trajectory is whole:
+    ``odometry.tum``, ``online.tum`` (each pose as it was when its frame was the newest), ``corrected.tum``,
+    ``plot.png`` and, where the truth is known, ``truth.tum`` and ``metrics.json``. All stamps are those of the frames,
+    so that the same recording gives the same bytes.
+    """
+
+    def __init__(self, folder: Path, base_frame: str, odom_frame: str, map_frame: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self._frames = {"base": base_frame, "odom": odom_frame, "map": map_frame}
+        self._covariance = np.zeros((3, 3))
+        self._writer = RecordingWriter(folder / "trajectories.mcap", flush_s=None, library="ngo_estimator")
+        for topic, kind in _TYPES.items():
+            self._writer.add_topic(topic, f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}")
+
+    def __enter__(self) -> "RecordedOutput":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.close()
+
+    def add(self, step: RecordedStep) -> None:
+        """Write what the nodes publish about a step."""
+        local, update, frames = step.local, step.update, self._frames
+        self._covariance = propagate(self._covariance, local.odom_xyyaw, local.relative_xyyaw, local.covariance)
+        stamp_ns, odom, map_frame = local.stamp_ns, frames["odom"], frames["map"]
+        odometry = messages.odometry_message(local, self._covariance, odom, frames["base"])
+        pose = messages.pose_message(stamp_ns, map_frame, update.pose_xyyaw, update.covariance)
+        transforms = messages.transform_message(stamp_ns, map_frame, odom, update.map_from_odom_xyyaw)
+        below = messages.transform_message(stamp_ns, odom, frames["base"], local.odom_xyyaw)
+        transforms.transforms = [*transforms.transforms, *below.transforms]
+        for topic, message in ((ODOMETRY, odometry), (POSE, pose), (TF, transforms)):
+            self._writer.write(topic, bytes(serialize_message(message)), stamp_ns)
+
+    def finish(self, run: RecordedRun, title: str, settings: ReportSettings) -> dict[str, Report]:
+        """Write everything about the whole trajectory; returns the errors of each estimate, none without truth.
+
+        Raises:
+            ValueError: there is a truth, but nothing can be compared with it; all else has been written.
+        """
+        trajectory, truth = run.trajectory, run.truth
+        stamps_ns = trajectory.stamps_ns
+        estimates = {
+            "odometry": trajectory.odometry_xyyaw,
+            "online": trajectory.online_xyyaw,
+            "corrected": trajectory.poses_xyyaw,
+        }
+        for name, poses in estimates.items():
+            write_trajectory(self.folder / f"{name}.tum", stamps_ns, poses)
+        self._write_path(PATHS["odometry"], self._frames["odom"], stamps_ns, estimates["odometry"])
+        self._write_path(PATHS["corrected"], self._frames["map"], stamps_ns, estimates["corrected"])
+        in_map = None
+        if truth is not None:
+            write_trajectory(self.folder / "truth.tum", truth.stamps_ns, truth.planar())
+            in_map = _seen_by(truth, SpatialPoses.from_planar(stamps_ns, estimates["corrected"]))
+            self._write_path(PATHS["truth"], self._frames["map"], truth.stamps_ns, in_map)
+        shown = {name: estimates[name] for name in ("odometry", "corrected")}
+        save_plot(self.folder / "plot.png", title, shown, in_map)
+        if truth is None:
+            return {}
+        reports = {
+            name: trajectory_report(SpatialPoses.from_planar(stamps_ns, poses), truth, settings)
+            for name, poses in estimates.items()
+        }
+        summary = {**reports, "truth_residual": _residual(run.truth_residual)}
+        (self.folder / "metrics.json").write_text(json.dumps(summary, indent=1) + "\n")
+        return reports
+
+    def _write_path(self, topic: str, frame: str, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> None:
+        self._writer.add_topic(topic, "nav_msgs/msg/Path", depth=1, transient_local=True)
+        message = PathWriter(frame).write(int(stamps_ns[-1]), stamps_ns, poses_xyyaw)
+        self._writer.write(topic, message, int(stamps_ns[-1]))
+
+
+def _seen_by(truth: SpatialPoses, estimate: SpatialPoses) -> np.ndarray:
+    """The truth ``(frames, 3)`` in the frame of the estimate, with which its first common pose agrees."""
+    true, ours = associate(truth, estimate)
+    first, onto = (SpatialPoses(p.stamps_ns[:1], p.positions_xyz[:1], p.quaternions_xyzw[:1]) for p in (true, ours))
+    whole = SpatialPoses(
+        np.concatenate((first.stamps_ns, truth.stamps_ns)),
+        np.concatenate((first.positions_xyz, truth.positions_xyz)),
+        np.concatenate((first.quaternions_xyzw, truth.quaternions_xyzw)),
+    )
+    return aligned(whole, onto, "first").planar()[1:]
+
+
+def _residual(values: np.ndarray) -> dict[str, Any]:
+    """What the projection of the truth to the plane leaves out: root mean square of z, roll and pitch."""
+    z_m, roll_rad, pitch_rad = np.sqrt(np.mean(values**2, axis=0)).tolist()
+    return {"z_m": z_m, "roll_deg": float(np.degrees(roll_rad)), "pitch_deg": float(np.degrees(pitch_rad))}

@@ -1,0 +1,258 @@
+"""Estimate the trajectory of a recording, as fast as the machine computes, with the results of the live nodes.
+
+    ros2 run ngo_estimator run_recording drive.mcap --world maze3d --out results
+    ros2 run ngo_estimator run_recording bag_folder --weights my_weights --image /camera/image_raw --out results
+
+RECORDINGS are .mcap files or rosbag2 folders, several as one. OUT gets odometry.tum, online.tum (each corrected pose as
+it was when its frame was the newest), corrected.tum, trajectories.mcap (odometry, poses, transforms and paths),
+plot.png and run.json; where the recording holds the truth, also truth.tum and metrics.json. The same recording gives
+the same bytes.
+"""
+
+import json
+import math
+import sys
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from ament_index_python.packages import get_package_share_directory
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ngo_estimator.trajectory_errors import KITTI_LENGTHS_M, RelativeDelta
+from ngo_estimator.trajectory_report import ReportSettings, remarks, report_table
+from ngo_recordings.images import SCAN_TYPE
+from ngo_recordings.recording import Recording, open_recording
+from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_topics
+
+if TYPE_CHECKING:
+    from ngo_estimator.local_odometry import LocalOdometry
+    from ngo_estimator.recording_run import RecordingRun
+
+NAME = "run_recording"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What is run, on what, and where the results go."""
+
+    recordings: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """.mcap files or rosbag2 folders, several as one recording in order of time."""
+    out: Path
+    """Folder for the results, new or empty."""
+    world: str | None = None
+    """World whose weights are used: maze2d, maze3d or scan (any 2D lidar) ship with the package."""
+    weights: Path | None = None
+    """Folder of weights of your own, instead of those of a world."""
+    topics: tyro.conf.OmitArgPrefixes[TopicArguments] = field(default_factory=TopicArguments)
+    """What is used of the recording."""
+    window_frames: int = 2000
+    """How many of the newest frames are optimised together; older ones stay."""
+    scan_yaw_deg: float = 0.0
+    """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead."""
+    base_frame: str = "base_link"
+    """Frame of the robot in trajectories.mcap."""
+    odom_frame: str = "odom"
+    """Frame in which the odometry is smooth and drifts."""
+    map_frame: str = "map"
+    """Frame of the corrected trajectory; its origin is the first frame."""
+    rpe_metres: float | None = None
+    """Take the RPE over so many metres; not given: from each frame to the next."""
+    segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
+    """Lengths of KITTI's segments."""
+    overwrite: bool = False
+    """Whether results that are in OUT already may be replaced."""
+
+    def check(self) -> None:
+        """Raise ``ValueError`` for what contradicts itself."""
+        if not self.recordings:
+            raise ValueError("no recording was given; expected .mcap files or rosbag2 folders")
+        if (self.world is None) == (self.weights is None):
+            raise ValueError("expected either --world (maze2d, maze3d or scan) or --weights FOLDER")
+        if self.out.exists() and not self.out.is_dir():
+            raise ValueError(f"{self.out} is a file; expected a folder for the results")
+        if self.out.is_dir() and any(self.out.iterdir()) and not self.overwrite:
+            raise ValueError(f"{self.out} is not empty; give a new folder, or --overwrite")
+
+    @property
+    def weights_folder(self) -> Path:
+        """The folder with the networks; raises ``ValueError`` where there is none."""
+        shipped = Path(get_package_share_directory("ngo_estimator"), "weights")
+        folder = self.weights if self.weights is not None else shipped / str(self.world)
+        if not folder.is_dir():
+            there = "" if self.world is None else f"; worlds: {', '.join(sorted(p.name for p in shipped.iterdir()))}"
+            raise ValueError(f"there is no folder of weights {folder}{there}")
+        return folder
+
+    @property
+    def report_settings(self) -> ReportSettings:
+        """How estimates are compared with the truth, whose poses are those of the very frames."""
+        delta = RelativeDelta() if self.rpe_metres is None else RelativeDelta(self.rpe_metres, "metres")
+        return ReportSettings(delta=delta, segment_lengths_m=self.segment_lengths_m)
+
+
+def run(arguments: Arguments, console: Console) -> dict[str, Any]:
+    """Run both estimators over the recording, write the results and return what run.json says.
+
+    Raises:
+        ValueError, OSError: of one line, about what cannot be read, used or written.
+    """
+    arguments.check()
+    settings = arguments.report_settings
+    with open_recording(arguments.recordings) as recording:
+        # Imported here because torch takes seconds: a file that is not there is said at once.
+        import torch
+
+        from ngo_estimator.local_odometry import LocalOdometry
+        from ngo_estimator.online_trajectory import OnlineTrajectory
+        from ngo_estimator.recording_run import RecordingRun
+
+        torch.set_num_threads(1)
+        folder = arguments.weights_folder
+        local = LocalOdometry.load(folder, arguments.world)
+        online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world)
+        topics = choose_topics(recording, _with_sensor(recording, arguments.topics, local))
+        _check_side_information(topics, local)
+        console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
+        core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
+        began_s = time.monotonic()
+        trajectories = _run(arguments, settings, recording, topics, core, console)
+    took_s = time.monotonic() - began_s
+    if not trajectories:
+        why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
+        raise ValueError(f"no two frames of {topics.image} could be used: {why or f'it has {core.frames}'}")
+    for line in _losses(core):
+        console.print(line, soft_wrap=True, highlight=False)
+    console.print(f"{core.frames} frames in {took_s:.1f} s, {core.frames / took_s:.0f} frames/s", highlight=False)
+    result = {
+        "recordings": [str(path) for path in arguments.recordings],
+        "weights": local.world,
+        "window_frames": arguments.window_frames,
+        "topics": {field.name: _plain(getattr(topics, field.name)) for field in fields(topics)},
+        "frames": core.frames,
+        "not_used": dict(core.rejected),
+        "gaps": core.gaps,
+        "trajectories": trajectories,
+    }
+    (arguments.out / "run.json").write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def _run(
+    arguments: Arguments,
+    settings: ReportSettings,
+    recording: Recording,
+    topics: RecordingTopics,
+    core: "RecordingRun",
+    console: Console,
+) -> list[dict[str, Any]]:
+    """Run over all frames; for each trajectory the folder of its results and how many poses it has."""
+    from ngo_estimator.nodes.recorded_output import PART, RecordedOutput, remove_results
+    from ngo_estimator.recording_run import RecordedStep
+    from ngo_recordings.frames import frames as frames_of
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    found: list[dict[str, Any]] = []
+    output: RecordedOutput | None = None
+    remove_results(arguments.out)
+    with ExitStack() as stack, Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(topics.image, total=recording.topics[topics.image].count)
+        for event in core.run(frames_of(recording, topics, core.rejected)):
+            if output is None:
+                folder = arguments.out if not found else arguments.out / f"{PART}{len(found) + 1}"
+                names = arguments.base_frame, arguments.odom_frame, arguments.map_frame
+                output = stack.enter_context(RecordedOutput(folder, *names))
+            if isinstance(event, RecordedStep):
+                output.add(event)
+                progress.update(task, completed=core.frames)
+                continue
+            found.append(
+                {
+                    "folder": output.folder.relative_to(arguments.out).as_posix(),
+                    "poses": len(event.trajectory.stamps_ns),
+                }
+            )
+            title = f"{arguments.recordings[0].name}{'' if len(found) == 1 else f', part {len(found)}'}"
+            try:
+                reports = output.finish(event, title, settings)
+            except ValueError as error:
+                console.print(f"no errors were measured: {error}", soft_wrap=True, highlight=False)
+                reports = {}
+            stack.pop_all().close()
+            if reports:
+                console.print(report_table(title, reports, ("first", "best")))
+                for line in remarks(reports):
+                    console.print(line, soft_wrap=True, highlight=False)
+            output = None
+    return found
+
+
+def _with_sensor(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
+    """The arguments, with the only laser scan as the image where the weights take one."""
+    scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
+    if given.image is None and local.image_format.is_scan and len(scans) == 1:
+        return replace(given, image=scans[0])
+    return given
+
+
+def _check_side_information(topics: RecordingTopics, local: "LocalOdometry") -> None:
+    for name, needed, topic in (
+        ("action", local.uses_action, topics.action),
+        ("twist", local.uses_twist, topics.twist),
+    ):
+        if needed and topic is None:
+            raise ValueError(
+                f"these weights need the {name} of each step, and no topic of the recording was chosen for it: "
+                f"name one (--{name}), or use weights without"
+            )
+
+
+def _words(topics: RecordingTopics) -> str:
+    used = {
+        "images": topics.image,
+        "depth": topics.depth,
+        "actions": topics.action,
+        "velocities": topics.twist,
+        "truth": topics.ground_truth,
+    }
+    return ", ".join(f"{what} {topic}" for what, topic in used.items() if topic is not None)
+
+
+def _plain(value: object) -> str | float | None:
+    return value if value is None or isinstance(value, float) else str(value)
+
+
+def _rejected(core: "RecordingRun") -> list[tuple[str, int]]:
+    return [(reason, count) for reason, count in core.rejected.items() if count]
+
+
+def _losses(core: "RecordingRun") -> list[str]:
+    """A line for each reason why frames were not used, and one about gaps."""
+    lines = []
+    for reason, count in _rejected(core):
+        example = core.examples.get(reason)
+        lines.append(f"{count} of {core.frames} frames not used: {reason}{f' (first: {example})' if example else ''}")
+    if core.gaps:
+        lines.append(f"{core.gaps} steps span more than the time between two frames in training")
+    return lines
+
+
+def main() -> None:
+    """Run with the command line's arguments."""
+    console = Console()
+    try:
+        arguments = tyro.cli(Arguments, prog=NAME, description=__doc__)
+        run(arguments, console)
+    except (ValueError, OSError) as error:
+        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
