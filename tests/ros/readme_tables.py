@@ -4,6 +4,7 @@ python -m tests.ros.readme_tables      # writes the nodes' parameters into READM
 """
 
 import re
+from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -115,8 +116,8 @@ def default_text(value: object) -> str:
         return f"`{value}`" if value else "`''`"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
-    if isinstance(value, list):
-        return f"`[{', '.join(value)}]`"
+    if isinstance(value, (list, array)):
+        return f"`[{', '.join(map(str, value))}]`"
     return f"`{value}`"
 
 

@@ -12,6 +12,8 @@ from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.source_guard import SourceGuard
 
+_UNKNOWN = "a node of a name not known yet"
+
 
 class OtherPublisher(ValueError):
     """A message of another publisher than the one that is held on to."""
@@ -41,7 +43,8 @@ class Input:
         self._guard = SourceGuard(timeout_s)
         self._kind = f"message on {topic}"
         self._others = ""  # who published beside the one that is held on to, since the last call of problems()
-        self._misfit = ""
+        self._misfit_policy = ""
+        self._misfit_said = ""
         self._subscription = node.create_subscription(
             message_type,
             topic,
@@ -61,10 +64,19 @@ class Input:
 
     def problems(self) -> list[str]:
         """A line for each thing that is wrong with those who publish, the first of them since the last call."""
-        if not self._misfit_publishers():
-            self._misfit = ""
-        found = [line for line in (self._others, self._misfit) if line]
+        found = [self._others] if self._others else []
         self._others = ""
+        misfits = self._misfits() if self._misfit_policy else []
+        # The graph learns of a publisher before it learns its node's name.
+        if misfits and _UNKNOWN not in misfits:
+            names = " and ".join(misfits)
+            found.append(
+                f"nothing comes from {names} on '{self._subscription.topic_name}': "
+                f"the QoS policy {self._misfit_policy} does not fit"
+            )
+            if found[-1] != self._misfit_said:
+                self._misfit_said = found[-1]
+                self._node.get_logger().warning(self._misfit_said)
         return found
 
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
@@ -79,17 +91,13 @@ class Input:
         self._status.dropped(self._kind, OtherPublisher(self._others))
 
     def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
-        policy = qos_policy_name_from_kind(event.last_policy_kind)
-        names = " and ".join(self._misfit_publishers()) or "a publisher"
-        self._misfit = (
-            f"nothing comes from {names} on '{self._subscription.topic_name}': its QoS policy {policy} does not fit"
-        )
-        self._node.get_logger().warning(self._misfit)
+        self._misfit_policy = qos_policy_name_from_kind(event.last_policy_kind)
+        self._misfit_said = ""
 
     def _publishers(self) -> list[TopicEndpointInfo]:
         return list(self._node.get_publishers_info_by_topic(self._subscription.topic_name))
 
-    def _misfit_publishers(self) -> list[str]:
+    def _misfits(self) -> list[str]:
         """Names of those from whom nothing comes."""
         own = self._subscription.qos_profile
         return sorted(
@@ -100,4 +108,6 @@ class Input:
 
 
 def _name(publisher: TopicEndpointInfo) -> str:
+    if "UNKNOWN" in publisher.node_name:
+        return _UNKNOWN
     return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"

@@ -1,0 +1,341 @@
+"""What arrives broken at ngo_node: a real process, fed by the test with what a bad day brings.
+
+Each test drives anew, with stamps long before those of the one before it, which is what a restarted source looks like.
+"""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Path as PathMessage
+from ngo_msgs.msg import RelativePose
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.nodes.messages import to_ns, to_time
+
+from .processes import NodeProcess, Probe, wait_until
+from .relative_poses import Optimizer, assert_pose_is
+
+pytestmark = pytest.mark.processes
+
+SOURCE_TIMEOUT_S = 0.3
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("weights")
+    write_untrained(folder, "maze2d")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def parameters(weights: Path) -> dict[str, object]:
+    return {
+        "world": "maze2d",
+        "weights": str(weights),
+        "diagnostics_period_s": 0.1,
+        "source_timeout_s": SOURCE_TIMEOUT_S,
+        "lost_position_std_m": 0.5,
+    }
+
+
+@pytest.fixture(scope="module")
+def optimizer(weights: Path, parameters: dict[str, object]) -> Iterator[Optimizer]:
+    probe = Probe()
+    with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+        yield Optimizer(process, weights, probe)
+        assert process.running, process.log
+        assert "Traceback" not in process.log, process.log
+    probe.close()
+
+
+def test_lost_steps_become_a_gap_with_a_large_covariance(optimizer: Optimizer) -> None:
+    drive = optimizer.drive()
+    steps = [*drive.steps(1, 5), *drive.steps(16, 20)]
+    gaps = optimizer.count("gaps")
+    optimizer.publish(*steps)
+    pose = optimizer.wait_for_stamp(drive.stamp_ns(20))
+    assert_pose_is(pose, optimizer.expected(steps))
+    optimizer.wait_for_value("gaps", lambda value: int(value) == gaps + 1)
+    before, after = (np.array(optimizer.poses[k].pose.covariance).reshape(6, 6)[5, 5] for k in (4, 5))
+    assert after > before + 10 * 0.01**2, "ten steps were lost, and one came"
+    odometry = (drive.step(20).odom_x, drive.step(20).odom_y)
+    assert np.hypot(*odometry) > 0.5, "the test drives nowhere"
+
+
+def test_a_gap_is_flagged(optimizer: Optimizer) -> None:
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 3))
+    optimizer.wait_for_stamp(drive.stamp_ns(3))
+    optimizer.diagnostics.clear()
+    optimizer.publish(*drive.steps(9, 10))
+    optimizer.probe.spin_until(
+        lambda: any("1 gaps in the relative poses" in status.message for status in optimizer.statuses()), "the flag"
+    )
+
+
+def test_while_lost_covariance_and_diagnostics_say_so(optimizer: Optimizer) -> None:
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 2))
+    optimizer.wait_for_stamp(drive.stamp_ns(2))
+    far = drive.step(9003)  # a quarter of an hour later
+    optimizer.publish(far)
+    pose = optimizer.wait_for_stamp(drive.stamp_ns(9003))
+    assert np.sqrt(pose.pose.covariance[0]) > 0.5
+    optimizer.wait_for_problem("lost: the standard deviation of the position is ")
+
+
+def test_a_burst_is_taken_whole(optimizer: Optimizer) -> None:
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 500))
+    optimizer.wait_for_stamp(drive.stamp_ns(500))
+    assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 501)]
+
+
+def test_doubled_late_and_reordered_steps_change_nothing(optimizer: Optimizer) -> None:
+    drive = optimizer.drive()
+    order = [1, 2, 3, 3, 5, 4, 6, 2, 6, 7, 8, 9]
+    optimizer.publish(*(drive.step(step) for step in order))
+    pose = optimizer.wait_for_stamp(drive.stamp_ns(9))
+    assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in (1, 2, 3, 5, 6, 7, 8, 9)]
+    assert_pose_is(pose, optimizer.expected([drive.step(step) for step in (1, 2, 3, 5, 6, 7, 8, 9)]))
+    for kind in ("duplicate", "late"):
+        assert optimizer.count(f"dropped: relative pose ({kind} step)") >= 2
+    optimizer.process.wait_for_log("dropped relative pose: step to .* came when the trajectory was at")
+
+
+def test_time_that_jumps_back_is_a_clean_reset(optimizer: Optimizer) -> None:
+    """A bag that is played in a loop: the same stamps, the same origin."""
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 30))
+    once = optimizer.wait_for_stamp(drive.stamp_ns(30))
+    restarts = optimizer.count("restarts")
+    optimizer.poses.clear()
+    optimizer.publish(*drive.steps(1, 30))
+    again = optimizer.wait_for_stamp(drive.stamp_ns(30))
+    assert len(optimizer.poses) == 30
+    assert again == once
+    optimizer.wait_for_value("restarts", lambda value: int(value) == restarts + 1)
+
+
+def broken(message: RelativePose, what: str) -> RelativePose:
+    """A message spoilt in one way."""
+    if what == "nan":
+        message.x = float("nan")
+    elif what == "infinity":
+        message.odom_y = float("inf")
+    elif what == "short feature":
+        message.motion_feature = message.motion_feature[:-1]
+    elif what == "long code":
+        message.place_code = [*message.place_code, 0.0]
+    elif what == "no feature":
+        message.motion_feature = []
+    elif what == "negative covariance":
+        message.covariance[4] = -1.0
+    elif what == "backwards":
+        message.from_stamp, message.header.stamp = message.header.stamp, message.from_stamp
+    else:
+        message.yaw = 1e300
+    return message
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["nan", "infinity", "short feature", "long code", "no feature", "negative covariance", "backwards", "huge"],
+)
+def test_unusable_values_are_dropped_and_nothing_wrong_is_published(optimizer: Optimizer, what: str) -> None:
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 4), broken(drive.step(5), what), *drive.steps(6, 8))
+    pose = optimizer.wait_for_stamp(drive.stamp_ns(8))
+    good = [*drive.steps(1, 4), *drive.steps(6, 8)]
+    assert optimizer.stamps_ns() == [to_ns(message.header.stamp) for message in good]
+    assert_pose_is(pose, optimizer.expected(good))
+
+
+def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:
+    other = Probe("careless_odometry")
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = other.node.create_publisher(RelativePose, "relative_pose", best_effort)
+    try:
+        message = optimizer.wait_for_problem("/careless_odometry", "'/relative_pose'", "RELIABILITY")
+        assert "nothing comes from" in message, message
+        optimizer.process.wait_for_log("WARN.*nothing comes from /careless_odometry on '/relative_pose'")
+    finally:
+        other.node.destroy_publisher(publisher)
+        other.close()
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 2))
+    optimizer.wait_for_stamp(drive.stamp_ns(2))
+
+
+def test_of_two_publishers_the_first_is_held_and_both_are_named(optimizer: Optimizer) -> None:
+    intruder, drive = optimizer.drive(seed=7), optimizer.drive()
+    optimizer.publish(*drive.steps(1, 3))
+    optimizer.wait_for_stamp(drive.stamp_ns(3))
+    other = Probe("second_odometry")
+    publisher = other.node.create_publisher(RelativePose, "relative_pose", 5000)
+    try:
+        other.spin_until(lambda: publisher.get_subscription_count() == 1, "a match")
+        for step in range(4, 41):
+            optimizer.publish(drive.step(step))
+            publisher.publish(intruder.step(step))
+            optimizer.wait_for_stamp(drive.stamp_ns(step))
+        assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 41)]
+        assert_pose_is(optimizer.poses[-1], optimizer.expected(drive.steps(1, 40)))
+        optimizer.process.wait_for_log(
+            "dropped message on relative_pose: /probe and /second_odometry publish on '/relative_pose': only the first"
+        )
+        # The first falls silent: the other takes its place.
+        step = 40
+
+        def taken_over() -> bool:
+            nonlocal step
+            step += 1
+            publisher.publish(intruder.step(step))
+            return optimizer.stamps_ns()[-1] > intruder.origin_ns
+
+        optimizer.probe.spin_until(taken_over, "the second to take over")
+    finally:
+        other.node.destroy_publisher(publisher)
+        other.close()
+
+
+def test_a_subscriber_that_stalls_holds_nobody_up(optimizer: Optimizer) -> None:
+    """A stopped process with a reliable subscription to the path: poses go on, and it may come back."""
+    listener = subprocess.Popen(
+        [sys.executable, "-m", "tests.ros.listener", "ngo/path"], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        optimizer.probe.spin_until(lambda: optimizer.probe.node.count_subscribers("ngo/path") == 1, "the listener")
+        drive = optimizer.drive()
+        optimizer.publish(*drive.steps(1, 8))
+        optimizer.wait_for_stamp(drive.stamp_ns(8))
+        assert listener.stdout is not None and int(listener.stdout.readline()) > 0
+        listener.send_signal(signal.SIGSTOP)
+        slowest_s = 0.0
+        for step in range(9, 400):
+            started = time.monotonic()
+            optimizer.publish(drive.step(step))
+            optimizer.wait_for_stamp(drive.stamp_ns(step))
+            slowest_s = max(slowest_s, time.monotonic() - started)
+        assert slowest_s < 1.0
+        assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 400)]
+        listener.send_signal(signal.SIGCONT)
+        while int(listener.stdout.readline()) != 400:
+            assert listener.poll() is None
+    finally:
+        listener.kill()
+        listener.wait()
+
+
+@pytest.mark.parametrize("rate_hz", [10, 200])
+def test_slow_and_fast_input_is_taken_whole_and_the_path_keeps_its_pace(optimizer: Optimizer, rate_hz: int) -> None:
+    paths = optimizer.probe.collect(PathMessage, "ngo/path")
+    optimizer.probe.spin_until(lambda: optimizer.probe.node.count_subscribers("ngo/path") >= 1, "a subscription")
+    drive, count = optimizer.drive(period_ns=10**9 // rate_hz), max(10, rate_hz)
+    begin = time.monotonic()
+    for step in range(1, count + 1):
+        optimizer.probe.spin_until(lambda due=begin + step / rate_hz: time.monotonic() >= due, "the time")
+        optimizer.publish(drive.step(step))
+    optimizer.wait_for_stamp(drive.stamp_ns(count))
+    assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, count + 1)]
+    optimizer.probe.spin_until(
+        lambda: paths and to_ns(paths[-1].header.stamp) == drive.stamp_ns(count), "the whole path"
+    )
+    seconds = time.monotonic() - begin
+    assert len(paths) <= 10 * seconds + 2
+    if rate_hz == 200:
+        assert len(paths) < count / 2
+
+
+def test_silence_is_said(optimizer: Optimizer) -> None:
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 3))
+    optimizer.wait_for_stamp(drive.stamp_ns(3))
+    optimizer.diagnostics.clear()
+    optimizer.probe.spin_until(
+        lambda: any(
+            status.level == DiagnosticStatus.STALE and status.message.startswith("no input for ")
+            for status in optimizer.statuses()
+        ),
+        "STALE in diagnostics",
+    )
+
+
+def test_a_killed_node_that_comes_back_goes_on_in_the_middle(weights: Path, parameters: dict[str, object]) -> None:
+    """The odometry has gone on: the new map begins where the first step that it hears does."""
+    probe = Probe("steady_odometry")
+    namespace = ("-r", "__ns:=/revived")
+    try:
+        with NodeProcess("ngo_estimator", "ngo_node", parameters, namespace) as process:
+            first = Optimizer(process, weights, probe, "/revived")
+            drive = first.drive()
+            first.publish(*drive.steps(1, 10))
+            first.wait_for_stamp(drive.stamp_ns(10))
+            process.send(signal.SIGKILL)
+            process.wait()
+            first.publish(*drive.steps(11, 15))
+        with NodeProcess("ngo_estimator", "ngo_node", parameters, namespace) as process:
+            process.wait_for_log("ready")
+            first.poses.clear()
+            step = 15
+
+            def heard() -> bool:
+                nonlocal step
+                step += 1
+                first.publish(drive.step(step))
+                return bool(first.poses)
+
+            probe.spin_until(heard, "a pose of the new node")
+            begin = to_ns(first.poses[0].header.stamp)
+            steps = [message for message in drive.steps(16, step) if to_ns(message.header.stamp) >= begin]
+            pose = first.wait_for_stamp(drive.stamp_ns(step))
+            assert_pose_is(pose, first.expected(steps))
+    finally:
+        probe.close()
+
+
+def test_a_clock_that_stands_still_or_jumps_stops_nothing(weights: Path, parameters: dict[str, object]) -> None:
+    """With use_sim_time: stamps come from the input, and pace and diagnostics from a clock that always goes on."""
+    probe = Probe("clock")
+    clock = probe.node.create_publisher(Clock, "/clock", 10)
+    simulated = {**parameters, "use_sim_time": True}
+    with NodeProcess("ngo_estimator", "ngo_node", simulated, ("-r", "__ns:=/simulated")) as process:
+        optimizer = Optimizer(process, weights, probe, "/simulated")
+        paths = probe.collect(PathMessage, "/simulated/ngo/path")
+        probe.spin_until(lambda: probe.node.count_subscribers("/simulated/ngo/path") == 1, "a subscription")
+        for clock_s in (0, 100, 100, 3):
+            clock.publish(Clock(clock=to_time(clock_s * 10**9)))
+            drive = optimizer.drive()
+            optimizer.publish(*drive.steps(1, 12))
+            pose = optimizer.wait_for_stamp(drive.stamp_ns(12))
+            assert_pose_is(pose, optimizer.expected(drive.steps(1, 12)))
+            probe.spin_until(lambda: paths and to_ns(paths[-1].header.stamp) == drive.stamp_ns(12), "the path")  # noqa: B023
+            optimizer.wait_for_value("frames", "13".__eq__)
+        assert to_ns(optimizer.diagnostics[-1].header.stamp) == drive.stamp_ns(12)
+        process.send(signal.SIGINT)
+        assert process.wait() == 0, process.log
+    probe.close()
+
+
+def test_nothing_is_left_of_a_burst_of_rubbish(optimizer: Optimizer) -> None:
+    """Empty messages, as a publisher of another program may send: dropped with one line, not one each."""
+    optimizer.drive()
+    lines = len(optimizer.process.lines)
+    optimizer.publish(*(RelativePose() for _ in range(500)))
+    drive = optimizer.drive()
+    optimizer.publish(*drive.steps(1, 2))
+    optimizer.wait_for_stamp(drive.stamp_ns(2))
+    assert len(optimizer.poses) == 2
+    wait_until(lambda: len(optimizer.process.lines) <= lines + 3, "few lines")
