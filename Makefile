@@ -33,7 +33,7 @@ build: venv ## the workspace, with colcon
 demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000
 	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
 
-train: build ## every network of a world, from simulated data, into the estimator's package: WORLD=maze3d|maze2d
+train: build ## every network of a world, from simulated data, into the estimator's package: WORLD=maze3d|maze2d|scan
 	@$(OPEN) && for script in train_local train_place featurise train_optimizer evaluate; do \
 		python -m training.$$script --world $(WORLD) || exit; done
 
