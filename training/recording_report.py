@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ngo_recordings.association import header_stamp_ns
-from ngo_recordings.frames import Frame, frames
+from ngo_recordings.frames import NO_DEPTH, UNUSABLE, Frame, frames
 from ngo_recordings.recording import Message, Recording
 from ngo_recordings.topics import POSE_TYPES, TF_TYPE, RecordingTopics
 
@@ -275,8 +275,10 @@ class _Findings:
         for path in self.recording.unfinished:
             yield f"{path} has no end (its recorder was killed): it is read to its last whole chunk"
         yield from self._of_times()
-        for reason, count in self.skipped.items():
-            yield f"{count} images are left out, {reason}: raise --tolerance-s, or record depth at the images' rate"
+        if count := self.skipped[NO_DEPTH]:
+            yield f"{count} images are left out, {NO_DEPTH}: raise --tolerance-s, or record depth at the images' rate"
+        if count := self.skipped[UNUSABLE]:
+            yield f"{count} images are left out, {UNUSABLE}: record anew, or cut the recording there"
         if self.frames < 2:
             yield f"there are {self.frames} frames: a recording needs two at least"
             return

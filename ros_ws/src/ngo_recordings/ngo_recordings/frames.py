@@ -26,6 +26,9 @@ from ngo_recordings.topics import TF_TYPE, RecordingTopics
 
 __all__ = ["Frame", "ScanGeometry", "frames"]
 
+NO_DEPTH = "no depth within the tolerance"
+UNUSABLE = "damaged, or of another size or encoding than before"
+
 # How far the recording is read on for what belongs to an image, before the image is taken without it.
 _WAIT_NS = 2_000_000_000
 
@@ -57,19 +60,22 @@ def frames(recording: Recording, topics: RecordingTopics, skipped: Counter[str] 
     Reads the recording once. An image waits for what belongs to it, at most 2 s of the recording, so memory is bounded.
 
     Args:
-        skipped: counts images that gave no frame, by the reason.
+        skipped: counts images that gave no frame, by the reason (NO_DEPTH, UNUSABLE).
 
     Raises:
-        RecordingError: an image of an encoding that is not supported, or of another size than the one before.
+        RecordingError: an image that is damaged, of an encoding that is not supported, or of another size than those
+            before. Where skipped is given, only for the first; later ones are counted.
     """
-    return _Frames(recording, topics, Counter() if skipped is None else skipped).run()
+    return _Frames(recording, topics, skipped).run()
 
 
 class _Frames:
     """One pass over a recording."""
 
-    def __init__(self, recording: Recording, topics: RecordingTopics, skipped: Counter[str]) -> None:
-        self._recording, self._topics, self._skipped = recording, topics, skipped
+    def __init__(self, recording: Recording, topics: RecordingTopics, skipped: Counter[str] | None) -> None:
+        self._recording, self._topics = recording, topics
+        self._tolerant = skipped is not None
+        self._skipped: Counter[str] = Counter() if skipped is None else skipped
         tolerance_ns, gap_ns = round(topics.tolerance_s * 1e9), round(topics.interpolation_s * 1e9)
         self._depth = Depths(tolerance_ns)
         self._actions = Actions(tolerance_ns)
@@ -132,7 +138,7 @@ class _Frames:
             return True
         stamp_ns = header_stamp_ns(image.value)
         return all(
-            side.knows(self._before_ns, stamp_ns) or now_ns >= end_ns
+            side.knows(self._before_ns, stamp_ns) or now_ns > end_ns
             for (side, _), end_ns in zip(self._sides, self._ends_ns, strict=True)
         )
 
@@ -145,14 +151,29 @@ class _Frames:
         message = self._pending.popleft()
         stamp_ns, before_ns = header_stamp_ns(message.value), self._before_ns
         self._before_ns = stamp_ns if before_ns is None else max(before_ns, stamp_ns)
-        type_name = self._recording.topics[message.topic].type_name
-        image, scan = picture(message.value, type_name, message.topic)
+        try:
+            decoded = self._decoded(message, stamp_ns)
+        except RecordingError:
+            if not self._tolerant or self._shape is None:
+                raise
+            self._skipped[UNUSABLE] += 1
+            decoded = None
+        if decoded is None:
+            self._before_ns = None  # no single step leads over the gap
+            return
+        image, scan = decoded
+        yield self._frame(stamp_ns, before_ns, image, scan)
+        for side, _ in self._sides:
+            side.forget_before(stamp_ns)
+
+    def _decoded(self, message: Message, stamp_ns: int) -> tuple[np.ndarray, ScanGeometry | None] | None:
+        """The image with its depth; None where that is missing."""
+        image, scan = picture(message.value, self._recording.topics[message.topic].type_name, message.topic)
         if self._topics.depth is not None:
             depth = self._depth.at(stamp_ns)
             if depth is None:
-                self._skipped["no depth within the tolerance"] += 1
-                self._before_ns = None  # no single step leads over the gap
-                return
+                self._skipped[NO_DEPTH] += 1
+                return None
             image = with_depth(image, picture(depth, IMAGE_TYPE, self._topics.depth)[0], self._topics.depth)
         if scan is None and self._shape not in (None, image.shape):
             raise RecordingError(
@@ -160,9 +181,7 @@ class _Frames:
                 f"{self._shape} (height, width, channels): split the recording there"
             )
         self._shape = image.shape
-        yield self._frame(stamp_ns, before_ns, image, scan)
-        for side, _ in self._sides:
-            side.forget_before(stamp_ns)
+        return image, scan
 
     def _frame(self, stamp_ns: int, before_ns: int | None, image: np.ndarray, scan: ScanGeometry | None) -> Frame:
         pose = residual = action = twist = None
@@ -171,4 +190,3 @@ class _Frames:
         if before_ns is not None and stamp_ns > before_ns:
             action, twist = self._actions.step(before_ns, stamp_ns), self._twists.step(before_ns, stamp_ns)
         return Frame(stamp_ns, image, scan, action, twist, pose, residual)
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from bisect import bisect_left
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,7 +197,9 @@ def read_tum(path: Path, gap_ns: int) -> PoseTrack:
     Raises RecordingError where it is not.
     """
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty file is told below
+            rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read as a TUM file: {' '.join(str(error).split())}") from None
     if not len(rows) or rows.shape[1] != 8:

@@ -1,0 +1,142 @@
+"""Poses in space: algebra, interpolation, chains of transforms, and what is planar of them."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.poses import Pose, PoseTrack, TransformTree, make_pose, read_tum
+
+S = 10**9
+angles = st.floats(-3.0, 3.0)
+metres = st.floats(-20.0, 20.0)
+poses = st.builds(
+    lambda x, y, z, a, b, c: Pose(np.array([x, y, z]), Rotation.from_rotvec([a, b, c])),
+    metres, metres, metres, st.floats(-1.7, 1.7), st.floats(-1.7, 1.7), st.floats(-1.7, 1.7),
+)  # fmt: skip
+
+
+def flat(x: float, y: float, yaw: float) -> Pose:
+    return Pose(np.array([x, y, 0.0]), Rotation.from_euler("z", yaw))
+
+
+def assert_same(one: Pose | None, other: Pose, atol: float = 1e-9) -> None:
+    assert one is not None
+    np.testing.assert_allclose(one.position, other.position, atol=atol)
+    np.testing.assert_allclose(one.rotation.as_matrix(), other.rotation.as_matrix(), atol=atol)
+
+
+@given(a=poses, b=poses)
+def test_a_pose_after_its_inverse_is_none(a: Pose, b: Pose) -> None:
+    assert_same(a.inverse() @ (a @ b), b, 1e-7)
+
+
+@given(x=metres, y=metres, z=metres, yaw=angles, pitch=st.floats(-1.4, 1.4), roll=angles)
+def test_planar_part_and_residual_are_the_usual_angles(
+    x: float, y: float, z: float, yaw: float, pitch: float, roll: float
+) -> None:
+    pose = Pose(np.array([x, y, z]), Rotation.from_euler("ZYX", [yaw, pitch, roll]))
+    planar, residual = pose.planar()
+    np.testing.assert_allclose(planar, [x, y, yaw], atol=1e-7)
+    np.testing.assert_allclose(residual, [z, roll, pitch], atol=1e-7)
+
+
+def test_between_two_poses_it_goes_straight_and_the_shortest_turn() -> None:
+    track = PoseTrack(gap_ns=2 * S)
+    track.add(1 * S, flat(0.0, 0.0, math.radians(170)))
+    track.add(3 * S, flat(4.0, 2.0, math.radians(-170)))
+    assert_same(track.at(round(1.5 * S)), flat(1.0, 0.5, math.radians(175)))
+    assert_same(track.at(3 * S), flat(4.0, 2.0, math.radians(-170)))
+
+
+@given(a=poses, b=poses, share=st.integers(0, 1000))
+def test_interpolation_moves_along_one_screw_free_line(a: Pose, b: Pose, share: int) -> None:
+    track = PoseTrack(gap_ns=1000)
+    track.add(0, a)
+    track.add(1000, b)
+    middle = track.at(share)
+    assert middle is not None
+    whole = (a.rotation.inv() * b.rotation).magnitude()
+    assert math.isclose((a.rotation.inv() * middle.rotation).magnitude(), share / 1000 * whole, abs_tol=1e-6)
+    np.testing.assert_allclose(middle.position - a.position, share / 1000 * (b.position - a.position), atol=1e-9)
+
+
+def test_nothing_is_made_up_beyond_the_ends_or_over_a_gap() -> None:
+    track = PoseTrack(gap_ns=1 * S)
+    assert track.at(0) is None and track.newest_ns is None
+    for second in (1, 2, 5):
+        track.add(second * S, flat(second, 0.0, 0.0))
+    assert track.at(round(0.9 * S)) is None
+    assert track.at(round(5.1 * S)) is None
+    assert track.at(3 * S) is None
+    assert_same(track.at(round(1.25 * S)), flat(1.25, 0.0, 0.0))
+    # Rounded in a text file, a stamp is the same within 1 ms.
+    assert_same(track.at(5 * S + 400_000), flat(5.0, 0.0, 0.0))
+
+
+@given(order=st.permutations(range(6)))
+def test_late_poses_go_to_their_place(order: list[int]) -> None:
+    track = PoseTrack(gap_ns=S)
+    for k in order:
+        track.add(k * S, flat(k, -k, 0.0))
+    for k in range(5):
+        assert_same(track.at(k * S + S // 2), flat(k + 0.5, -k - 0.5, 0.0))
+
+
+def test_a_chain_goes_up_and_down_the_tree_with_what_is_static() -> None:
+    tree = TransformTree(gap_ns=S)
+    map_from_odom, odom_from_base = flat(10.0, 0.0, math.pi / 2), flat(1.0, 2.0, 0.3)
+    base_from_camera, world_from_map = flat(0.2, 0.0, -0.1), flat(0.0, 5.0, 0.0)
+    tree.add("base", "camera", 0, base_from_camera, static=True)
+    tree.add("world", "map", 0, world_from_map, static=True)
+    assert tree.lookup("map", "camera", S) is None and tree.known_until_ns("map", "camera") is None
+    tree.add("map", "odom", 1 * S, map_from_odom, static=False)
+    tree.add("odom", "base", 1 * S, odom_from_base, static=False)
+    tree.add("odom", "base", 2 * S, odom_from_base, static=False)
+    assert tree.known_until_ns("map", "camera") == 1 * S
+    expected = map_from_odom @ odom_from_base @ base_from_camera
+    assert_same(tree.lookup("map", "camera", 1 * S), expected)
+    assert_same(tree.lookup("camera", "map", 1 * S), expected.inverse())
+    assert_same(tree.lookup("world", "camera", 1 * S), world_from_map @ expected)
+    assert tree.lookup("map", "camera", 2 * S) is None, "odom is known for 1 s only"
+    assert tree.lookup("map", "nowhere", 1 * S) is None
+    tree.add("map", "odom", 2 * S, map_from_odom, static=False)
+    assert_same(tree.lookup("map", "camera", round(1.5 * S)), expected)
+    assert_same(tree.lookup("odom", "camera", round(1.5 * S)), odom_from_base @ base_from_camera)
+
+
+def test_a_ring_of_transforms_is_no_endless_loop() -> None:
+    tree = TransformTree(gap_ns=S)
+    tree.add("a", "b", 0, flat(1.0, 0.0, 0.0), static=True)
+    tree.add("b", "a", 0, flat(-1.0, 0.0, 0.0), static=True)
+    assert tree.lookup("a", "c", 0) is None
+    assert tree.lookup("a", "b", 0) is not None
+
+
+def test_poses_that_are_no_numbers_are_no_poses() -> None:
+    assert make_pose((math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) is None
+    assert make_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)) is None
+    assert make_pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 2.0)) is not None
+
+
+def test_a_tum_file_is_read_to_the_microsecond(tmp_path: Path) -> None:
+    path = tmp_path / "truth.tum"
+    path.write_text("# timestamp tx ty tz qx qy qz qw\n1700000000.25 1 2 3 0 0 0 1\n1700000000.75 2 2 3 0 0 1 0\n")
+    track = read_tum(path, gap_ns=S)
+    pose = track.at(1_700_000_000_500_000_000)
+    assert pose is not None
+    np.testing.assert_allclose(pose.planar()[0], [1.5, 2.0, math.pi / 2], atol=1e-6)
+
+
+@pytest.mark.parametrize("text", ["", "1 2 3\n", "1 2 3 4 5 6 7 nought\n", "0 1 2 3 0 0 0 1 9\n"])
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "truth.tum"
+    path.write_text(text)
+    with pytest.raises(RecordingError) as error:
+        read_tum(path, gap_ns=S)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)

@@ -1,0 +1,340 @@
+"""Recordings of every kind are read the same, whole or cut; what cannot be read says so in one line."""
+
+import shutil
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader, StoragePlugin
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ngo_recordings.definitions import message_definition
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.recording import Message, TopicInfo, open_recording
+from ngo_recordings.writer import RecordingWriter
+
+from . import messages as m
+
+COUNT = 60
+
+
+def drive(count: int = COUNT, seed: int = 0) -> Iterator[m.Entry]:
+    """Images, custom messages and strings, three a frame."""
+    rng = np.random.default_rng(seed)
+    for k in range(count):
+        stamp_ns = 10**9 + k * 10**8
+        yield "/image", stamp_ns, m.image(stamp_ns, rng.integers(0, 256, (8, 12, 3)).astype(np.uint8))
+        yield "/pose", stamp_ns + 1, m.pose_stamped(stamp_ns, 0.1 * k, -0.2, 0.3)
+        yield "/action", stamp_ns + 2, m.action(stamp_ns, k % 3)
+
+
+def facts(messages: Iterator[Message]) -> list[tuple[str, int, bytes]]:
+    """What can be compared of messages: made into bytes again."""
+    return [(each.topic, each.log_time_ns, m.serialised(into_store(each.value))) for each in messages]
+
+
+def into_store(value: Any) -> Any:
+    """The same message of the types of the tests' own store, whose classes differ."""
+    if isinstance(value, list):
+        return [into_store(item) for item in value]
+    if not hasattr(value, "__msgtype__"):
+        return value
+    fields = {name: into_store(part) for name, part in vars(value).items()}
+    return m.STORE.types[value.__msgtype__](**fields)
+
+
+def expected(entries: list[m.Entry]) -> list[tuple[str, int, bytes]]:
+    return [(topic, log_time_ns, m.serialised(message)) for topic, log_time_ns, message in entries]
+
+
+@pytest.fixture(params=["mcap", "folder", "rosbags_mcap", "rosbags_sqlite3", "sqlite3_file"])
+def stored(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """One drive in each form that we read."""
+    entries = list(drive())
+    if request.param == "mcap":
+        return m.write_mcap(tmp_path / "drive.mcap", entries, chunk_bytes=5000)
+    if request.param == "folder":
+        return m.write_mcap(tmp_path / "drive", entries, chunk_bytes=5000)
+    if request.param == "rosbags_mcap":
+        return m.write_rosbag(tmp_path / "drive", entries, StoragePlugin.MCAP)
+    folder = m.write_rosbag(tmp_path / "drive", entries)
+    return folder if request.param == "rosbags_sqlite3" else folder / "drive.db3"
+
+
+def test_every_form_is_read_the_same(stored: Path) -> None:
+    entries = list(drive())
+    with open_recording([stored]) as recording:
+        assert facts(recording.messages()) == expected(entries)
+        assert recording.topics == {
+            "/action": TopicInfo("ngo_msgs/msg/DiscreteAction", COUNT, entries[2][1], entries[-1][1]),
+            "/image": TopicInfo("sensor_msgs/msg/Image", COUNT, entries[0][1], entries[-3][1]),
+            "/pose": TopicInfo("geometry_msgs/msg/PoseStamped", COUNT, entries[1][1], entries[-2][1]),
+        }
+        assert recording.unfinished == ()
+        chosen = [entry for entry in entries if entry[0] != "/image"]
+        assert facts(recording.messages(["/pose", "/action"])) == expected(chosen)
+
+
+def test_custom_types_need_no_ros_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = m.write_mcap(tmp_path / "drive.mcap", drive())
+    monkeypatch.setenv("AMENT_PREFIX_PATH", "")
+    with open_recording([path]) as recording:
+        actions = [message.value.action for message in recording.messages(["/action"])]
+    assert actions == [k % 3 for k in range(COUNT)]
+
+
+def test_the_mcap_and_the_rosbags_library_read_every_message(tmp_path: Path) -> None:
+    entries = list(drive())
+    path = m.write_mcap(tmp_path / "drive.mcap", entries, chunk_bytes=5000)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        read = [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]
+    assert read == expected(entries)
+    with AnyReader([path]) as reader:
+        for (connection, log_time_ns, data), (topic, time_ns, cdr) in zip(
+            reader.messages(), expected(entries), strict=True
+        ):
+            assert (connection.topic, log_time_ns, bytes(data)) == (topic, time_ns, cdr)
+            assert reader.deserialize(data, connection.msgtype).header.stamp.sec == time_ns // 10**9
+
+
+def test_a_folder_is_one_of_rosbag2(tmp_path: Path) -> None:
+    folder = m.write_mcap(tmp_path / "drive", drive())
+    with Reader(folder) as reader:  # refuses metadata.yaml that is not as it should be
+        assert reader.message_count == 3 * COUNT and reader.ros_distro == "jazzy"
+        assert (reader.start_time, reader.end_time - 1) == (10**9, 10**9 + (COUNT - 1) * 10**8 + 2)
+        assert {connection.topic: connection.msgcount for connection in reader.connections} == dict.fromkeys(
+            ("/image", "/pose", "/action"), COUNT
+        )
+        assert sum(1 for _ in reader.messages()) == 3 * COUNT
+    text = (folder / "metadata.yaml").read_text()
+    assert "&" not in text, "aliases, which rosbag2 does not write"
+
+
+def test_several_files_are_one_in_order_of_time(tmp_path: Path) -> None:
+    entries = list(drive())
+    first = m.write_mcap(tmp_path / "b.mcap", entries[::2])
+    second = m.write_rosbag(tmp_path / "a", entries[1::2])
+    with open_recording([first, second]) as recording:
+        assert facts(recording.messages()) == expected(entries)
+        assert recording.topics["/image"].count == COUNT
+
+
+def cut(path: Path, size: int) -> Path:
+    copy = path.with_name(f"cut_{size}.mcap")
+    copy.write_bytes(path.read_bytes()[:size])
+    return copy
+
+
+def test_wherever_a_file_is_cut_it_is_read_to_its_last_whole_chunk(tmp_path: Path) -> None:
+    entries = list(drive())
+    path = m.write_mcap(tmp_path / "drive.mcap", entries, chunk_bytes=3000)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and len(summary.chunk_indexes) > 10
+    ends = [(chunk.chunk_start_offset + chunk.chunk_length, chunk.message_end_time) for chunk in summary.chunk_indexes]
+    for end, last_ns in ends:
+        for size in (end, end + 5):  # and within the record after it
+            with open_recording([cut(path, size)]) as recording:
+                read = facts(recording.messages())
+                assert recording.unfinished == recording.paths
+                assert sum(info.count for info in recording.topics.values()) == len(read)
+            assert read == expected([entry for entry in entries if entry[1] <= last_ns])
+
+
+@settings(deadline=None, max_examples=60)
+@given(data=st.data())
+def test_damaged_files_give_whole_messages_or_one_clear_line(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("damaged")
+    path = m.write_mcap(folder / "drive.mcap", drive(12), chunk_bytes=2000)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    complaint = str(path)
+    try:
+        with open_recording([path]) as recording:
+            for _ in recording.messages():
+                pass
+    except RecordingError as error:
+        complaint = str(error)
+    shutil.rmtree(folder)
+    assert "\n" not in complaint and str(path) in complaint
+
+
+def test_the_same_messages_make_the_same_bytes_without_flushing_by_the_clock(tmp_path: Path) -> None:
+    paths = [m.write_mcap(tmp_path / name, drive(), flush_s=None) for name in ("a.mcap", "b.mcap")]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_what_is_written_is_on_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    with RecordingWriter(path, flush_s=0.0) as writer:
+        writer.add_topic("/action", m.ACTION)
+        for k in range(5):
+            writer.write("/action", m.serialised(m.action(k, 1)), k)
+            with open_recording([path]) as recording:
+                assert [message.log_time_ns for message in recording.messages()] == list(range(k + 1))
+
+
+def test_files_without_chunks_or_without_an_index_are_read(tmp_path: Path) -> None:
+    entries = list(drive())
+    for name, options in (("plain", {"use_chunking": False}), ("unindexed", {"use_statistics": False})):
+        path = tmp_path / f"{name}.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream, compression=CompressionType.LZ4, **options)
+            writer.start(profile="ros2")
+            channels: dict[str, int] = {}
+            for topic, log_time_ns, message in entries:
+                if topic not in channels:
+                    text = message_definition(message.__msgtype__)
+                    schema = writer.register_schema(message.__msgtype__, "ros2msg", text.encode())
+                    channels[topic] = writer.register_channel(topic, "cdr", schema)
+                writer.add_message(channels[topic], log_time_ns, m.serialised(message), log_time_ns)
+            writer.finish()
+        with open_recording([path]) as recording:
+            assert facts(recording.messages()) == expected(entries)
+            assert recording.topics["/pose"].count == COUNT
+            assert recording.unfinished == ()
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+    def peak(count: int) -> int:
+        pixels = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+        entries = (("/image", k, m.image(k, pixels)) for k in range(count))
+        path = m.write_mcap(tmp_path / f"{count}.mcap", entries, chunk_bytes=2**18)
+        tracemalloc.start()
+        with open_recording([path]) as recording:
+            read = sum(1 for _ in recording.messages(["/image"]))
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert read == count
+        return most
+
+    peak(20)  # what is loaded once
+    assert peak(1200) < 1.5 * peak(120) + 2**20
+
+
+def test_sqlite3_of_old_versions_without_definitions_is_read_by_the_standard_ones(tmp_path: Path) -> None:
+    import sqlite3
+
+    entries = [entry for entry in drive() if entry[0] == "/pose"]
+    path = tmp_path / "old.db3"
+    with sqlite3.connect(path) as database:
+        database.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
+            " offered_qos_profiles TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
+            "INSERT INTO topics VALUES(1, '/pose', 'geometry_msgs/msg/PoseStamped', 'cdr', '');"
+        )
+        rows = [(1, time_ns, cdr) for _, time_ns, cdr in expected(entries)]
+        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
+    database.close()
+    with open_recording([path]) as recording:
+        assert facts(recording.messages()) == expected(entries)
+
+
+def test_a_folder_whose_recorder_was_killed_needs_no_metadata(tmp_path: Path) -> None:
+    folder = m.write_mcap(tmp_path / "drive", drive())
+    (folder / "metadata.yaml").unlink()
+    with open_recording([folder]) as recording:
+        assert facts(recording.messages()) == expected(list(drive()))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "complaint"),
+    [
+        ("gone.mcap", None, "there is no file"),
+        ("text.mcap", b"not a recording", "cannot be read as MCAP"),
+        ("empty.mcap", b"", "cannot be read as MCAP"),
+        ("text.db3", b"not a recording, but longer than a head of sqlite" * 9, "cannot be read as a rosbag2 recording"),
+        ("drive.bag", b"#ROSBAG V2.0", "is no recording: expected a .mcap or .db3 file"),
+    ],
+)
+def test_what_is_no_recording_is_refused_in_one_line(
+    tmp_path: Path, name: str, content: bytes | None, complaint: str
+) -> None:
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError) as error:
+        open_recording([path])
+    assert complaint in str(error.value) and str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_folder_says_what_it_lacks(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"neither metadata.yaml nor .mcap or .db3 files"):
+        open_recording([tmp_path])
+    folder = m.write_mcap(tmp_path / "drive", drive())
+    (folder / "drive_0.mcap").rename(folder / "other.mcap")
+    with pytest.raises(RecordingError, match=r"lacks drive_0.mcap, which its metadata.yaml names"):
+        open_recording([folder])
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    with pytest.raises(RecordingError, match="ros2 bag reindex"):
+        open_recording([folder])
+    with pytest.raises(RecordingError, match="no recording was given"):
+        open_recording([])
+
+
+def test_topics_that_are_not_there_or_of_two_types_are_named(tmp_path: Path) -> None:
+    first = m.write_mcap(tmp_path / "a.mcap", drive())
+    with (
+        open_recording([first]) as recording,
+        pytest.raises(RecordingError, match=r"there is no topic /images .*it has /action, /image, /pose"),
+    ):
+        recording.messages(["/images"])
+    second = m.write_mcap(tmp_path / "b.mcap", [("/image", 1, m.pose_stamped(1, 0.0, 0.0, 0.0))])
+    with pytest.raises(RecordingError, match=r"topic /image is of several types .*open these recordings apart"):
+        open_recording([first, second])
+
+
+def test_a_message_that_is_not_what_its_type_says_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    good = m.serialised(m.pose_stamped(1, 0.0, 0.0, 0.0))
+    with RecordingWriter(path) as writer:
+        writer.add_topic("/pose", "geometry_msgs/msg/PoseStamped")
+        writer.write("/pose", good, 1_500_000_000)
+        writer.write("/pose", good[:-20], 2_500_000_000)
+    with open_recording([path]) as recording:
+        read = recording.messages()
+        assert next(read).log_time_ns == 1_500_000_000
+        with pytest.raises(
+            RecordingError, match=r"/pose at 2.500000000 s \(\d+ bytes\) cannot be read as geometry_msgs"
+        ):
+            next(read)
+
+
+def test_the_writer_refuses_what_it_cannot_keep(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").touch()
+    with pytest.raises(RecordingError, match="exists: give a new folder"):
+        RecordingWriter(tmp_path / "there")
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/pose", "geometry_msgs/msg/PoseStamped")
+        with pytest.raises(RecordingError, match="announced twice"):
+            writer.add_topic("/pose", "geometry_msgs/msg/PoseStamped")
+        with pytest.raises(RecordingError, match=r"no_msgs/msg/None is in no package on AMENT_PREFIX_PATH"):
+            writer.add_topic("/none", "no_msgs/msg/None")
+        with pytest.raises(RecordingError, match=r"expected a name such as sensor_msgs/msg/Image"):
+            writer.add_topic("/none", "geometry_msgs/PoseStamped")
+
+
+def test_definitions_are_those_that_rosbags_knows() -> None:
+    """The text that goes into files describes a type as the library's own copy of ROS 2 Jazzy does."""
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    for name in ("sensor_msgs/msg/Image", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path"):
+        types = get_types_from_msg(message_definition(name), name)
+        own = get_typestore(Stores.EMPTY)
+        own.register(types)
+        assert own.hash_rihs01(name) == jazzy.hash_rihs01(name)
