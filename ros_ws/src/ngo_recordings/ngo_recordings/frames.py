@@ -66,7 +66,10 @@ def frames(recording: Recording, topics: RecordingTopics, skipped: Counter[str] 
         RecordingError: an image that is damaged, of an encoding that is not supported, or of another size than those
             before. Where skipped is given, only for the first; later ones are counted.
     """
-    return _Frames(recording, topics, skipped).run()
+    try:
+        yield from _Frames(recording, topics, skipped).run()
+    except AttributeError as error:
+        raise RecordingError(f"a message is not what its type should be ({error}): is the recording damaged?") from None
 
 
 class _Frames:

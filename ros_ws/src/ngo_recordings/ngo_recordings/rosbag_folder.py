@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+import apsw
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import BROKEN, Stored
 
+_BROKEN = (ReaderError, apsw.Error, AttributeError, TypeError, *BROKEN)
 _ENCODINGS = {
     MessageDefinitionFormat.MSG: "ros2msg",
     MessageDefinitionFormat.IDL: "ros2idl",
@@ -32,10 +34,10 @@ class RosbagFolder:
         try:
             self._reader = Reader(path)
             self._reader.open()
-        except (ReaderError, *BROKEN) as error:
+            for connection in self._reader.connections:
+                self._add(connection)
+        except _BROKEN as error:
             raise RecordingError(f"{path} cannot be read as a rosbag2 recording: {_reason(error)}") from None
-        for connection in self._reader.connections:
-            self._add(connection)
 
     def close(self) -> None:
         """Close all files."""
@@ -47,7 +49,7 @@ class RosbagFolder:
         try:
             for connection, log_time_ns, data in self._reader.messages(connections) if connections else ():
                 yield connection.topic, log_time_ns, bytes(data)
-        except (ReaderError, *BROKEN) as error:
+        except _BROKEN as error:
             raise RecordingError(f"{self.path} is damaged ({_reason(error)}): copy it again") from None
 
     def _add(self, connection: Connection) -> None:

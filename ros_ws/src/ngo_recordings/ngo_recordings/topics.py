@@ -192,7 +192,7 @@ def _filled(recording: Recording, types: Collection[str]) -> list[str]:
 
 def _encoding(recording: Recording, name: str) -> str:
     first = next(iter(recording.messages([name])))
-    return str(first.value.encoding)
+    return str(getattr(first.value, "encoding", ""))  # damaged definitions are told when frames are read
 
 
 def _only(names: Iterable[str]) -> str | None:

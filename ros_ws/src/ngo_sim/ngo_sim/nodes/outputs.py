@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,8 @@ class Outputs:
                 self._recording = Recording(path)
             except (OSError, RecordingError) as error:
                 raise BadParameter(f"record is {record!r}, which cannot be written: {error}") from None
+            # A node that is interrupted while it starts has nobody to close it.
+            weakref.finalize(self, self._recording.writer.close)
 
     def create(self, message_type: type, topic: str) -> Output:
         """A topic to publish on."""
