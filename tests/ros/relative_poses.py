@@ -10,14 +10,25 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
 
 from ngo_estimator import se2
+from ngo_estimator.checkpoint import OPTIMIZER, PLACE, PlaceNetworks, save_checkpoint
 from ngo_estimator.local_odometry import LocalEstimate
 from ngo_estimator.nodes.messages import relative_pose_message, relative_step, to_ns
 from ngo_estimator.online_trajectory import OnlineTrajectory, TrajectoryUpdate
+from tests.unit.ngo_estimator.samples import place_config, small_optimizer
 
 from .estimator_graph import FIRST_RUN_NS, RUN_NS, STEP_NS
 from .processes import NodeProcess, Probe
 
 POSITION_STD_M = 0.01
+WORLD = "maze2d"
+
+
+def write_weights(folder: Path) -> None:
+    """Networks for ngo_node that are small and, with random weights, close loops and move every pose."""
+    place = place_config(WORLD, code_size=12, embedding_size=8, pair_hidden_size=16)
+    optimizer = small_optimizer("loops", trained=True)
+    save_checkpoint(folder / f"{PLACE}.safetensors", PlaceNetworks(place), PLACE, WORLD, {})
+    save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, WORLD, {})
 
 
 class Drive:
@@ -86,13 +97,19 @@ class Optimizer:
         )
         self.diagnostics: list[DiagnosticArray] = probe.collect(DiagnosticArray, "/diagnostics")
         self._origin_ns = FIRST_RUN_NS
-        probe.spin_until(
-            lambda: self.publisher.get_subscription_count() == 1 and self.poses_publishers() == 1, "ngo_node's topics"
-        )
+        self.connect()
 
-    def poses_publishers(self) -> int:
-        """How many publish poses."""
-        return self.probe.node.count_publishers(self.name.replace("ngo_node", "ngo/pose"))
+    def connect(self) -> None:
+        """Drive until a pose comes: only then do both ends know each other."""
+        self.probe.spin_until(lambda: self.publisher.get_subscription_count() == 1, "ngo_node's subscription")
+
+        def arrived() -> bool:
+            if not self.poses:
+                self.publish(self.drive().step(1))
+            return bool(self.poses)
+
+        self.probe.spin_until(arrived, "a pose")
+        self.wait_for_stamp(self._origin_ns + STEP_NS)
 
     def drive(self, seed: int = 0, period_ns: int = STEP_NS) -> Drive:
         """A drive of a restarted source, long before the last one; nothing that it gives has come yet."""
@@ -100,6 +117,11 @@ class Optimizer:
         self.poses.clear()
         self.core.reset()
         return Drive(self.core, self._origin_ns, seed, period_ns)
+
+    def pose_after(self, *messages: RelativePose) -> PoseWithCovarianceStamped:
+        """Publish relative poses, and return the pose of the last."""
+        self.publish(*messages)
+        return self.wait_for_stamp(to_ns(messages[-1].header.stamp))
 
     def publish(self, *messages: RelativePose) -> None:
         """Publish relative poses."""

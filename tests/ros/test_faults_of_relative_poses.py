@@ -19,11 +19,10 @@ from ngo_msgs.msg import RelativePose
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.nodes.messages import to_ns, to_time
 
 from .processes import NodeProcess, Probe, wait_until
-from .relative_poses import Optimizer, assert_pose_is
+from .relative_poses import Optimizer, assert_pose_is, write_weights
 
 pytestmark = pytest.mark.processes
 
@@ -33,9 +32,8 @@ SOURCE_TIMEOUT_S = 0.3
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.set_num_threads(1)
-    torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("weights")
-    write_untrained(folder, "maze2d")
+    write_weights(folder)
     return folder
 
 

@@ -30,7 +30,7 @@ class MapOrigin:
         cls, start_from_base_xyyaw: np.ndarray, map_from_base_xyyaw: np.ndarray, covariance: np.ndarray | None = None
     ) -> "MapOrigin":
         """A pose of the trajectory, ``start_from_base_xyyaw``, is ``map_from_base_xyyaw`` in ``map``."""
-        given, own = torch.from_numpy(map_from_base_xyyaw), torch.from_numpy(start_from_base_xyyaw)
+        given, own = torch.tensor(map_from_base_xyyaw), torch.tensor(start_from_base_xyyaw)
         map_from_start = se2.compose(given, se2.inverse(own)).numpy()
         return cls(map_from_start, map_from_base_xyyaw, np.zeros((3, 3)) if covariance is None else covariance)
 

@@ -39,8 +39,8 @@ class SmoothedCorrection:
 
 def _moved(from_xyyaw: np.ndarray, to_xyyaw: np.ndarray, base_xyyaw: np.ndarray, share: float) -> np.ndarray:
     """The transform that puts ``base`` at this share of the way from where one puts it to where the other does."""
-    base = torch.from_numpy(base_xyyaw)
-    start, end = (se2.compose(torch.from_numpy(transform), base).numpy() for transform in (from_xyyaw, to_xyyaw))
+    base = torch.tensor(base_xyyaw)
+    start, end = (se2.compose(torch.tensor(transform), base).numpy() for transform in (from_xyyaw, to_xyyaw))
     way = end - start
     way[2] = math.remainder(way[2], math.tau)
     return np.asarray(se2.compose(torch.from_numpy(start + share * way), se2.inverse(base)).numpy())

@@ -14,14 +14,13 @@ from ngo_msgs.srv import Reset
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
-from ngo_estimator.nodes.parameters import BadParameter, LiveSettings
+from ngo_estimator.nodes.parameters import LiveSettings
 from ngo_estimator.nodes.process import StartError, run_node
-from ngo_estimator.nodes.qos import overridable
+from ngo_estimator.nodes.qos import checked_overrides, overridable
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
@@ -72,10 +71,8 @@ class LocalNode(Node):
         self._covariance = np.zeros((3, 3))
         self._missed = self._newly_missed = 0
         self._inputs: list[Input] = []
-        try:
+        with checked_overrides():
             self._create_topics()
-        except InvalidQosOverridesError as error:
-            raise BadParameter(str(error)) from error
         self.create_service(Reset, "~/reset", self._on_reset)
         self._live.on_change(self._on_settings)
         self._live.lock()

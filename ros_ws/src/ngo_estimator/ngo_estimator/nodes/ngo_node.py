@@ -14,16 +14,15 @@ from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNode, LifecyclePublisher, LifecycleState, TransitionCallbackReturn
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
-from ngo_estimator.nodes.parameters import BadParameter, LiveSettings
+from ngo_estimator.nodes.parameters import LiveSettings
 from ngo_estimator.nodes.process import run_node
-from ngo_estimator.nodes.qos import overridable
+from ngo_estimator.nodes.qos import checked_overrides, overridable
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
@@ -121,10 +120,8 @@ class NgoNode(LifecycleNode):
         self._begin_anew()
         self._live.lock()
         built.callback(self._live.lock, False)
-        try:
+        with checked_overrides():
             self._create_outputs(settings)
-        except InvalidQosOverridesError as error:
-            raise BadParameter(str(error)) from error
         self._files = built.enter_context(ThreadPoolExecutor(1))
         for kind, name, callback, group in (
             # One of its own: while a file is written, the others go on.
@@ -153,7 +150,7 @@ class NgoNode(LifecycleNode):
 
     def _listen(self) -> None:
         settings, listening = self._settings, self._listening
-        try:
+        with checked_overrides():
             steps = Input(
                 self,
                 self._status,
@@ -173,8 +170,6 @@ class NgoNode(LifecycleNode):
                 qos_overriding_options=overridable(),
             )
             listening.callback(self.destroy_subscription, initial)
-        except InvalidQosOverridesError as error:
-            raise BadParameter(str(error)) from error
         self._inputs = [steps]
         listening.callback(self._inputs.clear)
         self._status.idle = ""

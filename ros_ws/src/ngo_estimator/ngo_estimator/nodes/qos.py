@@ -1,7 +1,13 @@
 """Quality of service that a user may override for each topic, the way that ROS 2 has for it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rclpy.exceptions import ParameterException
 from rclpy.qos import QoSPolicyKind
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+
+from ngo_estimator.nodes.parameters import BadParameter
 
 _POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
 
@@ -9,3 +15,12 @@ _POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILI
 def overridable() -> QoSOverridingOptions:
     """Parameters ``qos_overrides.TOPIC.publisher.depth`` and the like for one end of a topic."""
     return QoSOverridingOptions(policy_kinds=_POLICIES)
+
+
+@contextmanager
+def checked_overrides() -> Iterator[None]:
+    """Around the making of topics: raises ``BadParameter`` where rclpy stumbles over what a user overrides."""
+    try:
+        yield
+    except (InvalidQosOverridesError, ParameterException, RuntimeError, ValueError) as error:
+        raise BadParameter(f"parameters qos_overrides: {' '.join(str(error).split())}") from error

@@ -1,0 +1,343 @@
+"""What people do with ngo_node: start and stop it, ask and tell it things, and run several of it."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from evo.tools import file_interface
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Path as PathMessage
+from ngo_msgs.msg import Trajectory
+from ngo_msgs.srv import SaveTrajectory
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import SetBool
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.map_origin import MapOrigin
+from ngo_estimator.nodes.messages import planar_estimate, pose_message, relative_step, to_ns
+from ngo_estimator.tf_smoothing import SmoothedCorrection
+
+from .processes import NodeProcess, Probe
+from .relative_poses import Optimizer, assert_pose_is, write_weights
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("weights")
+    write_weights(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def parameters(weights: Path) -> dict[str, Any]:
+    return {"world": "maze2d", "weights": str(weights), "diagnostics_period_s": 0.1}
+
+
+@pytest.fixture(scope="module")
+def optimizer(weights: Path, parameters: dict[str, Any]) -> Iterator[Optimizer]:
+    probe = Probe()
+    with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+        yield Optimizer(process, weights, probe)
+        process.send(signal.SIGINT)
+        assert process.wait() == 0, process.log
+        assert "Traceback" not in process.log, process.log
+    probe.close()
+
+
+def set_parameter(probe: Probe, node: str, name: str, value: Any) -> str:
+    """Set a parameter of a running node; returns why it was refused, or nothing."""
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    (result,) = probe.call(SetParameters, f"{node}/set_parameters", request).results
+    return "" if result.successful else str(result.reason)
+
+
+def xyyaw(pose: Any) -> np.ndarray:
+    """The planar pose of a Pose or a Transform."""
+    where = getattr(pose, "position", None) or pose.translation
+    turned = getattr(pose, "orientation", None) or pose.rotation
+    return np.array([where.x, where.y, 2.0 * np.arctan2(turned.z, turned.w)])
+
+
+# ---- services
+
+
+def test_paused_it_follows_the_odometry_and_then_catches_up(optimizer: Optimizer) -> None:
+    def pause(paused: bool) -> str:
+        response = optimizer.probe.call(SetBool, "ngo_node/pause", SetBool.Request(data=paused))
+        assert response.success
+        return str(response.message)
+
+    drive = optimizer.drive()
+    steps = drive.steps(1, 72)
+    optimizer.pose_after(*steps[:12])
+    assert pause(True) == "paused: poses follow the odometry"
+    optimizer.pose_after(*steps[12:50])
+    optimizer.wait_for_value("paused", "true".__eq__)
+    assert pause(False) == "corrections go on"
+    optimizer.pose_after(*steps[50:])
+    optimizer.core.reset()
+    for k, step in enumerate(steps):
+        update = optimizer.core.update(relative_step(step), optimize=not 12 <= k < 50)
+        assert_pose_is(optimizer.poses[k], update)
+    assert len(optimizer.poses) == 72, "none is lost"
+
+
+@pytest.mark.parametrize("ending", ["tum", "kitti"])
+def test_a_trajectory_is_saved_while_steps_go_on(optimizer: Optimizer, tmp_path: Path, ending: str) -> None:
+    drive = optimizer.drive()
+    optimizer.pose_after(*drive.steps(1, 100))
+    client = optimizer.probe.node.create_client(SaveTrajectory, "ngo_node/save_trajectory")
+    optimizer.probe.spin_until(client.service_is_ready, "the service")
+    path = tmp_path / f"run.{ending}"
+    answer = client.call_async(SaveTrajectory.Request(path=str(path)))
+    optimizer.publish(*drive.steps(101, 200))
+    optimizer.probe.spin_until(answer.done, "an answer")
+    optimizer.wait_for_stamp(drive.stamp_ns(200))
+    optimizer.probe.node.destroy_client(client)
+    assert answer.result().success, answer.result().message
+    read = {"tum": file_interface.read_tum_trajectory_file, "kitti": file_interface.read_kitti_poses_file}[ending]
+    saved = read(str(path))
+    assert saved.num_poses >= 101
+    assert answer.result().message == f"wrote {saved.num_poses} poses to {path}"
+    assert len(optimizer.poses) == 200
+
+
+def test_a_trajectory_that_cannot_be_saved_is_said_in_one_line(optimizer: Optimizer, tmp_path: Path) -> None:
+    optimizer.pose_after(*optimizer.drive().steps(1, 9))
+    for path, reason in ((tmp_path / "a.csv", "ends in"), (tmp_path / "no" / "a.tum", "No such file")):
+        request = SaveTrajectory.Request(path=str(path))
+        response = optimizer.probe.call(SaveTrajectory, "ngo_node/save_trajectory", request)
+        assert not response.success and reason in response.message and "\n" not in response.message
+    assert not list(tmp_path.iterdir())
+
+
+# ---- where the map is
+
+
+def test_an_initial_pose_moves_pose_path_and_transform(optimizer: Optimizer) -> None:
+    probe = optimizer.probe
+    given = probe.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
+    trajectories, transforms = probe.collect(Trajectory, "ngo/trajectory"), probe.collect(TFMessage, "/tf")
+    probe.spin_until(lambda: given.get_subscription_count() == 1, "ngo_node's subscription")
+    drive = optimizer.drive()
+    optimizer.pose_after(*drive.steps(1, 20))
+    wanted, covariance = np.array([5.0, -3.0, 2.0]), np.diag([0.04, 0.09, 0.01])
+    at = optimizer.expected(drive.steps(1, 20)).pose_xyyaw
+    given.publish(pose_message(0, "odom", wanted, covariance))  # of another frame: dropped
+    optimizer.process.wait_for_log("dropped initial pose: pose is in the frame 'odom'; expected 'map'")
+    given.publish(pose_message(0, "map", wanted, covariance))
+    optimizer.process.wait_for_log("the robot is at x 5.000 m, y -3.000 m, yaw 2.000 rad")
+    origin = MapOrigin.of_pose(at, wanted, covariance)
+    pose = optimizer.pose_after(drive.step(21))
+    update = optimizer.expected(drive.steps(1, 21))
+    expected = origin.poses(update.pose_xyyaw)
+    moved, its_covariance = planar_estimate(pose, "map")
+    np.testing.assert_allclose(moved, expected, atol=1e-5)
+    np.testing.assert_allclose(its_covariance, origin.covariance_of(expected, update.covariance), rtol=1e-3, atol=1e-9)
+    newest = drive.stamp_ns(21)
+    probe.spin_until(lambda: trajectories and trajectories[-1].stamps_ns[-1] == newest, "the trajectory")
+    whole = np.column_stack((trajectories[-1].x, trajectories[-1].y))
+    np.testing.assert_allclose(whole[0], origin.map_from_start_xyyaw[:2], atol=1e-5)
+    np.testing.assert_allclose(whole[-1], moved[:2], atol=1e-9)
+    probe.spin_until(lambda: transforms and to_ns(transforms[-1].transforms[0].header.stamp) == newest, "the transform")
+    map_from_odom = xyyaw(transforms[-1].transforms[0].transform)
+    np.testing.assert_allclose(map_from_odom[:2], origin.poses(update.map_from_odom_xyyaw)[:2], atol=1e-5)
+    # It belongs to this trajectory: the next one begins where the parameter says.
+    drive = optimizer.drive()
+    assert_pose_is(optimizer.pose_after(drive.step(1)), optimizer.expected([drive.step(1)]))
+    probe.node.destroy_publisher(given)
+
+
+def test_the_parameter_initial_pose_is_where_the_next_trajectory_begins(optimizer: Optimizer) -> None:
+    assert set_parameter(optimizer.probe, "ngo_node", "initial_pose", [1.0, 2.0, 1.5]) == ""
+    drive = optimizer.drive()
+    pose = optimizer.pose_after(drive.step(1))
+    step = optimizer.expected([drive.step(1)]).pose_xyyaw
+    expected = MapOrigin.of_first_pose(np.array([1.0, 2.0, 1.5])).poses(step)
+    np.testing.assert_allclose(xyyaw(pose.pose.pose), expected, atol=1e-6)
+    assert set_parameter(optimizer.probe, "ngo_node", "initial_pose", [0.0, 0.0, 0.0]) == ""
+    assert "three numbers" in set_parameter(optimizer.probe, "ngo_node", "initial_pose", [0.0, 0.0])
+
+
+def test_smoothed_corrections_reach_the_transform_little_by_little(optimizer: Optimizer) -> None:
+    probe = optimizer.probe
+    transforms = probe.collect(TFMessage, "/tf")
+    assert set_parameter(probe, "ngo_node", "tf_smoothing_s", 1.0) == ""
+    drive = optimizer.drive()
+    steps = drive.steps(1, 40)
+    optimizer.pose_after(*steps)
+    probe.spin_until(
+        lambda: transforms and to_ns(transforms[-1].transforms[0].header.stamp) == drive.stamp_ns(40), "the transform"
+    )
+    smoothing, jumps = SmoothedCorrection(1.0), 0.0
+    optimizer.core.reset()
+    for message, step in zip(transforms[-40:], map(relative_step, steps), strict=True):
+        newest = optimizer.core.update(step).map_from_odom_xyyaw
+        expected = smoothing.update(step.stamp_ns, newest, step.odom_xyyaw)
+        np.testing.assert_allclose(xyyaw(message.transforms[0].transform), expected, atol=1e-5)
+        jumps = max(jumps, float(np.abs(newest - expected).max()))
+    assert jumps > 1e-4, "there was nothing to smooth"
+    assert set_parameter(probe, "ngo_node", "tf_smoothing_s", 0.0) == ""
+
+
+# ---- parameters
+
+
+def test_the_path_comes_at_its_rate_and_only_to_those_who_listen(optimizer: Optimizer) -> None:
+    probe = optimizer.probe
+    assert set_parameter(probe, "ngo_node", "path_rate_hz", 0.0) == ""
+    paths = probe.collect(PathMessage, "ngo/path")
+    probe.spin_until(lambda: paths, "the newest path, for who comes late")
+    drive = optimizer.drive()
+    paths.clear()
+    optimizer.pose_after(*drive.steps(1, 30))
+    probe.spin_until(lambda: paths and len(paths[-1].poses) == 31, "a path for each step")
+    assert [len(path.poses) for path in paths] == list(range(2, 32))
+    assert set_parameter(probe, "ngo_node", "path_rate_hz", 2.0) == ""
+    paths.clear()
+    optimizer.pose_after(*drive.steps(31, 100))
+    probe.spin_until(lambda: paths and len(paths[-1].poses) == 101, "the newest path when it is time")
+    assert len(paths) <= 4
+    assert set_parameter(probe, "ngo_node", "path_rate_hz", 10.0) == ""
+
+
+def test_what_cannot_change_is_refused_in_one_line(optimizer: Optimizer) -> None:
+    for name, value in (("window_frames", 100), ("map_frame", "world"), ("publish_tf", False)):
+        reason = set_parameter(optimizer.probe, "ngo_node", name, value)
+        assert reason == f"parameter '{name}' cannot change now: start or configure the node with it"
+    assert "path_rate_hz" in set_parameter(optimizer.probe, "ngo_node", "path_rate_hz", -1.0)
+    described = optimizer.probe.call(
+        DescribeParameters, "ngo_node/describe_parameters", DescribeParameters.Request(names=["path_rate_hz"])
+    ).descriptors
+    assert described[0].additional_constraints == "a number from 0 to 1000; at any time"
+
+
+def test_quality_of_service_is_overridden_by_ros_own_parameters(parameters: dict[str, Any]) -> None:
+    """A path that is latched by the middleware, as some tools ask for; and what is no quality of service."""
+    probe = Probe("qos_probe")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    override = "qos_overrides./latched/ngo/path.publisher"
+    arguments = ("-r", "__ns:=/latched", "-p", f"{override}.durability:=transient_local", "-p", f"{override}.depth:=3")
+    with NodeProcess("ngo_estimator", "ngo_node", parameters, arguments) as process:
+        process.wait_for_log("ready")
+        probe.collect(PathMessage, "/latched/ngo/path", latched)
+
+        def durability() -> object:
+            infos = probe.node.get_publishers_info_by_topic("/latched/ngo/path")
+            return infos[0].qos_profile.durability if infos else None
+
+        probe.spin_until(lambda: durability() == DurabilityPolicy.TRANSIENT_LOCAL, "a latched path")
+    bad = ("-r", "__ns:=/latched", "-p", f"{override}.reliability:=sometimes")
+    with NodeProcess("ngo_estimator", "ngo_node", parameters, bad) as process:
+        assert process.wait() == 2, process.log
+        assert len(process.lines) == 1 and "reliability" in process.log.lower(), process.log
+    probe.close()
+
+
+# ---- life cycle
+
+
+class Managed:
+    """A node that waits to be told."""
+
+    def __init__(self, probe: Probe, name: str) -> None:
+        self._probe, self._name = probe, name
+
+    def state(self) -> str:
+        """The state that the node says it is in."""
+        response = self._probe.call(GetState, f"{self._name}/get_state", GetState.Request())
+        return str(response.current_state.label)
+
+    def change(self, transition: int) -> bool:
+        """Ask for a transition; whether it succeeded."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self._probe.call(ChangeState, f"{self._name}/change_state", request).success)
+
+
+def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: dict[str, Any]) -> None:
+    probe, name = Probe("manager"), "/managed/ngo_node"
+    waiting = {**parameters, "autostart": False, "weights": "/nowhere"}
+    with NodeProcess("ngo_estimator", "ngo_node", waiting, ("-r", "__ns:=/managed")) as process:
+        node = Managed(probe, name)
+        assert node.state() == "unconfigured"
+        assert not node.change(Transition.TRANSITION_CONFIGURE)
+        assert node.state() == "unconfigured"
+        process.wait_for_log("ERROR.*there is no folder '/nowhere'")
+        # Unconfigured, everything may change: it takes part when the node is configured.
+        assert set_parameter(probe, name, "weights", str(weights)) == ""
+        assert node.change(Transition.TRANSITION_CONFIGURE) and node.state() == "inactive"
+        assert "cannot change now" in set_parameter(probe, name, "weights", "")
+        assert probe.node.count_subscribers("/managed/relative_pose") == 0
+        assert node.change(Transition.TRANSITION_ACTIVATE) and node.state() == "active"
+        optimizer = Optimizer(process, weights, probe, "/managed")
+        drive = optimizer.drive()
+        optimizer.pose_after(*drive.steps(1, 10))
+        # Deactivated it listens no more; what it has missed is a gap that the odometry bridges.
+        assert node.change(Transition.TRANSITION_DEACTIVATE) and node.state() == "inactive"
+        probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 0, "ngo_node to stop listening")
+        optimizer.publish(*drive.steps(11, 15))
+        assert node.change(Transition.TRANSITION_ACTIVATE)
+        probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 1, "ngo_node to listen again")
+        pose = optimizer.pose_after(*drive.steps(16, 17))
+        assert_pose_is(pose, optimizer.expected([*drive.steps(1, 10), *drive.steps(16, 17)]))
+        # Cleaned up it has forgotten everything.
+        assert node.change(Transition.TRANSITION_DEACTIVATE) and node.change(Transition.TRANSITION_CLEANUP)
+        assert node.state() == "unconfigured"
+        assert node.change(Transition.TRANSITION_CONFIGURE) and node.change(Transition.TRANSITION_ACTIVATE)
+        optimizer.drive()
+        optimizer.connect()
+        drive = optimizer.drive()
+        assert_pose_is(optimizer.pose_after(*drive.steps(1, 5)), optimizer.expected(drive.steps(1, 5)))
+        assert node.change(Transition.TRANSITION_ACTIVE_SHUTDOWN) and node.state() == "finalized"
+        process.send(signal.SIGINT)
+        assert process.wait() == 0, process.log
+        assert "Traceback" not in process.log, process.log
+    probe.close()
+
+
+# ---- several robots
+
+
+@pytest.mark.parametrize("shared_tf", [True, False], ids=["one tf", "a tf each"])
+def test_two_robots_in_one_domain_do_not_meet(weights: Path, parameters: dict[str, Any], shared_tf: bool) -> None:
+    probe = Probe("two_robots")
+    with ExitStack() as stack:
+        robots = {}
+        for seed, name in enumerate(("red", "blue")):
+            own = {"frame_prefix": f"{name}/"} if shared_tf else {"tf_topic": "tf"}
+            process = stack.enter_context(
+                NodeProcess("ngo_estimator", "ngo_node", {**parameters, **own}, ("-r", f"__ns:=/{name}"))
+            )
+            robots[name] = seed, process
+        topics = ("/tf", "/tf") if shared_tf else ("/red/tf", "/blue/tf")
+        transforms = {topic: probe.collect(TFMessage, topic) for topic in set(topics)}
+        both = {name: Optimizer(process, weights, probe, f"/{name}") for name, (_, process) in robots.items()}
+        drives = {name: optimizer.drive(seed=robots[name][0]) for name, optimizer in both.items()}
+        for messages in transforms.values():
+            messages.clear()
+        for step in range(1, 25):
+            for name, optimizer in both.items():
+                optimizer.publish(drives[name].step(step))
+        prefixes = {name: f"{name}/" if shared_tf else "" for name in both}
+        for name, optimizer in both.items():
+            pose = optimizer.wait_for_stamp(drives[name].stamp_ns(24))
+            assert pose.header.frame_id == f"{prefixes[name]}map"
+            assert_pose_is(pose, optimizer.expected(drives[name].steps(1, 24)))
+            assert len(optimizer.poses) == 24
+        probe.spin_until(lambda: sum(map(len, transforms.values())) == 48, "all transforms")
+        for name, topic in zip(("red", "blue"), topics, strict=True):
+            frames = [(m.transforms[0].header.frame_id, m.transforms[0].child_frame_id) for m in transforms[topic]]
+            assert frames.count((f"{prefixes[name]}map", f"{prefixes[name]}odom")) == 24
+    probe.close()
