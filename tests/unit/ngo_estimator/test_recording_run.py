@@ -104,13 +104,14 @@ def test_what_cannot_be_used_is_left_out_and_counted() -> None:
     ]
     core, steps, (found,) = run(played)
     used = [frame for k, frame in enumerate(frames) if k not in (5, 12)]
-    # Over a frame that is missing, the first action after the frame before it counts, as live.
+    # Over a frame of another size the first action after the frame before it counts; not so over one with broken
+    # values, which is seen only when it is used.
     actions = [(frames.index(frame) - 1) % 3 if frame is not frames[0] else None for frame in used]
-    actions[5], actions[11] = 4 % 3, 11 % 3
+    actions[11] = 11 % 3
     check(steps, found, used, actions)
     assert core.rejected == {"the stamp came twice": 1, "older than the frame before": 1, "not usable": 2}
     assert "1 values that are not finite" in core.examples["not usable"]
-    assert f"{frames[8].stamp_ns / 1e9:.9f} s" in core.examples["the stamp came twice"]
+    assert "1700000000.800000000 s: " in core.examples["the stamp came twice"]
     assert core.gaps == 2
 
 

@@ -11,7 +11,7 @@ from ngo_estimator.frame_pairing import FramePairing
 from ngo_estimator.local_odometry import RESTART_AFTER_NS, DuplicateFrame, LateFrame, LocalEstimate, LocalOdometry
 from ngo_estimator.observations import observation
 from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep, Trajectory, TrajectoryUpdate
-from ngo_estimator.trajectory_file import SpatialPoses
+from ngo_estimator.trajectory_file import SpatialPoses, seconds
 from ngo_recordings.frames import Frame
 
 _REASONS: dict[type[ValueError], str] = {
@@ -98,13 +98,12 @@ class RecordingRun:
             self.rejected["no action or velocity led to it"] = missing
 
     def _taken(self, frame: Frame) -> bool:
-        """Whether the frame can be used as far as it is known by itself."""
+        """Whether the frame is of the right kind and size, and newer than those before."""
         try:
             image = observation(self._local.image_format, frame.image, frame.scan, self._scan_yaw_rad)
-            self._local.image_format.check(image)
             self._pairing.add_frame(frame.stamp_ns, image)
         except ValueError as error:
-            self._reject(_REASONS.get(type(error), "not usable"), f"{frame.stamp_ns / 1e9:.9f} s: {error}")
+            self._reject(_REASONS.get(type(error), "not usable"), f"{seconds(frame.stamp_ns)} s: {error}")
             return False
         return True
 
@@ -116,7 +115,7 @@ class RecordingRun:
                     continue
                 update = self._online.update(_step(local))
             except ValueError as error:
-                self._reject("not usable", f"{pair.stamp_ns / 1e9:.9f} s: {error}")
+                self._reject("not usable", f"{seconds(pair.stamp_ns)} s: {error}")
                 continue
             self.gaps += update.gap or local.missed_frames > 0
             yield RecordedStep(local, update)

@@ -101,11 +101,17 @@ def write_trajectory(
     if len(stamps_ns) != len(poses_xyyaw):
         raise ValueError(f"stamps are {len(stamps_ns)} and poses {len(poses_xyyaw)}; expected as many")
     if path.suffix == _KITTI:
-        times = (_seconds(stamp) for stamp in stamps_ns.tolist())
+        times = (seconds(stamp) for stamp in stamps_ns.tolist())
         return _write_together({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
     if path.suffix in TUM_ENDINGS:
         return _write_together({path: _tum_lines(stamps_ns, poses_xyyaw)})
     return _write_together({path: _g2o_lines(poses_xyyaw, edges)})
+
+
+def seconds(stamp_ns: int) -> str:
+    """A stamp in seconds, to the nanosecond."""
+    # Stamps of today have 19 digits in ns, more than a float64 holds: seconds and nanoseconds are written as integers.
+    return f"{stamp_ns // _NS}.{stamp_ns % _NS:09d}"
 
 
 def write_tum(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> None:
@@ -162,16 +168,11 @@ def read_tum(path: Path) -> SpatialPoses:
     return SpatialPoses(np.array(stamps, np.int64), values[:, :3], quaternions)
 
 
-def _seconds(stamp_ns: int) -> str:
-    # Stamps of today have 19 digits in ns, more than a float64 holds: seconds and nanoseconds are written as integers.
-    return f"{stamp_ns // _NS}.{stamp_ns % _NS:09d}"
-
-
 def _tum_lines(stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Iterator[str]:
     half_yaw = 0.5 * poses_xyyaw[:, 2]
     values = np.column_stack((poses_xyyaw[:, :2], np.sin(half_yaw), np.cos(half_yaw)))
     for stamp, (x, y, qz, qw) in zip(stamps_ns.tolist(), values.tolist(), strict=True):
-        yield f"{_seconds(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
+        yield f"{seconds(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
 
 
 def _kitti_lines(poses_xyyaw: np.ndarray) -> Iterator[str]:

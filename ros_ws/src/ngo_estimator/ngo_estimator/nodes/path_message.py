@@ -1,5 +1,7 @@
 """nav_msgs/Path as bytes, written by numpy: a thousand times cheaper than building a PoseStamped a pose."""
 
+from collections.abc import Callable
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
@@ -21,11 +23,14 @@ class PathWriter:
     which costs O(1) a pose.
     """
 
-    def __init__(self, frame_id: str) -> None:
-        """Lay out the buffer for poses in ``frame_id``; raises ``RuntimeError`` for any other layout."""
-        self._frame_id = frame_id
-        template = _serialised(frame_id, _TEMPLATE_POSES)
-        self._stride = len(template) - len(_serialised(frame_id, _TEMPLATE_POSES - 1))
+    def __init__(self, frame_id: str, serialise: Callable[[Path], bytes] = serialize_message) -> None:
+        """Lay out the buffer for poses in ``frame_id``; raises ``RuntimeError`` for any other layout.
+
+        ``serialise`` makes the template, and so the bytes between the values, which the middleware leaves to chance.
+        """
+        self._frame_id, self._serialise = frame_id, serialise
+        template = self._template(_TEMPLATE_POSES)
+        self._stride = len(template) - len(self._template(_TEMPLATE_POSES - 1))
         self._head = len(template) - (_TEMPLATE_POSES - 1) * self._stride  # up to the end of the first pose
         # Encapsulation (4 bytes), stamp (8), length of frame_id (4), and its bytes with a final zero.
         self._count = 16 + _aligned(len(frame_id.encode()) + 1, 4)
@@ -41,7 +46,7 @@ class PathWriter:
         if stamps_ns.shape != (frames,) or poses_xyyaw.shape != (frames, 3):
             raise ValueError(f"stamps are {stamps_ns.shape} and poses {poses_xyyaw.shape}; expected (n,) and (n, 3)")
         if frames == 0:
-            return bytes(serialize_message(Path(header=Header(stamp=_time(stamp_ns), frame_id=self._frame_id))))
+            return bytes(self._serialise(Path(header=Header(stamp=_time(stamp_ns), frame_id=self._frame_id))))
         size = self._head + (frames - 1) * self._stride
         while len(self._buffer) < size:
             self._buffer += self._buffer[self._head :]
@@ -56,6 +61,9 @@ class PathWriter:
         doubles[:, 5] = np.sin(0.5 * poses_xyyaw[:, 2])
         doubles[:, 6] = np.cos(0.5 * poses_xyyaw[:, 2])
         return bytes(memoryview(self._buffer)[:size])
+
+    def _template(self, poses: int) -> bytes:
+        return bytes(self._serialise(plain_path(self._frame_id, 0, np.zeros(poses, np.int64), np.zeros((poses, 3)))))
 
     def _stamps(self, offset: int, count: int) -> np.ndarray:
         """A view ``(count,)`` of the stamps that begin at ``offset`` and follow each other by the stride."""
@@ -79,10 +87,6 @@ def plain_path(frame_id: str, stamp_ns: int, stamps_ns: np.ndarray, poses_xyyaw:
         pose = Pose(position=Point(x=float(x), y=float(y)), orientation=orientation)
         poses.append(PoseStamped(header=Header(stamp=_time(int(pose_stamp_ns)), frame_id=frame_id), pose=pose))
     return Path(header=Header(stamp=_time(stamp_ns), frame_id=frame_id), poses=poses)
-
-
-def _serialised(frame_id: str, poses: int) -> bytes:
-    return bytes(serialize_message(plain_path(frame_id, 0, np.zeros(poses, np.int64), np.zeros((poses, 3)))))
 
 
 def _aligned(size: int, boundary: int) -> int:

@@ -6,10 +6,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
-from rclpy.serialization import serialize_message
-from tf2_msgs.msg import TFMessage
+from rosbags.typesys import Stores, get_typestore
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.path_message import PathWriter
@@ -36,7 +33,12 @@ _FILES = (
     "metrics.json",
     "run.json",
 )
-_TYPES = {ODOMETRY: Odometry, POSE: PoseWithCovarianceStamped, TF: TFMessage}
+_TYPES = {
+    ODOMETRY: "nav_msgs/msg/Odometry",
+    POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    TF: "tf2_msgs/msg/TFMessage",
+}
+_PATH_TYPE = "nav_msgs/msg/Path"
 
 
 def remove_results(folder: Path) -> None:
@@ -60,9 +62,10 @@ class RecordedOutput:
         self.folder = folder
         self._frames = {"base": base_frame, "odom": odom_frame, "map": map_frame}
         self._covariance = np.zeros((3, 3))
+        self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = RecordingWriter(folder / "trajectories.mcap", flush_s=None, library="ngo_estimator")
-        for topic, kind in _TYPES.items():
-            self._writer.add_topic(topic, f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}")
+        for topic, type_name in _TYPES.items():
+            self._writer.add_topic(topic, type_name)
 
     def __enter__(self) -> "RecordedOutput":
         return self
@@ -83,7 +86,7 @@ class RecordedOutput:
         below = messages.transform_message(stamp_ns, odom, frames["base"], local.odom_xyyaw)
         transforms.transforms = [*transforms.transforms, *below.transforms]
         for topic, message in ((ODOMETRY, odometry), (POSE, pose), (TF, transforms)):
-            self._writer.write(topic, bytes(serialize_message(message)), stamp_ns)
+            self._writer.write(topic, self._serialise(message, _TYPES[topic]), stamp_ns)
 
     def finish(self, run: RecordedRun, title: str, settings: ReportSettings) -> dict[str, Report]:
         """Write everything about the whole trajectory; returns the errors of each estimate, none without truth.
@@ -119,9 +122,15 @@ class RecordedOutput:
         (self.folder / "metrics.json").write_text(json.dumps(summary, indent=1) + "\n")
         return reports
 
+    def _serialise(self, message: Any, type_name: str) -> bytes:
+        # The middleware's serialiser leaves the bytes between values as they happen to be: no two runs were the same.
+        return bytes(self._store.serialize_cdr(message, type_name))
+
     def _write_path(self, topic: str, frame: str, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> None:
-        self._writer.add_topic(topic, "nav_msgs/msg/Path", depth=1, transient_local=True)
-        message = PathWriter(frame).write(int(stamps_ns[-1]), stamps_ns, poses_xyyaw)
+        self._writer.add_topic(topic, _PATH_TYPE, depth=1, transient_local=True)
+        message = PathWriter(frame, lambda path: self._serialise(path, _PATH_TYPE)).write(
+            int(stamps_ns[-1]), stamps_ns, poses_xyyaw
+        )
         self._writer.write(topic, message, int(stamps_ns[-1]))
 
 
