@@ -20,6 +20,7 @@ from ngo_estimator.nodes.messages import to_ns
 from ngo_estimator.trajectory_file import read_tum
 from ngo_estimator.trajectory_report import trajectory_report
 from ngo_recordings.recording import open_recording
+from ngo_recordings.writer import RecordingWriter
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.maze3d import Maze3D
@@ -307,3 +308,45 @@ def test_what_cannot_be_run_is_said_in_one_line(recording: Path, weights: Path, 
         assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("run_recording: "), done.stderr
         assert message in done.stderr
     assert [path.name for path in full.iterdir()] == ["mine.txt"]
+
+
+def write_wide(path: Path, frames: int) -> None:
+    """A drive in the 2D world beside the pictures of another camera, 2 MB each, that nothing makes smaller."""
+    noise = np.random.default_rng(0).integers(0, 256, (700, 1000, 3), np.uint8)
+    entries = episode_entries("maze2d", drive("maze2d", 40), START_NS, START_NS)
+    with RecordingWriter(path) as writer:
+        for topic, message in {topic: message for topic, _, message in entries}.items():
+            writer.add_topic(topic, message.__msgtype__)
+        writer.add_topic("/other_camera", "sensor_msgs/msg/Image")
+        period_ns = 10**8
+        for k in range(frames):
+            for topic, _, message in entries[:3]:
+                moved = shifted(message, START_NS + k * period_ns)
+                writer.write(topic, make.serialised(moved), START_NS + k * period_ns)
+            picture = make.image(START_NS + k * period_ns, np.roll(noise, k, axis=0))
+            writer.write("/other_camera", make.serialised(picture), START_NS + k * period_ns)
+
+
+def peak_bytes(*arguments: object) -> int:
+    """Peak of the memory that a run_recording has in use."""
+    command = [str(ROS2), "run", "ngo_estimator", "run_recording", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    said = process.stderr.read()
+    process.stderr.close()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0, said
+    return usage.ru_maxrss * 1024
+
+
+def test_memory_does_not_grow_with_the_recording(weights: Path, tmp_path: Path) -> None:
+    peaks = []
+    for frames in (20, 200):
+        file = tmp_path / f"{frames}.mcap"
+        write_wide(file, frames)
+        assert file.stat().st_size > frames * 2_000_000
+        topics = ("--image", "/image")
+        peaks.append(peak_bytes(file, "--weights", weights, *topics, "--out", tmp_path / f"out{frames}"))
+        file.unlink()
+    assert peaks[1] < 1e9 and peaks[1] - peaks[0] < 60e6, peaks
