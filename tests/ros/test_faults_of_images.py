@@ -1,0 +1,236 @@
+"""What arrives broken at local_node, and what becomes of it at the end of the chain: real processes over DDS.
+
+Lost, doubled, late and unusable images are in `test_estimator_nodes.py`; here are those who publish them.
+"""
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from ngo_msgs.msg import DiscreteAction, RelativePose
+from ngo_msgs.srv import Reset
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+
+from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.nodes.messages import to_ns, to_time
+
+from .estimator_graph import RUN_NS, STEP_NS, Graph, image_message, scan
+from .processes import NodeProcess, Probe
+
+pytestmark = pytest.mark.processes
+
+SOURCE_TIMEOUT_S = 0.5
+
+
+@pytest.fixture(scope="module")
+def parameters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("weights")
+    write_untrained(folder, "maze2d")
+    return {
+        "world": "maze2d",
+        "weights": str(folder),
+        "diagnostics_period_s": 0.1,
+        "source_timeout_s": SOURCE_TIMEOUT_S,
+    }
+
+
+@pytest.fixture(scope="module")
+def graph(parameters: dict[str, Any]) -> Iterator[Graph]:
+    """A running, connected pair of estimators."""
+    probe = Probe()
+    local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
+    with (
+        NodeProcess("ngo_estimator", "local_node", local) as local_node,
+        NodeProcess("ngo_estimator", "ngo_node", {**parameters, "path_rate_hz": 0.0}) as ngo_node,
+    ):
+        graph = Graph(local_node, ngo_node, Path(parameters["weights"]), probe)
+        graph.connect()
+        yield graph
+        for process in (local_node, ngo_node):
+            assert process.running and "Traceback" not in process.log, process.log
+    probe.close()
+
+
+def wait_for_problem(probe: Probe, node: str, diagnostics: list[DiagnosticArray], *texts: str) -> None:
+    """Wait until a node's diagnostics warn with these texts."""
+
+    def found() -> bool:
+        statuses = [status for array in diagnostics for status in array.status if status.name == node]
+        return any(
+            status.level == DiagnosticStatus.WARN and all(text in status.message for text in texts)
+            for status in statuses
+        )
+
+    probe.spin_until(found, f"a warning of {node} with {texts}")
+
+
+def test_a_burst_of_images_is_taken_whole(graph: Graph) -> None:
+    graph.start_run()
+    graph.play(*range(300))
+    graph.wait_for_step(299)
+    assert graph.steps() == [(step, step + 1) for step in range(299)]
+    assert len(graph.out.trajectories[-1].x) == 300
+
+
+def test_images_of_200_hz_are_taken_as_they_come(graph: Graph) -> None:
+    """What a shared machine does not get done in time waits, and none is lost."""
+    graph.start_run()
+    begin = time.monotonic()
+    for step in range(200):
+        graph.probe.spin_until(lambda due=begin + step / 200: time.monotonic() >= due, "the time")
+        graph.play(step)
+    graph.wait_for_step(199)
+    assert graph.steps() == [(step, step + 1) for step in range(199)]
+
+
+def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Graph) -> None:
+    """Killed and back half a minute later: the odometry goes on, and says how little it knows of the time between."""
+    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.start_run()
+    graph.play(*range(6))
+    graph.action(299)
+    graph.play(*range(300, 305))
+    graph.wait_for_step(304)
+    assert graph.steps() == [
+        (0, 1),
+        (1, 2),
+        (2, 3),
+        (3, 4),
+        (4, 5),
+        (5, 300),
+        (300, 301),
+        (301, 302),
+        (302, 303),
+        (303, 304),
+    ]
+    std = [np.sqrt(np.array(message.covariance).reshape(3, 3).diagonal()) for message in graph.out.relative_poses]
+    assert (std[5] > 100 * np.array([0.1, 0.02, 0.05])).all(), "294 frames are missing"
+    assert (std[5] > 10 * std[4]).all()
+    corrected = [np.sqrt(pose.pose.covariance[0]) for pose in graph.out.poses]
+    assert corrected[5] > 20.0 > corrected[4]
+    wait_for_problem(graph.probe, "/local_node", diagnostics, "294 frames missing between images")
+    wait_for_problem(graph.probe, "/ngo_node", diagnostics, "lost: the standard deviation of the position is")
+
+
+def test_reset_of_local_node_is_a_new_origin(graph: Graph) -> None:
+    graph.finish_run(frames=4)
+    response = graph.probe.call(Reset, "local_node/reset", Reset.Request())
+    assert (response.success, response.message) == (True, "the next image is the new origin of the odometry")
+    graph.play(4, 5, 6)
+    graph.wait_for_step(6)
+    assert graph.steps()[-2:] == [(4, 5), (5, 6)]
+    assert to_ns(graph.out.relative_poses[-1].origin_stamp) == graph.stamp_ns(4)
+
+
+def test_of_two_cameras_on_one_topic_the_first_is_held_and_both_are_named(graph: Graph) -> None:
+    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.start_run()
+    graph.play(*range(3))
+    graph.wait_for_step(2)
+    second = Probe("second_camera")
+    images = second.node.create_publisher(Image, "image", 100)
+    try:
+        second.spin_until(lambda: images.get_subscription_count() == 1, "a match")
+        for step in range(3, 20):
+            graph.play(step)
+            images.publish(image_message(scan(1000 + step), graph.stamp_ns(step) + 1 - RUN_NS * (step % 2)))
+            graph.wait_for_step(step)
+        assert graph.steps() == [(step, step + 1) for step in range(19)]
+        for estimate, message in zip(graph.expected(*range(20)), graph.out.relative_poses, strict=True):
+            np.testing.assert_allclose(message.odom_x, estimate.odom_xyyaw[0], atol=1e-6)
+        wait_for_problem(graph.probe, "/local_node", diagnostics, "/probe and /second_camera publish on '/image'")
+        graph.local.wait_for_log("dropped message on image: /probe and /second_camera publish on '/image'")
+    finally:
+        second.node.destroy_publisher(images)
+        second.close()
+
+
+def test_an_image_publisher_of_another_qos_is_named(graph: Graph) -> None:
+    other = Probe("careless_camera")
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = other.node.create_publisher(Image, "image", best_effort)
+    try:
+        graph.local.wait_for_log("nothing comes from /careless_camera on '/image': the QoS policy RELIABILITY")
+    finally:
+        other.node.destroy_publisher(publisher)
+        other.close()
+    graph.finish_run(frames=3)
+
+
+def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, parameters: dict[str, Any]) -> None:
+    """Started twice by mistake: ngo_node used to begin anew with every message."""
+    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.start_run()
+    graph.play(0, 1, 2)
+    graph.wait_for_step(2)
+    restarts = graph.ngo.log.count("restarted, so")
+    twin = {**parameters, "image_reliability": "reliable", "image_depth": 1000, "publish_odometry": False}
+    with NodeProcess("ngo_estimator", "local_node", {**twin, "publish_tf": False}, ("-r", "__node:=twin")) as process:
+        process.wait_for_log("ready")
+        graph.probe.spin_until(
+            lambda: graph.images.get_subscription_count() == 2 and graph.actions.get_subscription_count() == 2,
+            "the twin's subscriptions",
+        )
+        # The twin listens to images, and ngo_node's subscription knows the twin.
+        step = 3
+
+        def refused() -> bool:
+            nonlocal step
+            graph.play(step)
+            graph.probe.spin_until(
+                lambda: to_ns(graph.out.poses[-1].header.stamp) == graph.stamp_ns(step), f"the pose of step {step}"
+            )
+            step += 1
+            return "/local_node and /twin publish on '/relative_pose'" in graph.ngo.log
+
+        graph.probe.spin_until(refused, "a warning that names both")
+        wait_for_problem(graph.probe, "/ngo_node", diagnostics, "/local_node and /twin publish on '/relative_pose'")
+    assert graph.ngo.log.count("restarted, so") == restarts
+    assert [to_ns(pose.header.stamp) for pose in graph.out.poses] == [graph.stamp_ns(k) for k in range(1, step)]
+
+
+def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: dict[str, Any]) -> None:
+    """What moved meanwhile is unknown, and nothing is made up for it."""
+    probe = Probe("returning")
+    local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
+    arguments = ("-r", "__ns:=/returning")
+    with ExitStack() as stack:
+        ngo = stack.enter_context(NodeProcess("ngo_estimator", "ngo_node", parameters, arguments))
+        images = probe.node.create_publisher(Image, "/returning/image", 1000)
+        actions = probe.node.create_publisher(DiscreteAction, "/returning/action", 1000)
+        relative_poses = probe.collect(RelativePose, "/returning/relative_pose")
+        step = 0
+
+        def drive_until_heard() -> None:
+            def heard() -> bool:
+                nonlocal step
+                stamp = to_time(RUN_NS + step * STEP_NS)
+                actions.publish(DiscreteAction(header=Image().header.__class__(stamp=stamp), action=0))
+                step += 1
+                images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
+                return len(relative_poses) > 3
+
+            relative_poses.clear()
+            probe.spin_until(heard, "relative poses")
+
+        with NodeProcess("ngo_estimator", "local_node", local, arguments) as process:
+            drive_until_heard()
+            origin_ns = to_ns(relative_poses[0].origin_stamp)
+            process.send(signal.SIGKILL)
+            process.wait()
+        stack.enter_context(NodeProcess("ngo_estimator", "local_node", local, arguments))
+        drive_until_heard()
+        assert to_ns(relative_poses[0].origin_stamp) > origin_ns
+        ngo.wait_for_log("the relative poses have a new origin: their source restarted")
+        assert "only the first that was heard" not in ngo.log
+    probe.close()
