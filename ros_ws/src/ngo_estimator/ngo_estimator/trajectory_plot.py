@@ -20,7 +20,7 @@ def save_plot(path: Path, title: str, estimates: Mapping[str, np.ndarray], truth
         estimates: poses ``(frames, 3)`` by name, all in one frame.
         truth: poses ``(frames, 3)`` in the same frame.
     """
-    figure = Figure(figsize=(6.2 * len(estimates), 6.6), layout="constrained")
+    figure = Figure(figsize=(6.2 * len(estimates), 6.2))
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(estimates), sharex=True, sharey=True, squeeze=False)[0]
     for axes, (name, poses), color in zip(panels, estimates.items(), _COLORS, strict=False):
@@ -33,8 +33,9 @@ def save_plot(path: Path, title: str, estimates: Mapping[str, np.ndarray], truth
         axes.grid(color="#dddddd", linewidth=0.5)
         axes.legend(frameon=False, fontsize=8)
     panels[0].set_ylabel("y (m)")
+    figure.subplots_adjust(wspace=0.05)
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
 def _draw(axes: Axes, poses: np.ndarray, color: str, label: str) -> None:

@@ -146,7 +146,8 @@ def _rows(report: Report, alignments: Sequence[Alignment]) -> list[tuple[str, An
     for how in alignments:
         rows.append((f"ATE, RMSE, m ({_ALIGNED[how]})", rmse("ate", how, "translation_m")))
         rows.append((f"ATE, RMSE, deg ({_ALIGNED[how]})", rmse("ate", how, "rotation_deg")))
-    delta = f"{report['rpe']['delta']:g} {report['rpe']['unit']}"
+    size, unit = report["rpe"]["delta"], report["rpe"]["unit"]
+    delta = f"{size:g} {unit.removesuffix('s') if size == 1 else unit}"
     rows.append((f"RPE over {delta}, RMSE, m", rmse("rpe", "translation_m")))
     rows.append((f"RPE over {delta}, RMSE, deg", rmse("rpe", "rotation_deg")))
     for key, unit in (("translation_percent", "%"), ("rotation_deg_per_m", "deg/m")):
