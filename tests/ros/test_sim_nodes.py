@@ -16,9 +16,10 @@ from ngo_msgs.msg import DiscreteAction
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, LaserScan
+from tf2_msgs.msg import TFMessage
 
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
@@ -115,6 +116,8 @@ def test_maze2d_publishes_what_the_core_records(probe: Probe) -> None:
 
 
 def test_maze3d_publishes_what_the_core_records(probe: Probe) -> None:
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    mounted = probe.collect(TFMessage, "/tf_static", latched)
     run = Run(probe, "maze3d", CameraInfo, "camera_info")
     env = Maze3D()
     episode = record_episode(env, DRIVERS["maze3d"], FRAMES, SEED)
@@ -127,6 +130,13 @@ def test_maze3d_publishes_what_the_core_records(probe: Probe) -> None:
     assert math.degrees(2 * math.atan(40 / info.k[0])) == pytest.approx(108)
     assert (info.k[2], info.k[5]) == (39.5, 29.5)
     assert info.header.frame_id == image.header.frame_id == "camera_optical_frame"
+    (transform,) = mounted[0].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("base_link", "camera_optical_frame")
+    q = transform.transform.rotation
+    forward = (2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x**2 + q.y**2))
+    assert forward == (1.0, 0.0, 0.0), "the optical axis z is forward in base_link"
+    right = (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y))
+    assert right == (0.0, -1.0, 0.0), "x of the picture is right"
 
 
 def test_none_is_lost_by_a_slow_subscriber(probe: Probe) -> None:

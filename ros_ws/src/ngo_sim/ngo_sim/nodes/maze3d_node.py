@@ -8,18 +8,24 @@ import os
 import sys
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
+from tf2_msgs.msg import TFMessage
 
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.nodes.process import run_simulator
 from ngo_sim.nodes.simulator_node import SimulatorNode
 from ngo_sim.simulation import Frame, World
 
+# An optical frame looks along z, with x to the right and y down (REP-103).
+_BASE_FROM_OPTICAL = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
+
 
 class Maze3DNode(SimulatorNode):
     """Publishes `image` (rgb8) and `camera_info`: a pinhole at the middle of the robot, without distortion.
 
-    The two focal lengths differ: Doom's pixels are higher than wide.
+    The two focal lengths differ: Doom's pixels are higher than wide. Where the camera is, is on `/tf_static`.
     """
 
     world_config_type = Maze3DConfig
@@ -30,6 +36,13 @@ class Maze3DNode(SimulatorNode):
         self._camera_info = self.outputs.create(CameraInfo, "camera_info")
         self._image = self.outputs.create(Image, "image")
         self.image_publisher = self._image.publisher
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._static_tf = self.create_publisher(TFMessage, "/tf_static", latched)
+        if self.config.camera_frame != self.config.base_frame:
+            mounted = TransformStamped(child_frame_id=self.config.camera_frame)
+            mounted.header.frame_id = self.config.base_frame
+            mounted.transform = Transform(rotation=_BASE_FROM_OPTICAL)
+            self._static_tf.publish(TFMessage(transforms=[mounted]))
         config: Maze3DConfig = self.world_config
         focal_x, focal_y = config.focal_lengths_px
         # The middle of the picture, where the centre of pixel 0 is 0.
