@@ -115,7 +115,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         folder = arguments.weights_folder
         local = LocalOdometry.load(folder, arguments.world)
         online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world)
-        topics = choose_topics(recording, _with_sensor(recording, arguments.topics, local))
+        topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
         _check_side_information(topics, local)
         console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
         core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
@@ -125,7 +125,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     if not trajectories:
         why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
         raise ValueError(f"no two frames of {topics.image} could be used: {why or f'it has {core.frames}'}")
-    for line in _losses(core):
+    for line in _losses(core, max(core.frames, recording.topics[topics.image].count)):
         console.print(line, soft_wrap=True, highlight=False)
     console.print(f"{core.frames} frames in {took_s:.1f} s, {core.frames / took_s:.0f} frames/s", highlight=False)
     result = {
@@ -191,11 +191,15 @@ def _run(
     return found
 
 
-def _with_sensor(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
-    """The arguments, with the only laser scan as the image where the weights take one."""
+def _for_weights(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
+    """The arguments, with the only laser scan for weights that take one, and without what weights do not take."""
     scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
     if given.image is None and local.image_format.is_scan and len(scans) == 1:
-        return replace(given, image=scans[0])
+        given = replace(given, image=scans[0])
+    if given.action is None and not local.uses_action:
+        given = replace(given, action="none")
+    if given.twist is None and not local.uses_twist:
+        given = replace(given, twist="none")
     return given
 
 
@@ -230,12 +234,12 @@ def _rejected(core: "RecordingRun") -> list[tuple[str, int]]:
     return [(reason, count) for reason, count in core.rejected.items() if count]
 
 
-def _losses(core: "RecordingRun") -> list[str]:
-    """A line for each reason why frames were not used, and one about gaps."""
+def _losses(core: "RecordingRun", images: int) -> list[str]:
+    """A line for each reason why images were not used, and one about gaps."""
     lines = []
     for reason, count in _rejected(core):
         example = core.examples.get(reason)
-        lines.append(f"{count} of {core.frames} frames not used: {reason}{f' (first: {example})' if example else ''}")
+        lines.append(f"{count} of {images} images not used: {reason}{f' (first: {example})' if example else ''}")
     if core.gaps:
         lines.append(f"{core.gaps} steps span more than the time between two frames in training")
     return lines
