@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image as Picture
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
@@ -124,9 +124,16 @@ def write_mcap(path: Path, entries: Iterable[Entry], **options: Any) -> Path:
     return path
 
 
-def write_rosbag(path: Path, entries: Iterable[Entry], storage: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
+def write_rosbag(
+    path: Path,
+    entries: Iterable[Entry],
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
+    compression: CompressionMode = CompressionMode.NONE,
+) -> Path:
     """A folder by the rosbags library."""
-    with Writer(path, version=9, storage_plugin=storage) as writer:
+    bag = Writer(path, version=9, storage_plugin=storage)
+    bag.set_compression(compression, CompressionFormat.ZSTD)
+    with bag as writer:
         connections: dict[str, Any] = {}
         for topic, log_time_ns, message in entries:
             if topic not in connections:

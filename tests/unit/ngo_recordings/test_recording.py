@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader, StoragePlugin
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ngo_recordings.definitions import message_definition
@@ -81,6 +81,14 @@ def test_every_form_is_read_the_same(stored: Path) -> None:
         assert recording.unfinished == ()
         chosen = [entry for entry in entries if entry[0] != "/image"]
         assert facts(recording.messages(["/pose", "/action"])) == expected(chosen)
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("compression", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_folders_are_read(tmp_path: Path, storage: StoragePlugin, compression: CompressionMode) -> None:
+    folder = m.write_rosbag(tmp_path / "drive", drive(), storage, compression)
+    with open_recording([folder]) as recording:
+        assert facts(recording.messages()) == expected(list(drive()))
 
 
 def test_custom_types_need_no_ros_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

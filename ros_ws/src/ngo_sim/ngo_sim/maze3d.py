@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import shutil
 import tempfile
 import threading
@@ -222,6 +223,7 @@ class _Engine:
         folder = self._folder = Path(tempfile.mkdtemp(prefix="ngo_maze3d_"))
         write_pwad(folder / "maps.wad", [(_map_name(index), text) for index, text in enumerate(texts)])
         game = vizdoom.DoomGame()
+        game.set_vizdoom_path(str(_launcher(folder)))
         game.set_doom_game_path(str(Path(vizdoom.__file__).parent / "freedoom2.wad"))
         game.set_doom_scenario_path(str(folder / "maps.wad"))
         game.set_doom_config_path(str(folder / "engine.ini"))
@@ -293,6 +295,20 @@ class _Engine:
         folder, self._folder = self._folder, None
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _launcher(folder: Path) -> Path:
+    """What starts the engine: a script in the folder by which the engine ends with this process, even a killed one.
+
+    Without util-linux's setpriv (not on Linux) it is the engine itself.
+    """
+    engine, setpriv = Path(vizdoom.__file__).parent / "vizdoom", shutil.which("setpriv")
+    if setpriv is None:
+        return engine
+    script = folder / "engine.sh"
+    script.write_text(f"#!/bin/sh\nexec {shlex.quote(setpriv)} --pdeathsig KILL -- {shlex.quote(str(engine))} \"$@\"\n")
+    script.chmod(0o700)
+    return script
 
 
 def mean_2x2(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -28,6 +28,8 @@ from ngo_sim.simulator_config import SimulatorConfig
 
 _LOOK_AT_GRAPH_S = 0.1
 _IDLE_S = 0.05
+# Taking messages costs more than a frame: between frames that follow at once it is done this often.
+_LISTEN_S = 0.002
 
 
 class SimulatorNode(Node):
@@ -79,6 +81,7 @@ class SimulatorNode(Node):
         """Publish frames until there are enough and all are taken; a KeyboardInterrupt ends it earlier."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
+        listened_s = 0.0
         while True:
             now_s = time.monotonic()
             if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
@@ -91,7 +94,9 @@ class SimulatorNode(Node):
             elif (idle_s := self._idle_s(now_s)) == 0.0:
                 self._publish_next(now_s)
             self.outputs.flush_if_due()
-            executor.spin_once(timeout_sec=idle_s)
+            if idle_s > 0.0 or now_s - listened_s >= _LISTEN_S:
+                listened_s = now_s
+                executor.spin_once(timeout_sec=idle_s)
         self.image_publisher.wait_for_all_acked(Duration(seconds=5))
         self.get_logger().info(f"published all {self._published} frames")
 
