@@ -27,7 +27,7 @@ from ngo_sim.maze3d import Maze3D
 from ngo_sim.nodes.parameters import BadParameter, ConfigParameters
 from ngo_sim.simulator_config import SimulatorConfig
 
-from .processes import NodeProcess, Probe
+from .processes import NodeProcess, Probe, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -308,3 +308,23 @@ def test_a_signal_ends_it_cleanly(probe: Probe, world: str, number: signal.Signa
         node.send(number)
         assert node.wait() == 0, node.log
         assert "Traceback" not in node.log
+
+
+def test_a_killed_maze3d_takes_its_engine_along(probe: Probe) -> None:
+    images = probe.collect(Image, "image")
+    with simulator("maze3d", rate=50) as node:
+        probe.spin_until(lambda: len(images) > 2, "some frames")
+        (engine,) = node.children()
+        status = Path(f"/proc/{engine}/stat")
+        assert "vizdoom" in status.read_text()
+        node.send(signal.SIGKILL)
+        node.wait()
+
+        def ended() -> bool:
+            """Gone, or but for its parent's taking notice."""
+            try:
+                return status.read_text().rpartition(")")[2].split()[0] == "Z"
+            except (FileNotFoundError, ProcessLookupError):
+                return True
+
+        wait_until(ended, "the engine's end")
