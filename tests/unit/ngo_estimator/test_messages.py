@@ -29,7 +29,10 @@ def update(loops: int) -> WholeTrajectory:
         online_xyyaw=rng.normal(size=(5, 3)),
         moved_m=rng.random(5),
         loops=np.array([[0, 4], [1, 3]])[:loops],
+        odometry_std=rng.random((4, 3)),
         loop_weights=np.array([0.25, 1.0])[:loops],
+        loop_relative_xyyaw=rng.normal(size=(loops, 3)),
+        loop_std=rng.random((loops, 3)),
     )
 
 

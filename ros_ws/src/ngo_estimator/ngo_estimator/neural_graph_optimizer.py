@@ -85,35 +85,36 @@ class NeuralGraphOptimizerConfig:
 
 
 @dataclass(frozen=True)
-class History:
-    """Poses from before the steps that are optimised, which move with them.
+class MetaSteps:
+    """Relative meta-poses as the local odometry has them.
 
-    ``relative`` ``(batch, poses, 3)``: each as seen from the one before, the first from the origin; the last is where
-    the steps begin. ``std`` ``(batch, poses, 3)``: their standard deviations, along the axes of the pose before.
+    ``relative`` ``(batch, poses, 3)`` and ``std``, their standard deviations along the axes of the pose before. The
+    last ``blocks`` of them are blocks of steps, with ``features`` ``(batch, blocks, width)`` where the optimizer has a
+    network; those in front, if any, lead from the origin to the first block and may stand for many steps each.
     """
 
     relative: Tensor
     std: Tensor
+    features: Tensor | None
+    blocks: int
 
 
 @dataclass(frozen=True)
-class OptimizedTrajectory:
-    """What the optimizer gives for ``(batch, steps)``, on whole blocks of steps.
+class OptimizedMetaPoses:
+    """What the optimizer gives for a batch of meta-steps.
 
-    ``poses`` ``(batch, steps, 3)``: corrected global poses of all frames after the origin. ``meta_relative``: one
-    ``(batch, blocks, 3)`` for each iteration, first to last; a history's poses stand in front. ``loops`` with
-    ``loop_weights`` ``(batch, loops)`` of the last iteration, zero to one. ``loop_information`` ``(batch, loops, 3)``
-    and ``step_std`` ``(batch, blocks, 3)``: the belief in the loops and in the relative meta-poses. ``equations``:
-    those of the last Gauss-Newton step, where no gradient was asked for.
+    ``meta_relative``: one ``(batch, poses, 3)`` for each iteration, first to last. ``loops`` with ``loop_weights``
+    ``(batch, loops)`` of the last iteration, zero to one. ``loop_information`` ``(batch, loops, 3)`` and ``step_std``
+    ``(batch, poses, 3)``: the belief in the loops and in the relative meta-poses. ``equations``: those of the last
+    Gauss-Newton step, where no gradient was asked for.
     """
 
-    poses: Tensor
     meta_relative: list[Tensor]
     loops: Loops | None
     loop_weights: Tensor | None
     loop_information: Tensor | None
     step_std: Tensor
-    equations: NormalEquations | None = None
+    equations: NormalEquations | None
 
     def end_covariance(self) -> Tensor:
         """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
@@ -127,6 +128,13 @@ class OptimizedTrajectory:
             residual = torch.zeros_like(self.loop_information)
             factors.append(pair_factors(self.loops.nodes, poses, residual, self.loop_information))
         return node_covariance(factors, poses.shape[1], poses.shape[1] - 1)
+
+
+@dataclass(frozen=True)
+class OptimizedTrajectory(OptimizedMetaPoses):
+    """The same with ``poses`` ``(batch, steps, 3)``: corrected global poses of all frames after the origin."""
+
+    poses: Tensor
 
 
 class RobustLoopGate(nn.Module):
@@ -309,6 +317,13 @@ class NeuralGraphOptimizer(nn.Module):
         """Loop candidates of trajectories; ``place_codes`` ``(batch, steps, code_size)`` are of each step's end."""
         return find_loops(pair_head, place_codes, poses_in_blocks(relative, self.block), self.config.search)
 
+    def aggregate(self, relative: Tensor, log_std: Tensor, motion_features: Tensor) -> MetaSteps:
+        """Meta-steps of trajectories whose number of steps is a multiple of the block; arguments as of ``forward``."""
+        in_blocks = poses_in_blocks(relative, self.block)
+        features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
+        std = block_variances(in_blocks, log_std).sqrt()
+        return MetaSteps(in_blocks[..., -1, :], std, features, in_blocks.shape[1])
+
     def forward(
         self,
         relative: Tensor,
@@ -316,7 +331,6 @@ class NeuralGraphOptimizer(nn.Module):
         motion_features: Tensor,
         loops: Loops | None = None,
         fixes: CompassFixes | None = None,
-        history: History | None = None,
     ) -> OptimizedTrajectory:
         """Optimise trajectories whose number of steps is a multiple of the block.
 
@@ -325,23 +339,23 @@ class NeuralGraphOptimizer(nn.Module):
             motion_features: ``(batch, steps, motion_feature_size)``.
             loops: what ``find_loops`` found, for an optimizer with loops.
             fixes: what ``compass_fixes`` chose, for an optimizer with a compass.
-            history: poses from before the first step; the indices of loops and fixes count them, too.
         """
+        result = self.optimize(self.aggregate(relative, log_std, motion_features), loops, fixes)
+        poses = frame_poses(poses_in_blocks(relative, self.block), result.meta_relative[-1])
+        return OptimizedTrajectory(**vars(result), poses=poses)
+
+    def optimize(
+        self, steps: MetaSteps, loops: Loops | None = None, fixes: CompassFixes | None = None
+    ) -> OptimizedMetaPoses:
+        """Optimise meta-poses; ``loops`` and ``fixes`` as in ``forward``, their indices count all ``steps``."""
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
         if self.config.compass != (fixes is not None):
             given = "no fixes were given" if fixes is None else "fixes were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.compass else 'out'} a compass")
-        in_blocks = poses_in_blocks(relative, self.block)
-        odometry = in_blocks[..., -1, :]
-        base_std = block_variances(in_blocks, log_std).sqrt()
-        before = 0
-        if history is not None:
-            before = history.relative.shape[1]
-            odometry = torch.cat((history.relative, odometry), dim=1)
-            base_std = torch.cat((history.std, base_std), dim=1)
-        features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
+        odometry, base_std, features = steps.relative, steps.std, steps.features
+        before = odometry.shape[1] - steps.blocks
         similarity = None if loops is None or features is None else loops.embeddings @ loops.embeddings.mT
         adjusted, deviation, step_std = odometry, torch.zeros_like(odometry), base_std
         lattice = None if fixes is None else fixes.lattice.double()
@@ -380,15 +394,16 @@ class NeuralGraphOptimizer(nn.Module):
             if loops is not None and information is not None and log_scale is not None:
                 own = base_std[:, before:] * torch.exp(3.0 * torch.tanh(log_scale / 3.0)) * self.odometry_noise
                 step_std = torch.cat((base_std[:, :before], own), dim=1)
+                poses = poses.double()
                 factors = [
-                    chain_factors(poses.double(), deviation.double(), step_std.double()),
-                    pair_factors(loops.nodes, poses.double(), residuals.double(), information.double()),
+                    chain_factors(poses, deviation.double(), step_std.double()),
+                    pair_factors(loops.nodes, poses, residuals.double(), information.double()),
                 ]
                 if fixes is not None and lattice is not None:
                     origin = torch.zeros_like(fixes.node)
                     drift = odometry_variances(origin, fixes.node, poses, step_std.square())
                     drift = drift * RobustLoopGate.ANNEALING ** (2 * iteration)
-                    factors.append(compass_factors(fixes, self.compass_gate, lattice, poses.double(), drift))
+                    factors.append(compass_factors(fixes, self.compass_gate, lattice, poses, drift))
                 nodes = poses.shape[1]
                 if structure is not None:
                     equations = NormalEquations(factors, structure)
@@ -396,13 +411,12 @@ class NeuralGraphOptimizer(nn.Module):
                 else:
                     step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
                 step = step if self.config.robust else self.loop_gain * step
-                deviation = deviation + _change(poses.double(), step[:, :nodes]).to(deviation.dtype)
+                change = se2.g2r((poses + step[:, :nodes])[:, 1:]) - se2.g2r(poses[:, 1:])
+                change = torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
+                deviation = deviation + change.to(deviation.dtype)
                 lattice = None if lattice is None else lattice + step[:, nodes]
             results.append(adjusted + deviation)
-        poses = frame_poses(in_blocks, results[-1][:, before:])
-        if history is not None:
-            poses = se2.compose(se2.r2g(results[-1])[:, before - 1 : before], poses)
-        return OptimizedTrajectory(poses, results, loops, weights, information, step_std, equations)
+        return OptimizedMetaPoses(results, loops, weights, information, step_std, equations)
 
     def _structure(self, loops: Loops | None, odometry: Tensor) -> GraphStructure | None:
         """Of the graph that every iteration solves, where a single one is optimised and no gradient asked for."""
@@ -412,12 +426,6 @@ class NeuralGraphOptimizer(nn.Module):
         index = torch.arange(blocks)
         nodes = torch.cat((torch.stack((index, index + 1), dim=-1), loops.nodes[0]))
         return GraphStructure(nodes.numpy(), blocks + 1)
-
-
-def _change(poses: Tensor, step: Tensor) -> Tensor:
-    """What a Gauss-Newton step at global poses with the origin in front adds to the relative ones."""
-    change = se2.g2r((poses + step)[:, 1:]) - se2.g2r(poses[:, 1:])
-    return torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
 
 
 def _zero(layer: nn.Conv1d) -> nn.Conv1d:

@@ -17,6 +17,8 @@ from ngo_estimator.gauss_newton import Factors
 _RELATIVE_JITTER = 1e-12
 """Added to the diagonal, in units of itself: what the rounding of some hundred poses can take from it."""
 
+_SYMMETRIC = {"SymmetricMode": True}
+
 
 class GraphStructure:
     """Which poses the factors of a graph join: the same in all Gauss-Newton steps of an optimisation.
@@ -28,12 +30,17 @@ class GraphStructure:
     def __init__(self, nodes: np.ndarray, count: int) -> None:
         self.count = count
         unknown = count - 1
-        row, column = (nodes - 1)[:, [0, 0, 1, 1]].ravel(), (nodes - 1)[:, [0, 1, 0, 1]].ravel()
-        self._kept = np.flatnonzero((row >= 0) & (column >= 0))
-        row, column = row[self._kept], column[self._kept]
+        pairs = nodes - 1
+        self._rank = _order_of_elimination(pairs[(pairs >= 0).all(1)], unknown)
+        ranks = self._rank[pairs]
+        row, column = ranks[:, [0, 0, 1, 1]].ravel(), ranks[:, [0, 1, 0, 1]].ravel()
+        known = (pairs[:, [0, 0, 1, 1]] < 0).ravel() | (pairs[:, [0, 1, 0, 1]] < 0).ravel()
         diagonal = np.arange(unknown)
         keys = np.concatenate((column * unknown + row, diagonal * unknown + diagonal))
-        blocks, self._block = np.unique(keys, return_inverse=True)
+        blocks, block = np.unique(keys[np.append(~known, np.ones(unknown, bool))], return_inverse=True)
+        # Blocks of node 0 are summed, too, behind all others, and of no account.
+        self._block = torch.full((len(row),), len(blocks))
+        self._block[torch.from_numpy(~known)] = torch.from_numpy(block[: len(block) - unknown])
         block_column, block_row = blocks // unknown, blocks % unknown
         height = np.bincount(block_column, minlength=unknown)
         first = np.concatenate(([0], np.cumsum(height)))
@@ -48,17 +55,32 @@ class GraphStructure:
         self._indptr = np.append(starts.ravel(), 9 * len(blocks)).astype(np.int32)
         self._is_diagonal = block_column == block_row
 
+    def rows(self, nodes: np.ndarray) -> np.ndarray:
+        """Rows of the matrix ``(n, 3)`` that belong to nodes ``(n,)``, none of them node 0."""
+        rows: np.ndarray = 3 * self._rank[nodes - 1][:, None] + np.arange(3)
+        return rows
+
     def matrix(self, hessian: Tensor) -> csc_matrix:
-        """The factors' ``(factors, 6, 6)`` summed, without the rows and columns of node 0."""
-        parts = hessian.unflatten(-1, (2, 3)).unflatten(-3, (2, 3)).transpose(2, 3).reshape(-1, 9).numpy()[self._kept]
-        blocks = np.zeros((len(self._is_diagonal), 9))
-        index = torch.from_numpy(self._block[: len(self._kept)])
-        torch.from_numpy(blocks).index_add_(0, index, torch.from_numpy(parts))
+        """The factors' ``(factors, 6, 6)`` summed, without node 0, in an order that leaves few entries to eliminate."""
+        parts = hessian.unflatten(-1, (2, 3)).unflatten(-3, (2, 3)).transpose(2, 3).reshape(-1, 9)
+        summed = torch.zeros(len(self._is_diagonal) + 1, 9, dtype=torch.float64).index_add_(0, self._block, parts)
+        blocks = summed[:-1].numpy()
         blocks[self._is_diagonal, ::4] *= 1.0 + _RELATIVE_JITTER
         data = np.empty(9 * len(blocks))
         data[self._place] = blocks.reshape(-1, 3, 3)
         size = 3 * (self.count - 1)
         return csc_matrix((data, self._indices, self._indptr), shape=(size, size))
+
+
+def _order_of_elimination(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Place of each node ``(count,)`` in an ordering of minimum degree, found on single numbers instead of blocks."""
+    degree = np.bincount(pairs.ravel(), minlength=count) + 1.0
+    values = np.concatenate((np.full(2 * len(pairs), -1.0), degree))
+    diagonal = np.arange(count)
+    rows, columns = (np.concatenate((pairs[:, k], pairs[:, 1 - k], diagonal)) for k in (0, 1))
+    matrix = csc_matrix((values, (rows, columns)), shape=(count, count))
+    order: np.ndarray = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC).perm_c
+    return order.astype(np.int64)
 
 
 class NormalEquations:
@@ -75,19 +97,22 @@ class NormalEquations:
         self._structure = structure
         self._right = torch.zeros(structure.count, 3, dtype=torch.float64)
         self._right.index_add_(0, nodes.flatten(), gradient.reshape(-1, 3))
-        options = {"SymmetricMode": True}
         matrix = structure.matrix(weighted.mT @ jacobian.double())
-        self._factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        self._factor = splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
 
     def step(self) -> Tensor:
         """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""
-        solution = torch.zeros(self._structure.count, 3, dtype=torch.float64)
-        solution[1:] = torch.from_numpy(self._factor.solve(self._right[1:].flatten().numpy()).reshape(-1, 3))
-        return solution.unsqueeze(0)
+        count = self._structure.count
+        rows = self._structure.rows(np.arange(1, count))
+        right = np.empty(rows.size)
+        right[rows] = self._right[1:].numpy()
+        step = np.zeros((count, 3))
+        step[1:] = self._factor.solve(right)[rows]
+        return torch.from_numpy(step).unsqueeze(0)
 
     def covariance(self, nodes: Sequence[int]) -> np.ndarray:
         """Joint covariance ``(3 n, 3 n)`` of the poses of ``n`` different nodes, node 0 excepted, in the map."""
-        wanted = (3 * (np.asarray(nodes) - 1)[:, None] + np.arange(3)).ravel()
+        wanted = self._structure.rows(np.asarray(nodes)).ravel()
         right = np.zeros((3 * (self._structure.count - 1), len(wanted)))
         right[wanted, np.arange(len(wanted))] = 1.0
         covariance: np.ndarray = self._factor.solve(right)[wanted]

@@ -10,9 +10,12 @@ from torch import Tensor
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import CheckpointError, load_optimizer, load_place
 from ngo_estimator.local_odometry import RESTART_AFTER_NS
+from ngo_estimator.meta_graph import MetaGraph
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.planar_covariance import propagate
+from ngo_estimator.pose_aggregation import in_block_poses
+from ngo_estimator.rows import GrowingRows
 
 LARGEST_VALUE = 1e4
 """Largest size of a coordinate (m, rad), feature or code: beyond it the optimizer's float32 has no room to compute."""
@@ -54,7 +57,7 @@ class TrajectoryUpdate:
     """What a step changed; its size does not depend on how long the trajectory is.
 
     ``pose_xyyaw`` (3,) of the newest frame, corrected, in ``map``, whose origin is the first frame, with its
-    ``covariance`` (3, 3), as if the pose where the window begins were exact; ``map_from_odom_xyyaw`` (3,). ``frames``
+    ``covariance`` (3, 3), that of the first frame being zero; ``map_from_odom_xyyaw`` (3,). ``frames``
     counts all of the trajectory. ``optimized`` says whether this step ran the optimizer, ``restarted`` whether it
     began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
     ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
@@ -81,8 +84,10 @@ class Trajectory:
 
     ``stamps_ns`` (n,) int64; ``poses_xyyaw`` (n, 3) corrected, in ``map``; ``odometry_xyyaw`` (n, 3) as the local
     odometry has it; ``online_xyyaw`` (n, 3) each corrected pose as it was when its frame was the newest; ``moved_m``
-    (n,) how far the last step moved each pose; ``loops`` (e, 2) frame indices, earlier first, with ``loop_weights``
-    (e,) of zero to one. The arrays are read-only and stay as they are.
+    (n,) how far the last step moved each pose; ``odometry_std`` (n - 1, 3) of what leads from each frame to the next.
+    ``loops`` (e, 2) frame indices, earlier first, with ``loop_weights`` (e,) of zero to one, ``loop_relative_xyyaw``
+    (e, 3), the later frame as it was seen from the earlier one, and ``loop_std`` (e, 3) in which the weight is
+    accounted for. The arrays are read-only and stay as they are.
     """
 
     stamps_ns: np.ndarray
@@ -90,42 +95,57 @@ class Trajectory:
     odometry_xyyaw: np.ndarray
     online_xyyaw: np.ndarray
     moved_m: np.ndarray
+    odometry_std: np.ndarray
     loops: np.ndarray
     loop_weights: np.ndarray
+    loop_relative_xyyaw: np.ndarray
+    loop_std: np.ndarray
 
 
 class OnlineTrajectory:
     """Keeps the trajectory and re-optimises it whenever a meta-pose is complete.
 
-    Between two meta-poses the newest frames follow the last corrected one by odometry. After ``n`` steps the result
-    is that of ``optimize_offline`` on the first ``n``. Only the last ``window_frames`` are optimised: older poses
-    stay where they were when they left the window.
+    Between two meta-poses the newest frames follow the last corrected one by odometry. The last ``window_frames`` are
+    optimised together; up to so many steps the result is that of ``optimize_offline``. Of the poses before, at most
+    ``key_frames`` (and a few more for a while) are optimised with them; all others move with these, and loops are
+    closed with their frames. So the cost of a step does not depend on how long the trajectory is.
     """
 
-    def __init__(self, optimizer: NeuralGraphOptimizer, pair_head: PairHead | None, window_frames: int = 2000) -> None:
+    def __init__(
+        self,
+        optimizer: NeuralGraphOptimizer,
+        pair_head: PairHead | None,
+        window_frames: int = 2000,
+        key_frames: int = 128,
+    ) -> None:
         block = optimizer.config.aggregation.block
         if window_frames < 2 * block:
             raise ValueError(f"window_frames is {window_frames}; expected at least {2 * block}, two meta-poses")
+        if key_frames < 2:
+            raise ValueError(f"key_frames is {key_frames}; expected at least 2")
         if optimizer.config.loops and pair_head is None:
             raise ValueError("an optimizer with loops needs a pair head")
         self._optimizer, self._pair_head = optimizer.eval(), pair_head
         self._block = block
         self._window = window_frames // block * block
+        self._key_frames = key_frames
         self.reset()
 
     @classmethod
-    def load(cls, weights: Path, window_frames: int = 2000, world: str | None = None) -> "OnlineTrajectory":
+    def load(
+        cls, weights: Path, window_frames: int = 2000, world: str | None = None, key_frames: int = 128
+    ) -> "OnlineTrajectory":
         """Load the networks in the folder ``weights``; raises ``CheckpointError``, of one clear line."""
         optimizer, description = load_optimizer(weights, world)
         if not optimizer.config.loops:
-            return cls(optimizer, None, window_frames)
+            return cls(optimizer, None, window_frames, key_frames)
         place, place_description = load_place(weights, description["world"])
         expected = description.get("place_encoder_sha256", place_description["sha256"])
         if place_description["sha256"] != expected:
             raise CheckpointError(
                 f"{weights}: the optimizer was trained with another place encoder than the one beside it"
             )
-        return cls(optimizer, place.pair_head, window_frames)
+        return cls(optimizer, place.pair_head, window_frames, key_frames)
 
     @property
     def block(self) -> int:
@@ -139,30 +159,30 @@ class OnlineTrajectory:
 
     def reset(self) -> None:
         """Forget everything: the next step begins a new trajectory."""
-        self._count = 0  # steps
-        self._window_start = 0  # first step in the window, at a boundary of blocks
-        self._stamps = _Rows((), np.int64)
-        self._poses = _Rows((3,), np.float64)
-        self._odometry = _Rows((3,), np.float64)
-        self._online = _Rows((3,), np.float64)
-        self._moved = np.zeros(0)
-        self._relative = _Rows((3,), np.float32)
-        self._log_std = _Rows((3,), np.float32)
-        self._motion: _Rows | None = None
-        self._codes: _Rows | None = None
+        self._stamps = GrowingRows((), np.int64)
+        self._odometry = GrowingRows((3,), np.float64)
+        self._odometry_std = GrowingRows((3,), np.float32)
+        self._online = GrowingRows((3,), np.float64)
+        self._graph = MetaGraph(self._optimizer, self._pair_head, self._window // self._block, self._key_frames)
         self._origin_stamp_ns = 0
         self._last_odom = np.zeros(3)
-        self._loops = np.zeros((0, 2), np.int64)
-        self._loop_weights = np.zeros(0)
+        self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
+        self._optimized = False
+
+    @property
+    def _count(self) -> int:
+        """Steps so far."""
+        return max(0, len(self._stamps) - 1)
 
     def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
         """Take the next step.
 
         A step that begins after the last frame means lost steps: the motion between is composed from the odometry
         poses. A step of an odometry with another origin begins a new trajectory, for the motion between is unknown;
-        so does one that lies ``RESTART_AFTER_NS`` or more in the past. Without ``optimize`` the newest frame follows the
-        one before it by odometry alone; the next meta-pose that is optimised takes all of them in.
+        so does one that lies ``RESTART_AFTER_NS`` or more in the past, or ``LARGEST_VALUE`` away. Without ``optimize``
+        the newest frame follows the one before it by odometry alone; the next meta-pose that is optimised takes all of
+        them in.
 
         Raises:
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
@@ -181,30 +201,52 @@ class OnlineTrajectory:
                 raise kind(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
             elif step.from_stamp_ns != last:
                 relative, variance = self._over_gap(step, last)
-                gap = True
+                gap = bool(np.abs(relative).max() <= LARGEST_VALUE)
+                if not gap:  # it would be so at every step to come
+                    self.reset()
+                    restarted, relative, variance = True, step.relative_xyyaw, np.diagonal(step.covariance)
         if self._count == 0:
             self._begin(step)
         self._append(step, relative, np.clip(variance, *_VARIANCES))
-        optimized = optimize and self._count % self._block == 0
-        self._moved = np.zeros(self._count + 1)
-        if optimized:
-            self._moved[:-1] = self._optimize()
-        self._online.append(self._poses.values[-1])
-        return self._result(optimized, restarted, gap)
+        self._optimized = optimize and self._count % self._block == 0
+        if self._optimized:
+            self._graph.optimize()
+            self._pose = self._graph.last.copy()
+            self._covariance = self._graph.end_covariance()
+        self._online.append(self._pose)
+        return self._result(restarted, gap)
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""
         if self._count == 0:
             return None
+        graph = self._graph
+        poses, moved = self._poses(graph.nodes()), np.zeros(self._count + 1)
+        if self._optimized:
+            moved[:-1] = np.linalg.norm((poses - self._poses(graph.nodes(before=True)))[:-1, :2], axis=1)
         return Trajectory(
-            stamps_ns=self._stamps.frozen(),
-            poses_xyyaw=self._poses.frozen(),
-            odometry_xyyaw=self._odometry.frozen(),
-            online_xyyaw=self._online.frozen(),
-            moved_m=_read_only(self._moved),
-            loops=_read_only(self._loops),
-            loop_weights=_read_only(self._loop_weights),
+            stamps_ns=_read_only(self._stamps.values),
+            poses_xyyaw=_read_only(poses),
+            odometry_xyyaw=_read_only(self._odometry.values),
+            online_xyyaw=_read_only(self._online.values),
+            moved_m=_read_only(moved),
+            odometry_std=_read_only(self._odometry_std.values),
+            loops=_read_only(graph.loop_frames),
+            loop_weights=_read_only(graph.loop_weights),
+            loop_relative_xyyaw=_read_only(graph.loop_relative),
+            loop_std=_read_only(graph.loop_std),
         )
+
+    def _poses(self, node_poses: np.ndarray) -> np.ndarray:
+        """Poses of all frames ``(steps + 1, 3)`` with these nodes; within blocks as ``frame_poses`` has them."""
+        nodes, odometry = torch.from_numpy(node_poses), torch.from_numpy(self._graph.odometry.values)
+        starts = odometry[: len(nodes) * self._block : self._block].unsqueeze(1)
+        whole = (len(nodes) - 1) * self._block
+        in_blocks = se2.between(starts[:-1], odometry[1 : whole + 1].unflatten(0, (-1, self._block))).unsqueeze(0)
+        steps = se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
+        corrected = se2.compose(nodes[:-1].unsqueeze(1), in_block_poses(in_blocks, steps)[0]).flatten(0, 1)
+        tail = se2.compose(nodes[-1:], se2.between(starts[-1], odometry[whole + 1 :]))
+        return torch.cat((nodes[:1], corrected, tail)).numpy()
 
     def _check(self, step: RelativeStep) -> None:
         config = self._optimizer.config
@@ -237,7 +279,6 @@ class OnlineTrajectory:
         """
         odom = torch.from_numpy(np.stack((self._last_odom, step.odom_xyyaw)))
         relative = se2.between(odom[0], odom[1]).numpy()
-        _check_size("the motion over lost steps", relative, LARGEST_VALUE)
         longer = (step.stamp_ns - last_ns) / (step.stamp_ns - step.from_stamp_ns)
         return relative, np.diagonal(step.covariance) * max(longer, 1.0)
 
@@ -246,70 +287,34 @@ class OnlineTrajectory:
         odom = torch.from_numpy(step.odom_xyyaw)
         before = se2.compose(odom, se2.inverse(torch.from_numpy(step.relative_xyyaw)))
         self._stamps.append(step.from_stamp_ns)
-        self._poses.append(np.zeros(3))
         self._odometry.append(before.numpy())
         self._online.append(np.zeros(3))
-        self._motion = _Rows(step.motion_feature.shape, np.float32)
-        self._codes = _Rows((0,) if self._pair_head is None else step.place_code.shape, np.float32)
 
     def _append(self, step: RelativeStep, relative: np.ndarray, variance: np.ndarray) -> None:
-        assert self._motion is not None and self._codes is not None
-        pose = se2.compose(torch.from_numpy(self._poses.values[-1]), torch.from_numpy(relative.astype(np.float64)))
+        code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
+        self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
+        self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
+        self._graph.append(relative, 0.5 * np.log(variance), step.motion_feature, code)
         self._stamps.append(step.stamp_ns)
-        self._poses.append(pose.numpy())
         self._odometry.append(step.odom_xyyaw)
-        self._relative.append(relative)
-        self._log_std.append(0.5 * np.log(variance))
-        self._motion.append(step.motion_feature)
-        self._codes.append(step.place_code if self._pair_head is not None else ())
-        self._covariance = propagate(self._covariance, pose.numpy(), relative, np.diag(variance))
+        self._odometry_std.append(np.sqrt(variance))
         self._last_odom = np.array(step.odom_xyyaw)
-        self._count += 1
 
-    def _optimize(self) -> np.ndarray:
-        """Re-optimise the window; returns how far each pose but the newest moved, (count,) m."""
-        assert self._motion is not None and self._codes is not None
-        self._window_start = max(self._window_start, self._count - self._window)
-        inside = slice(self._window_start, self._count)
-        result = optimize_offline(
-            self._optimizer,
-            self._pair_head,
-            *(
-                torch.from_numpy(rows.values[inside])
-                for rows in (self._relative, self._log_std, self._motion, self._codes)
-            ),
-        )
-        before = self._poses.values.copy()
-        start = torch.from_numpy(before[self._window_start])
-        poses = se2.compose(start, result.poses[0].double())
-        self._poses.replace(self._window_start + 1, poses.numpy())
-        rotation = se2.rotate(start[2].expand(2), torch.eye(2, dtype=torch.float64)).mT
-        map_from_window = torch.block_diag(rotation, torch.ones(1, 1, dtype=torch.float64))
-        covariance = map_from_window @ result.end_covariance()[0] @ map_from_window.mT
-        self._covariance = covariance.numpy()
-        if result.loops is not None and result.loop_weights is not None:
-            valid = result.loops.valid[0]
-            ends = (result.loops.end[0][valid] + 1) * self._block
-            frames = torch.stack((result.loops.frame[0][valid] + 1, ends), dim=-1)
-            self._loops = frames.numpy() + self._window_start
-            self._loop_weights = result.loop_weights[0][valid].double().numpy()
-        return np.linalg.norm(self._poses.values[:-1, :2] - before[:-1, :2], axis=1)
-
-    def _result(self, optimized: bool, restarted: bool, gap: bool) -> TrajectoryUpdate:
-        pose = self._poses.values[-1].copy()
-        map_from_odom = se2.compose(torch.from_numpy(pose), se2.inverse(torch.from_numpy(self._last_odom)))
+    def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
+        graph = self._graph
+        map_from_odom = se2.compose(torch.from_numpy(self._pose), se2.inverse(torch.from_numpy(self._last_odom)))
         return TrajectoryUpdate(
             stamp_ns=int(self._stamps.values[-1]),
-            pose_xyyaw=_read_only(pose),
+            pose_xyyaw=_read_only(self._pose.copy()),
             covariance=_read_only(0.5 * (self._covariance + self._covariance.T)),
             map_from_odom_xyyaw=_read_only(map_from_odom.numpy()),
             frames=self._count + 1,
-            optimized=optimized,
+            optimized=self._optimized,
             restarted=restarted,
             gap=gap,
-            largest_move_m=float(self._moved.max()),
-            closed_loops=int((self._loop_weights > 0.5).sum()),
-            window_fill=min(1.0, self._count / self._window),
+            largest_move_m=graph.largest_move_m if self._optimized else 0.0,
+            closed_loops=int((graph.loop_weights > 0.5).sum()),
+            window_fill=graph.window_fill,
         )
 
 
@@ -343,33 +348,6 @@ def optimize_offline(
         return result
     tail = se2.compose(result.poses[:, -1:], se2.r2g(relative[whole:].unsqueeze(0).float()))
     return replace(result, poses=torch.cat((result.poses, tail), dim=1))
-
-
-class _Rows:
-    """A growing array of equal rows; earlier views stay valid and unchanged unless ``replace`` copies."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: type) -> None:
-        self._buffer: np.ndarray = np.zeros((256, *shape), dtype)
-        self._used = 0
-
-    @property
-    def values(self) -> np.ndarray:
-        return self._buffer[: self._used]
-
-    def append(self, row: object) -> None:
-        if self._used == len(self._buffer):
-            self._buffer = np.concatenate((self._buffer, np.zeros_like(self._buffer)))
-        self._buffer[self._used] = row
-        self._used += 1
-
-    def replace(self, start: int, rows: np.ndarray) -> None:
-        """Overwrite the rows from ``start`` in a copy, so that views handed out stay as they are."""
-        self._buffer = self._buffer.copy()
-        self._buffer[start : start + len(rows)] = rows
-
-    def frozen(self) -> np.ndarray:
-        """A read-only view of all rows."""
-        return _read_only(self.values)
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:

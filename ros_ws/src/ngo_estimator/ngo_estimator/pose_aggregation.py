@@ -91,8 +91,8 @@ def block_variances(in_blocks: Tensor, log_std: Tensor) -> Tensor:
     return torch.stack((x, y, heading), dim=-1).sum(-2)
 
 
-def frame_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
-    """Global poses ``(batch, blocks * block, 3)`` of all frames under corrected relative meta-poses.
+def in_block_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
+    """Poses within blocks ``(batch, blocks, block, 3)`` under corrected relative meta-poses.
 
     A block's correction is spread evenly over its steps, so that the trajectory stays continuous.
 
@@ -100,13 +100,18 @@ def frame_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
         in_blocks: uncorrected poses within blocks ``(batch, blocks, block, 3)``.
         meta_relative: corrected relative meta-poses ``(batch, blocks, 3)``.
     """
-    batch, blocks, block, _ = in_blocks.shape
+    block = in_blocks.shape[2]
     correction = meta_relative - in_blocks[..., -1, :]
     correction = torch.cat((correction[..., :2], se2.wrap(correction[..., 2:])), dim=-1)
     share = torch.arange(1, block + 1, dtype=in_blocks.dtype, device=in_blocks.device) / block
-    corrected = in_blocks + share[:, None] * correction.unsqueeze(-2)
+    return in_blocks + share[:, None] * correction.unsqueeze(-2)
+
+
+def frame_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
+    """Global poses ``(batch, blocks * block, 3)`` of all frames; arguments as of ``in_block_poses``."""
+    corrected = in_block_poses(in_blocks, meta_relative)
     ends = se2.r2g(meta_relative)
     starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
     xy = starts[..., None, :2] + se2.rotate(starts[..., None, 2], corrected[..., :2])
     yaw = starts[..., None, 2:] + corrected[..., 2:]
-    return torch.cat((xy, yaw), dim=-1).reshape(batch, blocks * block, 3)
+    return torch.cat((xy, yaw), dim=-1).flatten(1, 2)

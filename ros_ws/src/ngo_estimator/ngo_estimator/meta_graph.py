@@ -1,0 +1,230 @@
+"""The graph of meta-poses behind the online trajectory: key frames, a window, and loops between any of them.
+
+Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 the first frame, the origin of ``map``.
+"""
+
+import numpy as np
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.key_frames import KeyFrame, KeyFrames
+from ngo_estimator.neural_graph_optimizer import MetaSteps, NeuralGraphOptimizer, OptimizedMetaPoses
+from ngo_estimator.online_loops import Candidates, OnlineLoops
+from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.pose_aggregation import block_variances, poses_in_blocks
+from ngo_estimator.rows import GrowingRows, SlidingRows
+
+_CONTEXT = 2
+"""Blocks on either side that a block's feature depends on: the convolutions reach 2 ** (halvings + 1) - 1 frames."""
+
+_MOST_DRIFT = 4.0
+"""How much the variance between a key frame and the newest pose is taken to be more than the graph says."""
+
+_LEAST_INFORMATION = 1e-12
+"""Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
+
+
+class MetaGraph:
+    """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it."""
+
+    def __init__(
+        self, optimizer: NeuralGraphOptimizer, pair_head: PairHead | None, window: int, key_frames: int
+    ) -> None:
+        self._optimizer, self._pair_head = optimizer, pair_head
+        self._block, self._window = optimizer.block, window
+        keep = (2 * _CONTEXT + 2) * self._block
+        self.odometry = GrowingRows((3,), np.float64)
+        self.odometry.append(np.zeros(3))
+        self._relative = SlidingRows((3,), np.float32, keep)
+        self._log_std = SlidingRows((3,), np.float32, keep)
+        config = optimizer.config.aggregation
+        self._motion = SlidingRows((config.motion_feature_size,), np.float32, keep)
+        self._steps = SlidingRows((3,), np.float32, window + 2)
+        self._std = SlidingRows((3,), np.float32, window + 2)
+        self._optimized_std = SlidingRows((3,), np.float64, window + 2)
+        self._features = SlidingRows((config.width,), np.float32, window + 2)
+        self._nodes = GrowingRows((3,), np.float64)
+        self._nodes.append(np.zeros(3))
+        self._first = 0  # node where the window begins
+        self._keys = KeyFrames(key_frames)
+        self._kept = np.zeros((0, 3))  # poses of key frames when some were let go last
+        self._gone = np.zeros(0, np.int64)  # nodes between these
+        self._loops: OnlineLoops | None = None
+        if optimizer.config.loops:
+            assert pair_head is not None
+            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self.odometry)
+        self._result: OptimizedMetaPoses | None = None
+        self._result_keys, self._result_first, self._result_last = np.zeros(0, np.int64), 0, 0
+        self.loop_frames = np.zeros((0, 2), np.int64)
+        """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
+        self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._active, self._before = np.zeros(0, np.int64), np.zeros((0, 3))
+
+    @property
+    def blocks(self) -> int:
+        """Whole blocks so far."""
+        return len(self._nodes) - 1
+
+    @property
+    def window_fill(self) -> float:
+        """Share of the window that is in use."""
+        return min(1.0, (len(self.odometry) - 1) / (self._window * self._block))
+
+    @property
+    def largest_move_m(self) -> float:
+        """How far the last optimisation moved a node at most."""
+        moved = self._nodes.values[self._active, :2] - self._before[:, :2]
+        return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
+
+    @property
+    def last(self) -> np.ndarray:
+        """Pose of the last node ``(3,)``."""
+        pose: np.ndarray = self._nodes.values[-1]
+        return pose
+
+    def append(self, relative: np.ndarray, log_std: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
+        """Take a step ``(3,)`` with what belongs to it; returns whether it completed a block."""
+        last = torch.from_numpy(self.odometry.values[-1])
+        self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        self._relative.append(relative)
+        self._log_std.append(log_std)
+        self._motion.append(motion)
+        if self._loops is not None:
+            self._loops.append(code)
+        if (len(self.odometry) - 1) % self._block:
+            return False
+        self._complete_block()
+        return True
+
+    @torch.inference_mode()
+    def _complete_block(self) -> None:
+        block = self.blocks
+        count = (block + 1) * self._block
+        steps = torch.from_numpy(self._relative.slice(count - self._block)).unsqueeze(0)
+        in_block = poses_in_blocks(steps, self._block)
+        log_std = torch.from_numpy(self._log_std.slice(count - self._block)).unsqueeze(0)
+        std = block_variances(in_block, log_std).sqrt()[0, 0]
+        self._steps.append(in_block[0, 0, -1])
+        self._std.append(std)
+        self._optimized_std.append(std)
+        relative = se2.between(*torch.from_numpy(self.odometry.values[[-1 - self._block, -1]]))
+        self._nodes.append(se2.compose(torch.from_numpy(self._nodes.values[-1]), relative).numpy())
+        if self._optimizer.config.network:
+            self._aggregate(block)
+        if self._loops is not None:
+            found = self._loops.find(block, self._first, self._keys)
+            if len(self._keys):
+                self._loops.limit_drift(found, self._drift(found))
+        while self.blocks - self._first > self._window:
+            self._slide()
+        if self._keys.crowded:
+            self._thin()
+
+    def _aggregate(self, block: int) -> None:
+        """Features of the blocks that the newest one changes, and of itself."""
+        changed = max(0, block - _CONTEXT)
+        start = max(0, changed - _CONTEXT)
+        rows = (self._relative, self._log_std, self._motion)
+        inputs = [torch.from_numpy(r.slice(start * self._block)).unsqueeze(0) for r in rows]
+        features = self._optimizer.aggregation(*inputs)[0, changed - start :]
+        self._features.replace(changed, features.numpy())
+
+    def _slide(self) -> None:
+        """Move the window by a block: its first node becomes a key frame."""
+        node = self._first
+        ends = torch.from_numpy(self._nodes.values[[node, node + 1]])
+        relative, variance = se2.between(ends[0], ends[1]).numpy(), self._optimized_std.slice(node, node + 1)[0] ** 2
+        if self._loops is not None:
+            self._keys.add(self._loops.key_frame(node, relative, variance))
+        else:
+            nothing = np.zeros((self._block, 0), np.float32)
+            self._keys.add(KeyFrame(node, relative, variance, nothing, nothing, nothing))
+        self._first += 1
+        if self._loops is not None:
+            self._loops.leave(self._first)
+
+    def _thin(self) -> None:
+        """Let some key frames go; what lies between those that stay moves with them from now on."""
+        nodes, variance = self._keys.nodes, self._keys.variance
+        self._nodes.values[:] = self.nodes()
+        poses = self._nodes.values[nodes]
+        stay = self._keys.thin(poses)
+        if self._loops is not None:
+            self._loops.reattach(nodes, stay, poses, variance)
+        self._kept = poses[stay]
+        inside = np.arange(self._first)
+        self._gone = inside[~np.isin(inside, self._keys.nodes)]
+
+    def nodes(self, before: bool = False) -> np.ndarray:
+        """Poses of all nodes ``(blocks + 1, 3)``, as they are or as they were before the last optimisation."""
+        nodes: np.ndarray = self._nodes.values.copy()
+        if before:
+            nodes[self._active] = self._before
+        if len(self._gone):
+            keys = self._keys.nodes[: len(self._kept)]
+            old, new = torch.from_numpy(self._kept), torch.from_numpy(nodes[keys])
+            segment = np.searchsorted(keys, self._gone, side="right") - 1
+            bent = se2.between(new[:-1], new[1:]) - se2.between(old[:-1], old[1:])
+            bent = torch.cat((bent[:, :2], se2.wrap(bent[:, 2:])), dim=1)
+            share = torch.from_numpy((self._gone - keys[segment]) / (keys[segment + 1] - keys[segment]))
+            relative = se2.between(old[segment], torch.from_numpy(nodes[self._gone]))
+            nodes[self._gone] = se2.compose(new[segment], relative + share[:, None] * bent[segment]).numpy()
+        return nodes
+
+    def _drift(self, found: Candidates) -> np.ndarray:
+        """How far candidates to key frames may be off at most, as variances ``(n, 3)``; infinite for all others.
+
+        The odometry alone would let a pose of long ago lie anywhere; the loops that were closed since say more.
+        """
+        limits = np.full((len(found), 3), np.inf)
+        if self._result is None or self._result.equations is None:
+            return limits
+        last = int(len(self._result_keys) + self._result_last - self._result_first)
+        since = self._std.slice(self._result_last).astype(np.float64)
+        travelled = self._nodes.values[self._result_last + 1 :, :2] - self._nodes.values[-1, :2]
+        own = (since**2).sum(0) + np.array([1.0, 1.0, 0.0]) * (since[:, 2] ** 2 @ (travelled**2).sum(1))
+        for k in np.flatnonzero(found.start < self._first):
+            start = int(np.searchsorted(self._result_keys, found.start[k]))
+            if start >= len(self._result_keys) or self._result_keys[start] != found.start[k]:
+                continue
+            covariance = np.zeros((6, 6))
+            which = slice(0, 6) if start else slice(3, 6)
+            covariance[which, which] = self._result.equations.covariance([start, last] if start else [last])
+            x, y = self._nodes.values[self._result_last, :2] - self._nodes.values[found.start[k], :2]
+            jacobian = np.hstack((np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]), -np.eye(3)))
+            limits[k] = _MOST_DRIFT * (np.diagonal(jacobian @ covariance @ jacobian.T) + own)
+        return limits
+
+    @torch.inference_mode()
+    def optimize(self) -> None:
+        """Optimise all nodes of the window and the key frames before it."""
+        keys, first = self._keys.nodes, self._first
+        relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
+        std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
+        features = (
+            torch.from_numpy(self._features.slice(first)).unsqueeze(0) if self._optimizer.config.network else None
+        )
+        steps = MetaSteps(
+            torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, self.blocks - first
+        )
+        loops = None
+        if self._loops is not None:
+            loops, numbers = self._loops.loops(keys, first, self.blocks)
+        result = self._optimizer.optimize(steps, loops)
+        if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
+            self.loop_frames, self.loop_relative = self._loops.edges(numbers)
+            self.loop_std = result.loop_information[0].double().clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
+            self.loop_weights = result.loop_weights[0].double().numpy()
+            self._loops.weigh(numbers, self.loop_weights)
+        poses = se2.r2g(result.meta_relative[-1][0].double())
+        poses[:, 2] = se2.wrap(poses[:, 2])
+        self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
+        self._before = self._nodes.values[self._active]
+        self._nodes.values[self._active[1:]] = poses.numpy()
+        self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
+        self._result, self._result_keys, self._result_first, self._result_last = result, keys, first, self.blocks
+
+    def end_covariance(self) -> np.ndarray:
+        """Covariance ``(3, 3)`` of the last node that was optimised, in the map."""
+        assert self._result is not None
+        return self._result.end_covariance()[0].numpy()
