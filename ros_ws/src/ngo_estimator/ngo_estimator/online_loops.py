@@ -285,7 +285,7 @@ class OnlineLoops:
         self._candidates.weight[numbers] = weights
 
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Frames that these candidates join ``(n, 2)``, counted from 0, and the later as seen from the earlier ``(n, 3)``."""
+        """Frames that these candidates join ``(n, 2)``, and the later one as seen from the earlier ``(n, 3)``."""
         start, frame, end = (getattr(self._candidates, name)[numbers] for name in ("start", "frame", "end"))
         odometry = torch.from_numpy(self._odometry.values)
         offset = se2.between(odometry[start * self._block], odometry[frame + 1])
