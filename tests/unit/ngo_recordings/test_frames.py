@@ -180,7 +180,7 @@ def test_depth_becomes_a_channel_and_images_without_it_are_left_out_and_counted(
     assert [frame.stamp_ns for frame in found] == [stamp(k) for k in range(10) if k != 4]
     assert skipped == {NO_DEPTH: 1}
     assert found[3].image.shape == (2, 8, 4) and found[3].image[0, 0, 3] == 3.0
-    assert [frame.action for frame in found] == [None, 1, 1, 1, None, 1, 1, 1, 1]
+    assert [frame.action for frame in found] == [None, *[1] * 8]
 
 
 def test_scans_keep_their_geometry_and_may_change_their_number_of_rays(tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_damaged_images_are_counted_where_that_is_asked_for(tmp_path: Path) -> N
     found = read(path, TOPICS, skipped)
     assert skipped == {UNUSABLE: 2}
     assert [frame.stamp_ns for frame in found] == [stamp(k) for k in range(12) if k not in (3, 5)]
-    assert [frame.action for frame in found[:5]] == [None, 0, 1, None, None]
+    assert [frame.action for frame in found[:5]] == [None, 0, 1, 2, 1], "as if they had never been recorded"
     with pytest.raises(RecordingError, match="an image of /image has 47 bytes"):
         read(path)
     entries[1][2].data = entries[1][2].data[:-1]

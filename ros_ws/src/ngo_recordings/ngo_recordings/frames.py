@@ -103,8 +103,8 @@ class _Frames:
             self._sides.append((self._truth, (truth.topic,)))
         self._ends_ns = [max(recording.topics[name].last_ns for name in names) for _, names in self._sides]
         self._pending: deque[Message] = deque()
-        self._newest_ns: int | None = None  # of the images that were read
-        # Newest of the images that were taken, from which the next step begins; None: there is no step.
+        self._newest_ns: int | None = None  # of the images that came, since the source started
+        # Newest of the images that gave a frame, from which the next step begins; None: there is no step.
         self._before_ns: int | None = None
         self._shape: tuple[int, ...] | None = None
 
@@ -131,8 +131,8 @@ class _Frames:
             )
         if self._newest_ns is not None and stamp_ns <= self._newest_ns - RESTART_NS:
             yield from self._take_all()
-            self._before_ns = None
-        self._newest_ns = stamp_ns
+            self._before_ns = self._newest_ns = None
+        self._newest_ns = stamp_ns if self._newest_ns is None else max(self._newest_ns, stamp_ns)
         self._pending.append(message)
 
     def _complete(self, image: Message, now_ns: int) -> bool:
@@ -153,7 +153,6 @@ class _Frames:
         """The frame of the first image that is pending, if it gives one."""
         message = self._pending.popleft()
         stamp_ns, before_ns = header_stamp_ns(message.value), self._before_ns
-        self._before_ns = stamp_ns if before_ns is None else max(before_ns, stamp_ns)
         try:
             decoded = self._decoded(message, stamp_ns)
         except RecordingError:
@@ -161,9 +160,9 @@ class _Frames:
                 raise
             self._skipped[UNUSABLE] += 1
             decoded = None
-        if decoded is None:
-            self._before_ns = None  # no single step leads over the gap
+        if decoded is None:  # like an image that was never recorded
             return
+        self._before_ns = stamp_ns if before_ns is None else max(before_ns, stamp_ns)
         image, scan = decoded
         yield self._frame(stamp_ns, before_ns, image, scan)
         for side, _ in self._sides:
