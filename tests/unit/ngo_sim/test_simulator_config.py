@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 
 from ngo_sim.maze2d import Maze2DConfig
 from ngo_sim.maze3d import Maze3DConfig
-from ngo_sim.simulator_config import SimulatorConfig, field_descriptions
+from ngo_sim.simulator_config import SimulatorConfig, field_descriptions, field_limits
 
 
 @pytest.mark.parametrize(
@@ -51,6 +52,30 @@ def test_every_field_is_described(config_type: type) -> None:
     descriptions = field_descriptions(config_type)
     assert list(descriptions) == [field.name for field in dataclasses.fields(config_type)]
     assert all(text[0].isupper() and text.endswith(".") for text in descriptions.values())
+
+
+@pytest.mark.parametrize("config_type", [SimulatorConfig, Maze2DConfig, Maze3DConfig])
+def test_every_field_says_what_is_allowed(config_type: type) -> None:
+    assert list(field_limits(config_type)) == [field.name for field in dataclasses.fields(config_type)]
+
+
+@pytest.mark.parametrize("config_type", [Maze2DConfig, Maze3DConfig])
+def test_what_a_world_says_is_allowed_is_what_it_takes(config_type: type) -> None:
+    kinds = {field.name: type(field.default) for field in dataclasses.fields(config_type)}
+    checked = 0
+    for name, text in field_limits(config_type).items():
+        match = re.fullmatch(r"([\d.]+) to ([\d.]+)", text)
+        if match is None:
+            continue  # it depends on other fields
+        low, high = (kinds[name](bound) for bound in match.groups())
+        for bound, beyond in ((low, -1), (high, 1)):
+            scale = {"radius_m": 0.2 * bound, "thrust_m": 0.0} if name == "block_m" and "radius_m" in kinds else {}
+            others = {"extra_openings": 0, **scale, name: bound}
+            config_type(**others)
+            with pytest.raises(ValueError, match=f"^{name} is "):
+                config_type(**{**others, name: bound + beyond * (1 if kinds[name] is int else 1e-6)})
+        checked += 1
+    assert checked >= 9
 
 
 def test_descriptions_come_from_docstring_or_comment() -> None:

@@ -28,19 +28,19 @@ _PIXELS_A_BLOCK = 24
 class Maze2DConfig:
     """The 2D world. Speeds and accelerations are given a step, as in v <- travel_decay (v + thrust_m)."""
 
-    rows: int = 7  # cells of the maze along y
-    cols: int = 7  # cells of the maze along x
-    extra_openings: int = 0  # walls opened on top of the spanning tree, each one a cycle
-    block_m: float = 1.0  # side of a block and width of a corridor, m
-    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it
-    period_s: float = 0.1  # time between two frames, s
-    thrust_m: float = 0.06  # gain of forward speed by one forward action, m a step
-    travel_decay: float = 0.8  # share of the speed that a step leaves
-    turn_deg: float = 6.0  # gain of turn rate by one turn action, degrees a step
-    turn_decay: float = 0.6  # share of the turn rate that a step leaves
-    radius_m: float = 0.2  # of the robot's body, m
-    rays: int = 241  # in one observation, left to right
-    field_of_view_deg: float = 300.0  # from the first ray to the last, straight ahead in the middle
+    rows: int = 7  # cells of the maze along y [2 to 100]
+    cols: int = 7  # cells of the maze along x [2 to 100]
+    extra_openings: int = 0  # walls opened on top of the spanning tree, each one a cycle [0 to (rows - 1) (cols - 1)]
+    block_m: float = 1.0  # side of a block and width of a corridor, m [0.01 to 100]
+    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it [0 to 1]
+    period_s: float = 0.1  # time between two frames, s [0.001 to 10]
+    thrust_m: float = 0.06  # gain of forward speed by one forward action, m a step [0 to block_m]
+    travel_decay: float = 0.8  # share of the speed that a step leaves [0 to 0.99]
+    turn_deg: float = 6.0  # gain of turn rate by one turn action, degrees a step [0 to 90]
+    turn_decay: float = 0.6  # share of the turn rate that a step leaves [0 to 0.99]
+    radius_m: float = 0.2  # of the robot's body, m [0.001 to 0.45 block_m]
+    rays: int = 241  # in one observation, left to right [2 to 10000]
+    field_of_view_deg: float = 300.0  # from the first ray to the last, straight ahead in the middle [1 to 360]
 
     def __post_init__(self) -> None:
         _check_number("block_m", self.block_m, 0.01, 100.0)

@@ -48,19 +48,19 @@ _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TU
 class Maze3DConfig:
     """The 3D world. Turn rates are given a step, as in w <- turn_decay w + turn_deg."""
 
-    rows: int = 5  # cells of the maze along y
-    cols: int = 5  # cells of the maze along x
-    extra_openings: int = 2  # walls opened on top of the spanning tree, each one a cycle
-    block_m: float = 3.0  # side of a block and width of a corridor, m
-    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it
-    width: int = 80  # of an observation, pixels
-    height: int = 60  # of an observation, pixels
-    field_of_view_deg: int = 108  # from the left to the right border of the picture
-    frame_skip: int = 2  # tics of 1/35 s in a step
-    thrust: int = 25  # Doom's forward command in whole units, into which noise is rounded: 25 walks, 50 runs
-    turn_deg: float = 2.2  # gain of turn rate by one turn action, degrees a step
-    turn_decay: float = 0.75  # share of the turn rate that a step leaves
-    light_level: int = 208  # of the whole maze, 0 (black) to 255
+    rows: int = 5  # cells of the maze along y [2 to 100]
+    cols: int = 5  # cells of the maze along x [2 to 100]
+    extra_openings: int = 2  # walls opened on top of the spanning tree, each one a cycle [0 to (rows - 1) (cols - 1)]
+    block_m: float = 3.0  # side of a block and width of a corridor, m [2 to 5]
+    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it [0 to 1]
+    width: int = 80  # of an observation, pixels [80, 160, 200, 256 or 320]
+    height: int = 60  # of an observation, pixels [3/4 of width]
+    field_of_view_deg: int = 108  # from the left to the right border of the picture [30 to 150]
+    frame_skip: int = 2  # tics of 1/35 s in a step [1 to 35]
+    thrust: int = 25  # Doom's forward command in whole units, into which noise is rounded: 25 walks, 50 runs [1 to 50]
+    turn_deg: float = 2.2  # gain of turn rate by one turn action, degrees a step [0 to 90]
+    turn_decay: float = 0.75  # share of the turn rate that a step leaves [0 to 0.99]
+    light_level: int = 208  # of the whole maze, 0 is black [0 to 255]
 
     def __post_init__(self) -> None:
         check_maze_size(self.rows, self.cols, self.extra_openings)

@@ -10,6 +10,8 @@ from typing import Any
 
 from ngo_sim.drivers import DRIVER_NAMES
 
+_LIMITS = re.compile(r" \[(.+)\]$")  # at the end of a comment behind a field
+
 
 def _setting(
     default: Any,
@@ -149,5 +151,18 @@ def field_descriptions(config_type: type) -> dict[str, str]:
                     f"`{item.name}: ...` in the docstring or a comment behind the field"
                 )
             text = " ".join(match.group(2).split())
+        text = _LIMITS.sub("", text)
         described[item.name] = text[0].upper() + text[1:].rstrip(".") + "."
     return described
+
+
+def field_limits(config_type: type) -> dict[str, str]:
+    """What the fields of a config may be, in words: from their metadata, or in brackets behind their comments."""
+    source, limits = inspect.getsource(config_type), {}
+    for item in dataclasses.fields(config_type):
+        match = re.search(rf"^( +){item.name}: .*?  # .+$", source, re.MULTILINE)
+        if item.metadata:
+            limits[item.name] = allowed_values(item.default, item.metadata)
+        elif match and (found := _LIMITS.search(match.group())):
+            limits[item.name] = found.group(1)
+    return limits

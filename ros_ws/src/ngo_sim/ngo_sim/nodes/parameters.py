@@ -10,7 +10,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from ngo_sim.simulator_config import field_descriptions
+from ngo_sim.simulator_config import field_descriptions, field_limits
 
 # Every rclpy node declares these two by itself.
 _OWN_TO_ROS = ("use_sim_time", "start_type_description_service")
@@ -38,7 +38,7 @@ class ConfigParameters:
 
         defaults: values that replace those of the fields. Raises BadParameter.
         """
-        descriptions = field_descriptions(config_type)
+        descriptions, limits = field_descriptions(config_type), field_limits(config_type)
         values = {}
         fields = dataclasses.fields(config_type)  # type: ignore[arg-type]
         for field in fields:
@@ -56,7 +56,7 @@ class ConfigParameters:
             self._node.declare_parameter(
                 field.name,
                 Parameter.Type.STRING_ARRAY if value == [] else value,
-                _descriptor(field, descriptions[field.name]),
+                _descriptor(field, descriptions[field.name], limits.get(field.name, "")),
                 ignore_override=True,
             )
         return config
@@ -93,11 +93,11 @@ def _converted(name: str, value: Any, default: Any) -> Any:
     return value
 
 
-def _descriptor(field: dataclasses.Field[Any], description: str) -> ParameterDescriptor:
+def _descriptor(field: dataclasses.Field[Any], description: str, limits: str) -> ParameterDescriptor:
     low, high = field.metadata.get("low"), field.metadata.get("high")
-    descriptor = ParameterDescriptor(description=description, read_only=not field.metadata.get("changeable", False))
-    if choices := field.metadata.get("choices"):
-        descriptor.additional_constraints = "one of " + ", ".join(choices)
+    changeable = field.metadata.get("changeable", False)
+    descriptor = ParameterDescriptor(description=description, read_only=not changeable)
+    descriptor.additional_constraints = limits + ("; at any time" if changeable else "")
     if low is None or high is None:
         return descriptor
     if isinstance(field.default, float):
