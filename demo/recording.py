@@ -19,6 +19,7 @@ ALL_TOPICS = {
     "ngo/trajectory": "ngo_msgs/msg/Trajectory",
     "ngo/loops": "visualization_msgs/msg/MarkerArray",
     "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
     "/clock": "rosgraph_msgs/msg/Clock",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/rosout": "rcl_interfaces/msg/Log",

@@ -32,7 +32,8 @@ DRIVERS = {"maze2d": "corners", "maze3d": "random_goals"}
 
 def counts(world: str) -> dict[str, int]:
     topics = {"/image", "/ground_truth", "/clock", SENSORS[world]}
-    return {"/action": FRAMES - 1, **dict.fromkeys(topics, FRAMES)}
+    latched = {"/tf_static": 1} if world == "maze3d" else {}
+    return {"/action": FRAMES - 1, **latched, **dict.fromkeys(topics, FRAMES)}
 
 
 def record(world: str, path: Path, **parameters: Any) -> None:
@@ -63,6 +64,7 @@ def test_every_message_is_read_by_the_mcap_and_the_rosbags_library_and_by_ours(
     episode = record_episode(make(), DRIVERS[world], FRAMES, 1007)
     with open_recording([path]) as recording:
         assert {topic: info.count for topic, info in recording.topics.items()} == counts(world)
+        assert {info.first_ns for info in recording.topics.values()} == {10**9}, "log times are those of the frames"
         read = list(frames(recording, choose_topics(recording)))
     images = np.stack([frame.image for frame in read])
     np.testing.assert_array_equal(images.reshape(episode.observations.shape), episode.observations)

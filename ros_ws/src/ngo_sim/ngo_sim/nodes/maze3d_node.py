@@ -37,7 +37,7 @@ class Maze3DNode(SimulatorNode):
         self._image = self.outputs.create(Image, "image")
         self.image_publisher = self._image.publisher
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._static_tf = self.create_publisher(TFMessage, "/tf_static", latched)
+        self._static_tf = self.outputs.create(TFMessage, "/tf_static", latched)
         if self.config.camera_frame != self.config.base_frame:
             mounted = TransformStamped(child_frame_id=self.config.camera_frame)
             mounted.header.frame_id = self.config.base_frame

@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 
 from ngo_recordings.errors import RecordingError
@@ -62,14 +62,18 @@ class Outputs:
             # A node that is interrupted while it starts has nobody to close it.
             weakref.finalize(self, self._recording.writer.close)
 
-    def create(self, message_type: type, topic: str) -> Output:
-        """A topic to publish on."""
-        publisher = self._node.create_publisher(message_type, topic, self._qos)
+    def create(self, message_type: type, topic: str, qos: QoSProfile | None = None) -> Output:
+        """A topic to publish on; qos: another one than that of the sensors."""
+        qos = self._qos if qos is None else qos
+        publisher = self._node.create_publisher(message_type, topic, qos)
         if self._recording is not None:
             package = message_type.__module__.partition(".")[0]
             type_name = f"{package}/msg/{message_type.__name__}"
             try:
-                self._recording.writer.add_topic(publisher.topic_name, type_name, depth=self._qos.depth)
+                latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                self._recording.writer.add_topic(
+                    publisher.topic_name, type_name, depth=qos.depth, transient_local=latched
+                )
             except RecordingError as error:
                 raise BadParameter(f"record is set, but {error}") from None
         return Output(publisher, self._recording)

@@ -53,6 +53,7 @@ class SimulatorNode(Node):
         # Deep enough that a reliable reader may be late with its acknowledgement by far more than what is in flight.
         qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
         self.outputs = Outputs(self, qos, self.config.record)
+        self.outputs.set_time(time.time_ns() if self.config.use_wall_stamps else self.config.stamp_ns(0, 0.0))
         self._truth = self.outputs.create(Odometry, "ground_truth")
         self._action = self.outputs.create(DiscreteAction, "action")
         self._clock_out = self.outputs.create(Clock, "/clock") if self.config.publish_clock else None
