@@ -12,6 +12,7 @@ from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.source_guard import SourceGuard
 
+# The graph learns of a publisher before it learns its node's name: nothing is said before that.
 _UNKNOWN = "a node of a name not known yet"
 
 
@@ -67,7 +68,6 @@ class Input:
         found = [self._others] if self._others else []
         self._others = ""
         misfits = self._misfits() if self._misfit_policy else []
-        # The graph learns of a publisher before it learns its node's name.
         if misfits and _UNKNOWN not in misfits:
             names = " and ".join(misfits)
             found.append(
@@ -85,10 +85,10 @@ class Input:
         if self._guard.admits(publishers, identity, sequence, received_ns):
             self._callback(message)
             return
-        if not self._others:
+        if not self._others or _UNKNOWN in self._others:
             names = " and ".join(sorted(map(_name, self._publishers())))
             self._others = f"{names} publish on '{self._subscription.topic_name}': only the first that was heard counts"
-        self._status.dropped(self._kind, OtherPublisher(self._others))
+        self._status.dropped(self._kind, OtherPublisher(self._others), warn=_UNKNOWN not in self._others)
 
     def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
         self._misfit_policy = qos_policy_name_from_kind(event.last_policy_kind)

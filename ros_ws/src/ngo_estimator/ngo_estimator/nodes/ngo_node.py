@@ -50,7 +50,9 @@ class NgoNode(LifecycleNode):
         self._live.on_change(self._on_settings)
         self._built, self._listening = ExitStack(), ExitStack()  # what cleanup and deactivate undo
         self._failure: Exception | None = None
+        self._starting = False
         self._inputs: list[Input] = []
+        self._configured = False
         if not self._settings.autostart:
             self.get_logger().info("unconfigured: waits to be told, as with ros2 lifecycle set")
 
@@ -61,9 +63,11 @@ class NgoNode(LifecycleNode):
     def start(self) -> "NgoNode":
         """Configure and activate, where ``autostart`` says so; raises what keeps the node from starting."""
         if self._settings.autostart:
+            self._starting = True
             for transition in (self.trigger_configure, self.trigger_activate):
                 if transition() != _SUCCESS and self._failure is not None:
                     raise self._failure
+            self._starting = False
         return self
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -98,7 +102,7 @@ class NgoNode(LifecycleNode):
         except Exception as error:  # rclpy itself would say nothing about it
             undo.close()
             self._failure = error
-            if not self._settings.autostart:
+            if not self._starting:  # whoever starts the node says it
                 self.get_logger().error(" ".join(str(error).split()) or repr(error))
             return _FAILURE
         return _SUCCESS
@@ -111,7 +115,10 @@ class NgoNode(LifecycleNode):
         from ngo_estimator.tf_smoothing import SmoothedCorrection
 
         self._core = load_core(
-            lambda folder, world: OnlineTrajectory.load(folder, settings.window_frames, world), settings
+            lambda folder, world: OnlineTrajectory.load(
+                folder, settings.window_frames, world, key_frames=settings.key_frames
+            ),
+            settings,
         )
         self._origin_of = MapOrigin
         self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
@@ -130,6 +137,8 @@ class NgoNode(LifecycleNode):
             (SetBool, "~/pause", self._on_pause, None),
         ):
             built.callback(self.destroy_service, self.create_service(kind, name, callback, callback_group=group))
+        self._configured = True
+        built.callback(setattr, self, "_configured", False)
 
     def _create_outputs(self, settings: NgoNodeSettings) -> None:
         self._status = NodeStatus(
@@ -179,6 +188,7 @@ class NgoNode(LifecycleNode):
     def _begin_anew(self) -> None:
         """What belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
+        self._covariance = np.zeros((3, 3))
         self._last_correction_m = 0.0
         self._origin = self._origin_of.of_first_pose(np.array(self._settings.initial_pose))
         self._smoothing.reset()
@@ -216,8 +226,8 @@ class NgoNode(LifecycleNode):
             map_from_odom = self._smoothing.update(stamp_ns, newest, odom_xyyaw)
             self._tf.publish(messages.transform_message(stamp_ns, map_frame, odom_frame, map_from_odom))
         pose = origin.poses(update.pose_xyyaw)
-        covariance = origin.covariance_of(pose, update.covariance)
-        self._pose.publish(messages.pose_message(stamp_ns, map_frame, pose, covariance))
+        self._covariance = origin.covariance_of(pose, update.covariance)
+        self._pose.publish(messages.pose_message(stamp_ns, map_frame, pose, self._covariance))
 
     def _trajectory(self) -> "Trajectory | None":
         """The whole trajectory, with its poses in map."""
@@ -267,7 +277,7 @@ class NgoNode(LifecycleNode):
         return response
 
     def _on_settings(self, settings: NgoNodeSettings) -> None:
-        if not self._inputs:
+        if not self._configured:
             return
         self._status.set_period(settings.diagnostics_period_s)
         self._whole.set_rate(settings.path_rate_hz)
@@ -276,7 +286,12 @@ class NgoNode(LifecycleNode):
             entry.set_timeout(settings.source_timeout_s)
 
     def _details(self) -> dict[str, str]:
-        values = {"paused": str(self._paused).lower(), "gaps": str(self._gaps), "restarts": str(self._restarts)}
+        values = {
+            "paused": str(self._paused).lower(),
+            "gaps": str(self._gaps),
+            "restarts": str(self._restarts),
+            "paths published": str(self._whole.paths),
+        }
         if self._latest is None:
             return values
         update = self._latest
@@ -286,7 +301,7 @@ class NgoNode(LifecycleNode):
             "window fill": f"{update.window_fill:.3f}",
             "loops": str(update.closed_loops),
             "last correction, largest move (m)": f"{self._last_correction_m:.3f}",
-            "standard deviation of the position (m)": f"{position_std(update.covariance):.3g}",
+            "standard deviation of the position (m)": f"{position_std(self._covariance):.3g}",
             "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",
         }
 
@@ -295,8 +310,7 @@ class NgoNode(LifecycleNode):
         if self._new_gaps:
             found.append(f"{self._new_gaps} gaps in the relative poses, bridged by the odometry")
             self._new_gaps = 0
-        std_m = 0.0 if self._latest is None else position_std(self._latest.covariance)
-        if std_m >= self._settings.lost_position_std_m:
+        if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:
             found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
         return found
 

@@ -116,7 +116,13 @@ class NgoNodeSettings(EstimatorSettings):
     autostart: bool = setting(True, "Whether the node configures and activates itself, or waits to be told.")
     window_frames: int = setting(
         2000,
-        "How many of the newest frames are optimised together; older ones stay.",
+        "How many of the newest frames are optimised together; older ones move with them.",
+        minimum=2,
+        maximum=100_000,
+    )
+    key_frames: int = setting(
+        128,
+        "How many places from before the window are remembered, so that coming back to them closes a loop.",
         minimum=2,
         maximum=100_000,
     )

@@ -77,16 +77,17 @@ class NodeStatus:
         yield
         self.took(what, time.perf_counter() - started)
 
-    def dropped(self, kind: str, reason: object, count: int = 1) -> None:
+    def dropped(self, kind: str, reason: object, count: int = 1, warn: bool = True) -> None:
         """Count ``count`` inputs as dropped, and warn: at once, then at most every few seconds a kind and reason.
 
-        They are counted by ``kind`` and, where ``reason`` is an error with a name of its own, by that, too.
+        They are counted by ``kind`` and, where ``reason`` is an error with a name of its own, by that, too. Without
+        ``warn`` they are counted only.
         """
         key = kind + _short(reason)
         self._dropped[key] += count
         self._dropped_now += count
         now = time.perf_counter()
-        if now - self._warned_at.get(key, -_QUIET_S) < _QUIET_S:
+        if not warn or now - self._warned_at.get(key, -_QUIET_S) < _QUIET_S:
             self._unsaid[key] += count
             return
         self._warned_at[key] = now

@@ -47,6 +47,8 @@ class TrajectoryPublishers:
         self._trajectory = self._create(Trajectory, settings.trajectory_topic)
         self._loops = self._create(MarkerArray, settings.loops_topic)
         self._outdated: set[LifecyclePublisher] = set()
+        self.paths = 0
+        """How many paths were published."""
         self._timer: Timer | None = None
         self.set_rate(settings.path_rate_hz)
 
@@ -96,6 +98,7 @@ class TrajectoryPublishers:
         stamps_ns = trajectory.stamps_ns
         for publisher in publishers:
             if publisher is self._path:
+                self.paths += 1
                 publisher.publish(self._writer.write(int(stamps_ns[-1]), stamps_ns, trajectory.poses_xyyaw))
             elif publisher is self._trajectory:
                 publisher.publish(trajectory_message(trajectory, self._frame_id))
