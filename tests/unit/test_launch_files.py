@@ -55,7 +55,11 @@ def test_launch_file_starts_nodes_with_parameters_from_yaml(path: Path) -> None:
     found = entities(path)
     arguments = [entity.values[0] for entity in found if type(entity).__name__ == "DeclareLaunchArgument"]
     nodes = [entity.named for entity in found if type(entity).__name__ == "Node"]
-    assert arguments == ["world", "parameters"]
+    only_graph = path.name == "graph.launch.py"
+    assert arguments == ["world", "parameters", *(["namespace"] if only_graph else [])]
+    if only_graph:
+        assert {node["namespace"].values for node in nodes} == {("namespace",)}
+        assert all(("/tf", "tf") in node["remappings"] for node in nodes)
     executables = [node["executable"] for node in nodes]
     fixed = [name for name in executables if isinstance(name, str)]
     assert fixed == ([] if path.name == "maze.launch.py" else ["local_node", "ngo_node"])
@@ -72,7 +76,7 @@ def test_there_are_launch_files_for_one_simulator_and_for_the_graph() -> None:
 @pytest.mark.parametrize("name", ["ngo_sim/config/{}.yaml", "ngo_estimator/config/graph_{}.yaml"])
 def test_shipped_parameters_are_those_of_the_simulator(world: str, name: str) -> None:
     nodes = yaml.safe_load((SRC / name.format(world)).read_text())
-    values = nodes[world]["ros__parameters"]
+    values = {key.removeprefix("/**/"): value for key, value in nodes.items()}[world]["ros__parameters"]
     world_type = {"maze2d": Maze2DConfig, "maze3d": Maze3DConfig}[world]
     split: tuple[dict[str, Any], dict[str, Any]] = ({}, {})
     for key, value in values.items():

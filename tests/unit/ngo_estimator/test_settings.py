@@ -81,7 +81,7 @@ def test_the_limits_themselves_are_allowed() -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_the_file_lists_every_parameter_with_its_default(name: str) -> None:
-    listed = yaml.safe_load((CONFIG / f"{name}.yaml").read_text())[name]["ros__parameters"]
+    listed = yaml.safe_load((CONFIG / f"{name}.yaml").read_text())[f"/**/{name}"]["ros__parameters"]
     defaults = {entry.name: entry.default for entry in fields(KINDS[name])}
     assert listed == {key: list(value) if isinstance(value, tuple) else value for key, value in defaults.items()}
     assert make_settings(KINDS[name], listed) == KINDS[name]()
@@ -90,8 +90,8 @@ def test_the_file_lists_every_parameter_with_its_default(name: str) -> None:
 @pytest.mark.parametrize("path", sorted(CONFIG.glob("*.yaml")), ids=lambda path: path.name)
 def test_every_file_is_accepted(path: Path) -> None:
     for name, content in yaml.safe_load(path.read_text()).items():
-        if name in KINDS:
-            make_settings(KINDS[name], content["ros__parameters"])
+        if (node := name.removeprefix("/**/")) in KINDS:
+            make_settings(KINDS[node], content["ros__parameters"])
 
 
 def test_what_ros_gives_is_taken_as_what_it_means() -> None:
