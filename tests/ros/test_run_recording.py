@@ -19,6 +19,7 @@ from ngo_estimator.local_odometry import RESTART_AFTER_NS
 from ngo_estimator.nodes.messages import to_ns
 from ngo_estimator.trajectory_file import read_tum
 from ngo_estimator.trajectory_report import trajectory_report
+from ngo_recordings.frames import UNUSABLE
 from ngo_recordings.recording import open_recording
 from ngo_recordings.writer import RecordingWriter
 from ngo_sim.episodes import Episode, record_episode
@@ -35,6 +36,8 @@ START_NS = 1_700_000_000_000_000_000
 WARM_UP_NS = START_NS + 10**15  # later than all that is played: going back begins anew
 TOPICS: dict[str, type] = {"/image": Image, "/scan": LaserScan, "/action": DiscreteAction}
 SEED = 1000
+AHEAD = 8
+"""Frames that the nodes may be behind: images that run far ahead of their actions would be given up."""
 
 
 def run_recording(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -77,7 +80,7 @@ def faulty_entries() -> list[make.Entry]:
     entries = episode_entries("maze2d", first, START_NS, 10**18)
     images = [entry for entry in entries if entry[0] == "/image"]
     actions = [entry for entry in entries if entry[0] == "/action"]
-    lost = [images[8], images[20], images[21], images[50], actions[30], actions[40], actions[41]]
+    lost = [images[8], images[20], images[21], images[35], images[50], actions[30], actions[40], actions[41]]
     entries = [entry for entry in entries if not any(entry is one for one in lost)]
     topic, log_ns, late = images[21]
     entries.append((topic, log_ns + 250_000_000, late))
@@ -85,6 +88,8 @@ def faulty_entries() -> list[make.Entry]:
     broken = first.observations[50].copy()
     broken[7, 0] = np.nan
     entries.append((topic, images[50][1], make.image(header_ns(images[50][2]), broken[None], "32FC4")))
+    topic, log_ns, whole = images[35]
+    entries.append((topic, log_ns, replace(whole, data=whole.data[:100])))
     entries.sort(key=lambda entry: entry[1])
     return entries + episode_entries("maze2d", second, START_NS - 10**13, 10**18 + 10**11)
 
@@ -139,19 +144,31 @@ class LiveNodes:
 
     def play(self, entries: list[make.Entry]) -> Live:
         """What they publish about these messages."""
-        newest_ns = 0
+        stamps_ns: list[int] = []  # of the frames that were sent
         for topic, _, message in entries:
-            if topic in self._topics:
-                if header_ns(message) < newest_ns - RESTART_AFTER_NS:
+            if topic not in self._topics:
+                continue
+            stamp_ns = header_ns(message)
+            if topic != "/action":
+                if stamps_ns and stamp_ns < max(stamps_ns) - RESTART_AFTER_NS:
                     # A node that is behind would give up the frames that wait for their actions.
-                    self._wait_for_answers(newest_ns)
-                    newest_ns = 0
-                newest_ns = max(newest_ns, header_ns(message)) if topic != "/action" else newest_ns
-                self._send(topic, message)
+                    self._wait_for_answers(max(stamps_ns))
+                    stamps_ns = []
+                stamps_ns.append(stamp_ns)
+            self._send(topic, message)
+            if len(stamps_ns) > AHEAD:
+                self._wait_for_odometry(stamps_ns[-AHEAD], max(stamps_ns))
+        newest_ns = max(stamps_ns)
         self._wait_for_answers(newest_ns)
         # Without the answers to the first frames that were played to connect.
         kept = ([m for m in messages if to_ns(m.header.stamp) < WARM_UP_NS] for messages in vars(self.out).values())
         return Live(*kept)
+
+    def _wait_for_odometry(self, first_ns: int, last_ns: int) -> None:
+        def there() -> bool:
+            return bool(self.out.odometry) and first_ns <= to_ns(self.out.odometry[-1].header.stamp) <= last_ns
+
+        self._probe.spin_until(there, f"the odometry of the frame at {first_ns} ns or of one after it")
 
     def _wait_for_answers(self, stamp_ns: int) -> None:
         def there() -> bool:
@@ -216,9 +233,9 @@ def test_equals_the_live_nodes(world: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(path.positions_xyz[:, :2], np.column_stack((final.x, final.y)), atol=1e-9)
     if world == "faulty":
         said = json.loads((tmp_path / "out" / "run.json").read_text())
-        assert said["frames"] == 60 - 4 + 3 + 40
+        assert said["frames"] == 60 - 5 + 3 + 40
         expected = {"older than the frame before": 1, "the stamp came twice": 1, "not usable": 1}
-        assert said["not_used"] == {**expected, "no action or velocity led to it": 3}
+        assert said["not_used"] == {**expected, "no action or velocity led to it": 3, UNUSABLE: 1}
         assert [part["folder"] for part in said["trajectories"]] == [".", "part2"]
 
 

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
+from ngo_estimator import se2
+from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep
 from ngo_estimator.trajectory_file import ENDINGS, PoseEdges, SpatialPoses, edges_of, read_tum, write_trajectory
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 
 STAMPS_NS = np.array([0, 1_700_000_000_057_142_857, 1_700_000_000_114_285_714], dtype=np.int64)
 POSES = np.array([[0.0, 0.0, 0.0], [1.25, -0.5, 0.5 * np.pi], [1.5, 2.0, -3.0]])
@@ -66,6 +69,25 @@ def test_gtsam_reads_g2o(tmp_path: Path) -> None:
         information.append(factor.noiseModel().information())
     assert keys == [(0, 1), (1, 2), (0, 2)]
     np.testing.assert_allclose(information, [np.diag(d) for d in ((100, 25, 4), (100, 25, 16), (4, 4, 100))], rtol=1e-9)
+
+
+def test_the_edges_of_a_trajectory_are_its_odometry_and_loops(tmp_path: Path) -> None:
+    core = OnlineTrajectory(small_optimizer(trained=True), small_pair_head(), 64)
+    relative, log_std, motion, codes = (values[0].double() for values in trajectory_inputs(1, 80))
+    odometry = se2.r2g(relative).numpy()
+    for k in range(80):
+        place, feature = codes[k].float().numpy(), motion[k].float().numpy()
+        covariance = np.diag(np.exp(2.0 * log_std[k].numpy()))
+        core.update(RelativeStep(k + 1, k, relative[k].numpy(), covariance, 0, odometry[k], feature, place))
+    trajectory = core.trajectory()
+    assert trajectory is not None and len(trajectory.loops) > 0
+    steps, loops = edges_of(trajectory)
+    np.testing.assert_allclose(steps.relative_xyyaw, relative.numpy(), atol=1e-6)
+    np.testing.assert_allclose(steps.std, np.exp(log_std.numpy()), rtol=1e-5)
+    assert (loops.frames[:, 0] < loops.frames[:, 1]).all() and len(loops.frames) == len(trajectory.loop_weights)
+    write_trajectory(tmp_path / "path.g2o", trajectory.stamps_ns, trajectory.poses_xyyaw, [steps, loops])
+    graph, values = gtsam.readG2o(str(tmp_path / "path.g2o"), False)
+    assert (values.size(), graph.size()) == (81, 80 + len(loops.frames))
 
 
 def test_g2o_without_edges_has_the_poses_alone(tmp_path: Path) -> None:

@@ -51,7 +51,9 @@ class Arguments:
     topics: tyro.conf.OmitArgPrefixes[TopicArguments] = field(default_factory=TopicArguments)
     """What is used of the recording."""
     window_frames: int = 2000
-    """How many of the newest frames are optimised together; older ones stay."""
+    """How many of the newest frames are optimised together."""
+    key_frames: int = 128
+    """How many older poses are kept as key frames: they close loops, and all other old poses move with them."""
     scan_yaw_deg: float = 0.0
     """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead."""
     base_frame: str = "base_link"
@@ -114,7 +116,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         torch.set_num_threads(1)
         folder = arguments.weights_folder
         local = LocalOdometry.load(folder, arguments.world)
-        online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world)
+        online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, arguments.key_frames)
         topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
         _check_side_information(topics, local)
         console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
@@ -132,6 +134,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         "recordings": [str(path) for path in arguments.recordings],
         "weights": local.world,
         "window_frames": arguments.window_frames,
+        "key_frames": arguments.key_frames,
         "topics": {field.name: _plain(getattr(topics, field.name)) for field in fields(topics)},
         "frames": core.frames,
         "not_used": dict(core.rejected),
