@@ -162,7 +162,9 @@ def _run(
     found: list[dict[str, Any]] = []
     output: RecordedOutput | None = None
     remove_results(arguments.out)
-    with ExitStack() as stack, Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    screen = Console(stderr=True)
+    bar = Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal)
+    with ExitStack() as stack, bar as progress:
         task = progress.add_task(topics.image, total=recording.topics[topics.image].count)
         for event in core.run(frames_of(recording, topics, core.rejected)):
             if output is None:
