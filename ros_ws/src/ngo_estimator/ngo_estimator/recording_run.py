@@ -73,6 +73,10 @@ class RecordingRun:
         """Every step, and after the last one of a trajectory the whole of it.
 
         A recording whose stamps jump back by a second or more holds several trajectories.
+
+        Raises:
+            ValueError: frames that cannot be used lie between two whose odometry is too far apart to go on; live, the
+                trajectory would begin anew.
         """
         self._local.reset()
         self._online.reset()
@@ -117,6 +121,11 @@ class RecordingRun:
             except ValueError as error:
                 self._reject("not usable", f"{seconds(pair.stamp_ns)} s: {error}")
                 continue
+            if update.restarted:
+                raise ValueError(
+                    f"the odometry goes too far from one frame to the next at {seconds(local.stamp_ns)} s: split the "
+                    "recording there, or use weights that know this robot"
+                )
             self.gaps += update.gap or local.missed_frames > 0
             yield RecordedStep(local, update)
 
