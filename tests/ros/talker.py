@@ -8,16 +8,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
+from std_srvs.srv import SetBool
 
 RATE_HZ = 20.0
 
 
-class Talker(Node):
+class Talker(LifecycleNode):
     """Publishes a header 20 times a second, and an image, a path and a status once, latched."""
 
     def __init__(self) -> None:
@@ -41,6 +42,7 @@ class Talker(Node):
         self._path.publish(Path(header=Header(frame_id="map")))
         self._status.publish(DiagnosticStatus(level=DiagnosticStatus.WARN, name="größe", message="x" * 200))
         self._count = 0
+        self.create_service(SetBool, "mute", self._mute)
         self.create_timer(1.0 / RATE_HZ, self._tick)
 
     def _tick(self) -> None:
@@ -48,6 +50,10 @@ class Talker(Node):
         header.stamp.sec, header.stamp.nanosec = 12, self._count
         self._count += 1
         self._headers.publish(header)
+
+    def _mute(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success, response.message = request.data, "as you wish"
+        return response
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         if any(parameter.name == "gain" and parameter.value > 1.0 for parameter in parameters):

@@ -242,9 +242,11 @@ class TestAgainstARealNode:
 
     def test_topic_list(self) -> None:
         names = ["/parameter_events", "/rosout", "/test/header", "/test/image", "/test/path", "/test/status"]
+        names.append("/test/talker/transition_event")
         assert listed("topic", "list", expected=names) == names
         types = ["rcl_interfaces/msg/ParameterEvent", "rcl_interfaces/msg/Log", "std_msgs/msg/Header"]
         types += ["sensor_msgs/msg/Image", "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticStatus"]
+        types.append("lifecycle_msgs/msg/TransitionEvent")
         typed = [f"{name} [{kind}]" for name, kind in zip(names, types, strict=True)]
         assert listed("topic", "list", "-t", expected=typed) == typed
 
@@ -329,6 +331,42 @@ class TestAgainstARealNode:
     def test_param_set_refused_by_the_node(self) -> None:
         result = ros2("param", "set", "/test/talker", "gain", "2.0")
         assert (result.stdout, result.stderr) == ("", "Setting parameter failed: gain is at most 1\n")
+
+    def test_service_list(self) -> None:
+        lines = ros2("service", "list").stdout.splitlines()
+        assert {"/test/mute", "/test/talker/change_state", "/test/talker/get_parameters"} <= set(lines)
+        assert lines == sorted(lines)
+
+    def test_service_call(self) -> None:
+        result = ros2("service", "call", "/test/mute", "std_srvs/srv/SetBool", "{data: true}")
+        assert result.returncode == 0, result.stderr
+        assert result.stdout.removeprefix("waiting for service to become available...\n") == (
+            "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n\n"
+            "response:\nstd_srvs.srv.SetBool_Response(success=True, message='as you wish')\n\n"
+        )
+
+    @pytest.mark.parametrize(
+        ("kind", "values", "line"),
+        [
+            ("std_srvs/srv/SetBool", "{state: true}", "has no attribute 'state'"),
+            ("lifecycle_msgs/srv/ChangeState", "{transition: {id: one}}", "Failed to populate field: invalid literal"),
+            ("lifecycle_msgs/srv/ChangeState", "{transition: 1}", "expected a mapping of names to values, got 1"),
+            ("std_srvs/srv/SetBool", "[1", "The values are no YAML"),
+            ("std_srvs/srv/Nothing", "{}", "The passed service type is invalid"),
+        ],
+    )
+    def test_a_request_that_is_none_is_one_line(self, kind: str, values: str, line: str) -> None:
+        result = ros2("service", "call", "/test/mute", kind, values)
+        assert (result.returncode, len(result.stderr.splitlines())) == (1, 1)
+        assert line in result.stderr
+
+    def test_lifecycle(self) -> None:
+        assert ros2("lifecycle", "get", "/test/talker").stdout == "unconfigured [1]\n"
+        refused = ros2("lifecycle", "set", "/test/talker", "activate")
+        assert refused.returncode == 1
+        assert refused.stderr.startswith("Unknown transition requested, available ones are:\n- configure [1]\n")
+        assert ros2("lifecycle", "set", "/test/talker", "configure").stdout == "Transitioning successful\n"
+        assert ros2("lifecycle", "get", "test/talker").stdout == "inactive [2]\n"
 
     def test_a_node_topic_or_parameter_that_is_not_there(self) -> None:
         result = ros2("param", "get", "/test/nobody", "speed")

@@ -9,14 +9,20 @@ from pathlib import Path
 
 from ros2_stand_in.errors import CommandError
 
-SERVED = "run, topic list|echo|hz, node list, param list|get|set"
+SERVED = "run, topic list|echo|hz, node list, param list|get|set, service list|call, lifecycle get|set"
 DESCRIPTION = f"""\
 This is not the real `ros2` command but a stand-in for it: the ROS 2 wheels come without one.
 It serves exactly: {SERVED}. What these print is what the real command prints.
 Where a real `ros2` is on PATH, that one is run instead."""
 NOT_SERVED = f"the stand-in for ros2 serves only: {SERVED}; install ROS 2 for the others"
 
-VERBS = {"topic": ("list", "echo", "hz"), "node": ("list",), "param": ("list", "get", "set")}
+VERBS = {
+    "topic": ("list", "echo", "hz"),
+    "node": ("list",),
+    "param": ("list", "get", "set"),
+    "service": ("list", "call"),
+    "lifecycle": ("get", "set"),
+}
 DEFAULT_TRUNCATE_LENGTH = 128
 DEFAULT_WINDOW = 10000
 
@@ -91,6 +97,22 @@ def make_parser() -> argparse.ArgumentParser:
     verb.add_argument("node_name", help="name of the node")
     verb.add_argument("parameter_name", help="name of the parameter")
     verb.add_argument("value", help="its new value, in YAML")
+
+    service = commands.add_parser("service", help="list or call services")
+    verbs = service.add_subparsers(dest="verb", metavar="VERB", required=True)
+    verbs.add_parser("list", help="output a list of available services")
+    verb = verbs.add_parser("call", help="call a service")
+    verb.add_argument("service_name", help="name of the service, e.g. /ngo_node/pause")
+    verb.add_argument("service_type", help="type of the service, e.g. std_srvs/srv/SetBool")
+    verb.add_argument("values", nargs="?", default="{}", help="values of the request, in YAML")
+
+    lifecycle = commands.add_parser("lifecycle", help="get or change the state of managed nodes")
+    verbs = lifecycle.add_subparsers(dest="verb", metavar="VERB", required=True)
+    verb = verbs.add_parser("get", help="get the state of a node")
+    verb.add_argument("node_name", help="name of the node")
+    verb = verbs.add_parser("set", help="trigger a transition")
+    verb.add_argument("node_name", help="name of the node")
+    verb.add_argument("transition", help="label or number of the transition, e.g. configure")
     return parser
 
 
@@ -115,8 +137,16 @@ def dispatch(arguments: Sequence[str]) -> int:
         import rclpy  # noqa: F401
     except ImportError as error:
         raise CommandError(f"rclpy cannot be imported ({error}); open the environment first: . ./env.sh") from None
-    from ros2_stand_in import graph, parameters, topics
+    from ros2_stand_in import graph, parameters, services, topics
 
+    if options.command == "service":
+        if options.verb == "list":
+            return services.print_services()
+        return services.call_service(options.service_name, options.service_type, options.values)
+    if options.command == "lifecycle":
+        if options.verb == "get":
+            return services.print_state(options.node_name)
+        return services.change_state(options.node_name, options.transition)
     if options.command == "node":
         return graph.print_nodes(include_hidden=options.all)
     if options.command == "param":

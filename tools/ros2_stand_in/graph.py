@@ -140,13 +140,13 @@ def print_nodes(include_hidden: bool) -> int:
     return 0
 
 
-def call(node: Node, service_type: Any, service: str, request: Any) -> Any:
+def call(node: Node, service_type: Any, service: str, request: Any, timeout_s: float = DISCOVERY_TIMEOUT_S) -> Any:
     """A service's response; CommandError where the service does not come up or does not answer."""
     client = node.create_client(service_type, service)
     if poll(lambda: client.service_is_ready() or None) is None:
         raise CommandError("Wait for service timed out")
     future = client.call_async(request)
-    deadline = time.monotonic() + DISCOVERY_TIMEOUT_S
+    deadline = time.monotonic() + timeout_s
     spin_while(node, lambda: not future.done() and time.monotonic() < deadline)
     if not future.done():
         raise CommandError(f"Service '{service}' did not answer")
