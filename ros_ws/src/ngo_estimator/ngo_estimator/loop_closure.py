@@ -6,9 +6,10 @@ frame.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ngo_estimator import se2
 from ngo_estimator.gauss_newton import pick
@@ -75,13 +76,19 @@ class Loops:
     length: Tensor | None = None
     most_drift: Tensor | None = None
 
-    @property
+    @cached_property
+    def description(self) -> Tensor:
+        """What gates see of each loop beside its residual ``(batch, loops, 6)``: the same under all poses."""
+        beliefs = torch.stack((self.similarity, self.logit / 5.0), dim=-1)
+        return torch.cat((beliefs, self.log_scale, self.spread - self.log_scale), dim=-1)
+
+    @cached_property
     def log_length(self) -> Tensor:
         """Logarithm of how many meta-poses lie on each loop ``(batch, loops)``."""
         length = self.end - self.start + 1 if self.length is None else self.length
         return torch.log(length.to(self.measured.dtype))
 
-    @property
+    @cached_property
     def nodes(self) -> Tensor:
         """The two poses of each loop ``(batch, loops, 2)``, as indices of the meta-poses with the origin in front."""
         return torch.stack((self.start, self.end + 1), dim=-1)
@@ -242,17 +249,19 @@ def odometry_variances(start: Tensor, end: Tensor, poses: Tensor, step_variance:
     """
     # Sums over a loop are differences of prefix sums, of which float32 would leave too few digits.
     poses, step_variance = poses.double(), step_variance.double()
-    along, aside, turn = step_variance.unbind(-1)
-    cos, sin = torch.cos(poses[:, :-1, 2]).square(), torch.sin(poses[:, :-1, 2]).square()
-    x, y = poses[:, 1:, 0], poses[:, 1:, 1]
-    terms = (cos * along + sin * aside, sin * along + cos * aside, turn, turn * x, turn * y, turn * x * x, turn * y * y)
-    prefix = torch.stack(terms, dim=-1).cumsum(1)
-    prefix = torch.cat((torch.zeros_like(prefix[:, :1]), prefix), dim=1)
-    xx, yy, one, t_x, t_y, t_xx, t_yy = (pick(prefix, end) - pick(prefix, start)).unbind(-1)
-    end_x, end_y, _ = pick(poses, end).unbind(-1)
-    across_x = xx + end_y * (end_y * one - 2.0 * t_y) + t_yy
-    across_y = yy + end_x * (end_x * one - 2.0 * t_x) + t_xx
-    return torch.stack((across_x, across_y, one), dim=-1).clamp(min=0.0)
+    along_x = torch.cos(poses[:, :-1, 2]).square()
+    position_x = along_x * step_variance[..., 0] + (1.0 - along_x) * step_variance[..., 1]
+    position_y = step_variance[..., :2].sum(-1) - position_x
+    position = torch.stack((position_x, position_y), dim=-1)
+    turn, at = step_variance[..., 2:], poses[:, 1:, :2]
+    lever = turn * at
+    terms = torch.cat((position, turn, lever, lever * at), dim=-1)
+    prefix = nn.functional.pad(terms.cumsum(1), (0, 0, 1, 0))
+    both = pick(prefix, torch.cat((end, start), dim=1))
+    position, turn, lever, squares = (both[:, : end.shape[1]] - both[:, end.shape[1] :]).split((2, 1, 2, 2), dim=-1)
+    at_end = pick(poses, end)[..., :2]
+    across = at_end * (at_end * turn - 2.0 * lever) + squares
+    return torch.cat((position + across.flip(-1), turn), dim=-1).clamp(min=0.0)
 
 
 def spread_over_span(loops: Loops, values: Tensor, weights: Tensor, blocks: int) -> tuple[Tensor, Tensor]:
@@ -265,10 +274,11 @@ def spread_over_span(loops: Loops, values: Tensor, weights: Tensor, blocks: int)
         Weighted mean of value / length ``(batch, blocks, channels)`` and sum of weights ``(batch, blocks, 1)``.
     """
     length = (loops.end - loops.start + 1).unsqueeze(-1)
-    payload = torch.cat((values / length * weights.unsqueeze(-1), weights.unsqueeze(-1)), dim=-1)
+    weights = weights.unsqueeze(-1)
+    payload = torch.cat((values / length * weights, weights), dim=-1)
     edges = payload.new_zeros(payload.shape[0], blocks + 1, payload.shape[2])
-    edges = edges.scatter_add(1, loops.start.unsqueeze(-1).expand_as(payload), payload)
-    edges = edges.scatter_add(1, (loops.end + 1).unsqueeze(-1).expand_as(payload), -payload)
+    index = torch.cat((loops.start, loops.end + 1), dim=1).unsqueeze(-1).expand(-1, -1, payload.shape[2])
+    edges = edges.scatter_add(1, index, torch.cat((payload, -payload), dim=1))
     spread = edges.cumsum(dim=1)[:, :-1]
     total = spread[..., -1:].clamp(min=0.0)
     return spread[..., :-1] / (total + 1e-3), total

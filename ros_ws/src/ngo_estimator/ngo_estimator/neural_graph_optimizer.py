@@ -152,6 +152,11 @@ class RobustLoopGate(nn.Module):
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(11, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
         self.head = nn.Linear(hidden, 3)
+        noise = torch.tensor([self.POSITION_NOISE, self.HEADING_NOISE]).square()
+        self.register_buffer("noise", noise, persistent=False)
+        self.register_buffer("components", torch.tensor([2.0, 1.0]), persistent=False)
+        self.noise: Tensor
+        self.components: Tensor
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
@@ -165,36 +170,26 @@ class RobustLoopGate(nn.Module):
             expected_variance: what the odometry alone lets the residuals vary ``(batch, loops, 3)``.
             iteration: how many iterations came before.
         """
-        measured_variance = torch.exp(2.0 * loops.log_scale)
-        position_variance = self.POSITION_NOISE**2 * measured_variance[..., 0]
-        heading_variance = self.HEADING_NOISE**2 * measured_variance[..., 1]
-        position_error = residuals[..., :2].square().sum(-1)
-        heading_error = residuals[..., 2].square()
+        # Of position and heading; a position's error has two components.
+        variance = torch.exp(2.0 * loops.log_scale) * self.noise
+        both = variance * self.components
+        squares = residuals.square()
+        errors = torch.stack((squares[..., 0] + squares[..., 1], squares[..., 2]), dim=-1)
         drift = expected_variance * self.ANNEALING**iteration
-        squared = position_error / (2.0 * position_variance + drift[..., :2].sum(-1))
-        squared = squared + heading_error / (heading_variance + drift[..., 2])
-        inputs = torch.stack(
-            (
-                loops.similarity,
-                loops.logit / 5.0,
-                loops.log_scale[..., 0],
-                loops.log_scale[..., 1],
-                *(loops.spread - loops.log_scale).unbind(-1),
-                loops.log_length / 3.0,
-                torch.log1p(position_error / (2.0 * position_variance)) / 3.0,
-                torch.log1p(heading_error / heading_variance) / 3.0,
-                torch.log1p(squared),
-                torch.full_like(squared, self.ANNEALING**iteration),
-            ),
-            dim=-1,
+        drift = torch.stack((drift[..., 0] + drift[..., 1], drift[..., 2]), dim=-1)
+        squared = (errors / (both + drift)).sum(-1, keepdim=True)
+        inputs = (
+            loops.description,
+            loops.log_length.unsqueeze(-1) / 3.0,
+            torch.log1p(errors / both) / 3.0,
+            torch.log1p(squared),
+            torch.full_like(squared, self.ANNEALING**iteration),
         )
-        out = self.head(self.layers(inputs))
-        kernel = (1.0 + squared / self.WIDTH).reciprocal().square()
-        gate = kernel * torch.sigmoid(loops.logit + 2.0 + 4.0 * out[..., 0]) * loops.valid
-        scale = torch.exp(4.0 * torch.tanh(out[..., 1:] / 2.0))
-        position = gate * scale[..., 0] / position_variance
-        heading = gate * scale[..., 1] / heading_variance
-        return gate, torch.stack((position, position, heading), dim=-1)
+        belief, scale = self.head(self.layers(torch.cat(inputs, dim=-1))).split((1, 2), dim=-1)
+        kernel = (1.0 + squared / self.WIDTH).square()
+        gate = torch.sigmoid((loops.logit + 2.0).unsqueeze(-1) + 4.0 * belief) * loops.valid.unsqueeze(-1) / kernel
+        information = gate * torch.exp(4.0 * torch.tanh(scale / 2.0)) / variance
+        return gate.squeeze(-1), information[..., [0, 0, 1]]
 
 
 class LearnedLoopGate(nn.Module):
@@ -298,11 +293,14 @@ class NeuralGraphOptimizer(nn.Module):
             logits = logits + 10.0 * self.place_gain * place_similarity
         return torch.softmax(logits, dim=-1)
 
-    def convolve(self, inputs: Tensor) -> Tensor:
+    def convolve(self, inputs: Tensor, products: "_Products") -> Tensor:
         """The optimisation phase's convolutions: ``(batch, poses, channels)`` to ``(batch, poses, width)``."""
         hidden = normed = inputs
-        for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            out = torch.relu(_convolution(layer, normed))
+        for weight, bias, neighbours, norm in zip(*products.convolutions, self.norms, strict=True):
+            # As one product it is several times as fast as torch's dilated convolutions.
+            padded = nn.functional.pad(normed, (0, 0, 0, 1)).index_select(1, neighbours)
+            beside = padded.reshape(normed.shape[0], normed.shape[1], -1)
+            out = torch.relu(nn.functional.linear(beside, weight, bias))
             hidden = out + hidden if self.config.residual and out.shape == hidden.shape else out
             # Without it nine layers, run five times, let the features grow until gates and stiffness saturate.
             normed = norm(hidden)
@@ -357,6 +355,7 @@ class NeuralGraphOptimizer(nn.Module):
         odometry, base_std, features = steps.relative, steps.std, steps.features
         before = odometry.shape[1] - steps.blocks
         similarity = None if loops is None or features is None else loops.embeddings @ loops.embeddings.mT
+        products = None if features is None else _Products(self, features.shape[1])
         adjusted, deviation, step_std = odometry, torch.zeros_like(odometry), base_std
         lattice = None if fixes is None else fixes.lattice.double()
         structure = self._structure(loops, odometry) if fixes is None else None
@@ -381,14 +380,14 @@ class NeuralGraphOptimizer(nn.Module):
                 inputs.append(torch.asinh(bent / self.correction_std.repeat(2)))
                 inputs.append(torch.log1p(support))
             log_scale: Tensor | None = None
-            if features is not None:
+            if features is not None and products is not None:
                 attended = self.attend(features, similarity) @ features
-                hidden = self.convolve(torch.cat([features, attended, *inputs], dim=-1))
-                beta = torch.sigmoid(_convolution(self.gate, hidden))
-                adjustment = beta * _convolution(self.adjustment, hidden) * self.correction_std
+                hidden = self.convolve(torch.cat([features, attended, *inputs], dim=-1), products)
+                feature, gate, change, *stiffness = products.heads(hidden)
+                adjustment = torch.sigmoid(gate) * change * self.correction_std
                 adjusted = torch.cat((adjusted[:, :before], adjusted[:, before:] + adjustment), dim=1)
-                features = torch.relu(_convolution(self.feature, hidden))
-                log_scale = _convolution(self.stiffness, hidden) if loops is not None else None
+                features = torch.relu(feature)
+                log_scale = stiffness[0] if stiffness else None
             elif loops is not None:
                 log_scale = self.log_scale
             if loops is not None and information is not None and log_scale is not None:
@@ -411,7 +410,8 @@ class NeuralGraphOptimizer(nn.Module):
                 else:
                     step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
                 step = step if self.config.robust else self.loop_gain * step
-                change = se2.g2r((poses + step[:, :nodes])[:, 1:]) - se2.g2r(poses[:, 1:])
+                after, before_it = se2.g2r(torch.cat((poses + step[:, :nodes], poses))[:, 1:]).chunk(2)
+                change = after - before_it
                 change = torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
                 deviation = deviation + change.to(deviation.dtype)
                 lattice = None if lattice is None else lattice + step[:, nodes]
@@ -434,15 +434,33 @@ def _zero(layer: nn.Conv1d) -> nn.Conv1d:
     return layer
 
 
-def _convolution(layer: nn.Module, values: Tensor) -> Tensor:
-    """A convolution of ``(batch, poses, channels)`` as one product: several times as fast as dilated ones of torch."""
-    assert isinstance(layer, nn.Conv1d)
-    size, dilation = layer.kernel_size[0], layer.dilation[0]
-    if size > 1:
-        poses, reach = values.shape[1], dilation * (size // 2)
-        padded = nn.functional.pad(values, (0, 0, reach, reach))
-        values = torch.cat([padded[:, dilation * k : dilation * k + poses] for k in range(size)], dim=-1)
-    return nn.functional.linear(values, layer.weight.transpose(1, 2).flatten(1), layer.bias)
+class _Products:
+    """The convolutions of an optimizer as matrices, laid out once for all iterations over so many poses.
+
+    ``convolutions`` are, for each, its weights, its bias and the poses that each pose is a neighbour of, where the one
+    behind the last is a zero. Features, gates, adjustments and stiffness are one product.
+    """
+
+    def __init__(self, optimizer: NeuralGraphOptimizer, poses: int) -> None:
+        layers = [layer for layer in optimizer.convolutions if isinstance(layer, nn.Conv1d)]
+        weights = [layer.weight.transpose(1, 2).flatten(1) for layer in layers]
+        index = torch.arange(poses, device=weights[0].device)
+        offsets = torch.arange(-1, 2, device=index.device)
+        neighbours = {}
+        for dilation in {layer.dilation[0] for layer in layers}:
+            beside = index[:, None] + dilation * offsets
+            neighbours[dilation] = beside.masked_fill((beside < 0) | (beside >= poses), poses).flatten()
+        self.convolutions = (weights, [layer.bias for layer in layers], [neighbours[x.dilation[0]] for x in layers])
+        heads = [optimizer.feature, optimizer.gate, optimizer.adjustment]
+        if optimizer.config.loops:
+            heads.append(optimizer.stiffness)
+        self._sizes = [head.out_channels for head in heads]
+        self._weight = torch.cat([head.weight for head in heads]).squeeze(-1)
+        self._bias = torch.cat([head.bias for head in heads if head.bias is not None])
+
+    def heads(self, hidden: Tensor) -> list[Tensor]:
+        """Features, gates, adjustments and, with loops, stiffness, of ``(batch, poses, width)``."""
+        return list(nn.functional.linear(hidden, self._weight, self._bias).split(self._sizes, dim=-1))
 
 
 def _with_origin(poses: Tensor) -> Tensor:
