@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,15 +13,19 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction, Trajectory
+from rich.console import Console
 from sensor_msgs.msg import Image, LaserScan
 
 from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.local_odometry import RESTART_AFTER_NS
 from ngo_estimator.nodes.messages import to_ns
+from ngo_estimator.nodes.run_recording import Arguments
+from ngo_estimator.nodes.run_recording import run as run_in_process
 from ngo_estimator.trajectory_file import read_tum
 from ngo_estimator.trajectory_report import trajectory_report
 from ngo_recordings.frames import UNUSABLE
 from ngo_recordings.recording import open_recording
+from ngo_recordings.topics import TopicArguments
 from ngo_recordings.writer import RecordingWriter
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D
@@ -301,30 +306,51 @@ def test_two_runs_leave_the_same_bytes(recording: Path, weights: Path, tmp_path:
 
 
 def test_what_cannot_be_run_is_said_in_one_line(recording: Path, weights: Path, tmp_path: Path) -> None:
-    full = tmp_path / "full"
+    full, pictures = tmp_path / "full", tmp_path / "pictures.mcap"
     full.mkdir()
     (full / "mine.txt").write_text("kept")
-    pictures = tmp_path / "pictures.mcap"
+    entries = episode_entries("maze2d", drive("maze2d", 3), START_NS, START_NS)
     grey = np.zeros((48, 64, 1), np.uint8)
     make.write_mcap(
-        pictures, [("/camera", START_NS + k, make.image(START_NS + k * 10**8, grey, "mono8")) for k in range(3)]
+        pictures,
+        [
+            (topic, log_ns, make.image(header_ns(message), grey, "mono8") if topic == "/image" else message)
+            for topic, log_ns, message in entries
+        ],
     )
-    for arguments, message in (
-        ((tmp_path / "nowhere.mcap", "--weights", weights), "nowhere.mcap"),
-        ((recording, "--weights", tmp_path), "local_pose_network"),
-        ((recording, "--world", "mars"), "there is no folder of weights"),
-        ((recording, "--weights", weights, "--image", "/camera"), "there is no topic /camera"),
-        ((recording, "--weights", weights, "--action", "none"), "need the action of each step"),
-        ((pictures, "--weights", weights, "--action", "none"), "need the action"),
-        ((recording,), "either --world (maze2d, maze3d or scan) or --weights FOLDER"),
-        ((recording, "--weights", weights, "--out", full), f"{full} is not empty"),
+    for files, changes, message in (
+        ((tmp_path / "nowhere.mcap",), {}, "there is no file .*nowhere.mcap"),
+        ((recording,), {"weights": tmp_path}, "local_pose_network"),
+        ((recording,), {"weights": None, "world": "mars"}, "no folder of weights .*mars; worlds: .*maze2d, maze3d"),
+        ((recording,), {"topics": TopicArguments(image="/camera")}, "there is no topic /camera"),
+        ((recording,), {"topics": TopicArguments(action="none")}, "need the action of each step"),
+        ((pictures,), {}, "no two frames of /image could be used: 3 not usable, first .* 64 x 48"),
+        ((recording,), {"world": "maze2d"}, "either --world .* or --weights FOLDER"),
+        ((recording,), {"window_frames": 3}, "window_frames is 3"),
+        ((), {}, "no recording was given"),
     ):
-        given = arguments if "--out" in arguments else (*arguments, "--out", tmp_path / "out")
-        done = run_recording(*given)
-        assert done.returncode == 2, done.stdout + done.stderr
-        assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("run_recording: "), done.stderr
-        assert message in done.stderr
+        arguments = replace(Arguments(files, tmp_path / "out", weights=weights), **changes)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=message) as caught:
+            run_in_process(arguments, Console(quiet=True))
+        assert "\n" not in str(caught.value)
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    done = run_recording(recording, "--weights", weights, "--out", full)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+    assert done.stderr.startswith(f"run_recording: {full} is not empty; give a new folder")
     assert [path.name for path in full.iterdir()] == ["mine.txt"]
+
+
+def test_old_results_are_replaced_as_a_whole(recording: Path, weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "part2").mkdir(parents=True)
+    for path in (out / "metrics.json", out / "part2" / "corrected.tum", out / "mine.txt"):
+        path.write_text("old")
+    arguments = Arguments(
+        (recording,), out, weights=weights, topics=TopicArguments(ground_truth="none"), overwrite=True
+    )
+    run_in_process(arguments, Console(quiet=True))
+    assert {path.name for path in out.iterdir()} == (RESULTS - {"metrics.json", "truth.tum"}) | {"part2", "mine.txt"}
+    assert not list((out / "part2").iterdir())
 
 
 def write_wide(path: Path, frames: int) -> None:
