@@ -16,7 +16,7 @@ import torch
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path as PathMessage
 from ngo_msgs.msg import RelativePose
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from ngo_estimator.nodes.messages import to_ns, to_time
@@ -175,6 +175,15 @@ def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:
     drive = optimizer.drive()
     optimizer.publish(*drive.steps(1, 2))
     optimizer.wait_for_stamp(drive.stamp_ns(2))
+
+
+def test_a_subscriber_of_another_qos_is_told(optimizer: Optimizer) -> None:
+    """A latched path is asked for; the parameters qos_overrides can offer one."""
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    optimizer.probe.collect(PathMessage, "ngo/path", latched)
+    optimizer.process.wait_for_log(
+        "New subscription discovered on topic '.*ngo/path', requesting incompatible QoS.*DURABILITY"
+    )
 
 
 def test_of_two_publishers_the_first_is_held_and_both_are_named(optimizer: Optimizer) -> None:

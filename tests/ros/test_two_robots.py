@@ -1,0 +1,69 @@
+"""Two whole robots in one domain: simulator, local_node and ngo_node each, in a namespace of their own."""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from ngo_msgs.msg import RelativePose
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.nodes.messages import relative_step, to_ns
+from ngo_estimator.online_trajectory import OnlineTrajectory
+
+from .processes import NodeProcess, Probe
+
+pytestmark = [pytest.mark.processes, pytest.mark.slow]
+
+FRAMES = 30
+ROBOTS = ("red", "blue")
+
+
+def test_two_robots_drive_at_once(tmp_path: Path) -> None:
+    """Each pose is what the core makes of that robot's own relative poses; on /tf the prefix tells them apart."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    write_untrained(tmp_path, "maze2d")
+    probe = Probe()
+    steps = {name: probe.collect(RelativePose, f"/{name}/relative_pose", 5000) for name in ROBOTS}
+    poses = {name: probe.collect(PoseWithCovarianceStamped, f"/{name}/ngo/pose", 5000) for name in ROBOTS}
+    transforms = probe.collect(TFMessage, "/tf", 5000)
+    with ExitStack() as stack:
+        for seed, name in enumerate(ROBOTS):
+            shared = {"world": "maze2d", "weights": str(tmp_path), "frame_prefix": f"{name}/"}
+            local = {**shared, "image_reliability": "reliable", "image_depth": 100}
+            # At rate 0 it waits for its own two estimators, and publishes no frame that they do not take.
+            maze = {
+                "seed": seed,
+                "frames": FRAMES,
+                "rate": 0.0,
+                "wait_for_subscribers": 1,
+                "wait_for_flow_control": True,
+            }
+            for package, executable, parameters in (
+                ("ngo_estimator", "ngo_node", shared),
+                ("ngo_estimator", "local_node", local),
+                ("ngo_sim", "maze2d", maze),
+            ):
+                arguments = ("-r", f"__ns:=/{name}")
+                stack.enter_context(NodeProcess(package, executable, parameters, arguments))
+        probe.spin_until(lambda: all(len(found) == FRAMES - 1 for found in poses.values()), "every pose of both")
+        probe.spin_until(lambda: len(transforms) == 4 * (FRAMES - 1), "every transform of both")
+    core = OnlineTrajectory.load(tmp_path)
+    for name in ROBOTS:
+        core.reset()
+        assert len(steps[name]) == FRAMES - 1
+        for message, pose in zip(steps[name], poses[name], strict=True):
+            update = core.update(relative_step(message))
+            assert to_ns(pose.header.stamp) == update.stamp_ns
+            position = pose.pose.pose.position
+            np.testing.assert_allclose((position.x, position.y), update.pose_xyyaw[:2], atol=1e-5)
+        frames = {(m.transforms[0].header.frame_id, m.transforms[0].child_frame_id) for m in transforms}
+        assert {(f"{name}/map", f"{name}/odom"), (f"{name}/odom", f"{name}/base_link")} <= frames
+    assert len(frames) == 4
+    red, blue = (np.array([[m.x, m.y, m.yaw] for m in steps[name]]) for name in ROBOTS)
+    assert np.abs(red - blue).max() > 1e-6, "they see different mazes"
+    probe.close()
