@@ -15,7 +15,7 @@ TYPED := ros_ws/src/ngo_recordings/ngo_recordings ros_ws/src/ngo_sim/ngo_sim ros
 
 OPEN := . ./env.sh
 
-.PHONY: help venv build demo train results test lint format clean
+.PHONY: help venv build demo train results bench test lint format clean
 .DEFAULT_GOAL := help
 # One step at a time, and nothing printed after the demo's last line.
 .NOTPARALLEL:
@@ -39,6 +39,9 @@ train: build ## every network of a world, from simulated data, into the estimato
 
 results: build ## tables and figures of a world, from networks to docs/: WORLD=maze2d
 	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)
+
+bench: build ## speed of nodes and online core beside GTSAM, last a line of JSON: ARGS="--worlds maze3d"
+	@$(OPEN) && exec python -m benchmarks.online $(ARGS)
 
 test: build ## every test below tests/: ARGS="tests/unit -k name" goes to pytest
 	@$(OPEN) && exec python -m pytest $(ARGS)

@@ -1,0 +1,184 @@
+"""How fast the nodes and the online core are, beside GTSAM in the same run.
+
+    make bench
+    python -m benchmarks.online --worlds maze3d --seed 2001
+
+What is measured runs on one core with one thread: the nodes as real processes that are fed over DDS from another core,
+the core and its peers in a process of their own. The last line is one JSON object, whose ms are by the clock; exit code
+1 where a bar is missed. "cpu" is processor time, which other processes disturb less.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.core_speed import core_speed, local_core_ms
+from benchmarks.drives import CACHE
+from benchmarks.node_latency import RATE_HZ, Latencies, local_node, ngo_node
+from benchmarks.pinned import in_process, running_on, two_cores
+from demo.graph import GraphError
+from demo.session import Session, SessionConfig
+
+BARS = {"ngo_node_p99_ms": 1000.0 / RATE_HZ, "local_node_p99_ms": 10.0, "ratio_to_gtsam_lm": 1.0}
+"""What is to be below."""
+
+_LOCAL_BEFORE = 100
+_LEAST_REPEATS = 2
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to measure."""
+
+    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")
+    """Worlds to measure in."""
+    seed: int = 2000
+    """Maze to drive through."""
+    window: int = 2000
+    """Frames in the window, which is full when latencies are measured."""
+    live: int = 840
+    """Frames that are then sent at 35 Hz."""
+    repeats: int = 24
+    """Meta-poses at the end of the full window at which the optimizer and its peers are timed."""
+    end_to_end_frames: int = 1000
+    """Frames through simulator, local_node and ngo_node as fast as they go."""
+    out: Path = CACHE
+    """Folder for drives, which are made once, logs and recordings."""
+
+    def __post_init__(self) -> None:
+        if self.repeats < _LEAST_REPEATS or self.window < 8 * (self.repeats + 2) or self.window % 8:
+            raise ValueError(
+                f"window, repeats are {self.window}, {self.repeats}; expected at least {_LEAST_REPEATS} repeats and a "
+                "window of whole meta-poses (8 frames), two more of them than repeats"
+            )
+        if self.live < 1 or self.end_to_end_frames < 3:
+            raise ValueError(
+                f"live, end_to_end_frames are {self.live}, {self.end_to_end_frames}; expected at least 1 and 3"
+            )
+
+
+def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
+    """Everything about one world, by name."""
+    cores, logs = two_cores(), arguments.out / "logs" / world
+    say.print(f"{world}: core and peers")
+    core = in_process(
+        cores[0], core_speed, world, arguments.seed, arguments.window, arguments.live, arguments.repeats, arguments.out
+    )
+    core_ms = core.pop("core_ms")
+    say.print(f"{world}: local_node")
+    local_ms = in_process(cores[0], local_core_ms, world, arguments.seed, _LOCAL_BEFORE + arguments.live)
+    local = local_node(world, arguments.seed, _LOCAL_BEFORE, arguments.live, cores, logs)
+    say.print(f"{world}: ngo_node")
+    ngo = ngo_node(world, arguments.seed, arguments.window, arguments.live, cores, logs, arguments.out)
+    say.print(f"{world}: end to end")
+    result = {
+        **_named("ngo_node", ngo, core_ms),
+        **_named("local_node", local, local_ms[_LOCAL_BEFORE:]),
+        "ratio_to_gtsam_lm": core["optimize"]["ms"] / core["gtsam_lm"]["ms"],
+        "ratio_to_isam2": core["optimize"]["ms"] / core["isam2"]["ms"],
+        "cpu_ratio_to_gtsam_lm": core["optimize"]["cpu_ms"] / core["gtsam_lm"]["cpu_ms"],
+        "cpu_ratio_to_isam2": core["optimize"]["cpu_ms"] / core["isam2"]["cpu_ms"],
+        "end_to_end_frames_per_s": end_to_end(world, arguments),
+        "times_bound": core["optimize"]["ms"] / core["work"]["bound_ms"],
+        **core,
+    }
+    rounded: dict[str, Any] = _rounded(result)
+    return rounded
+
+
+def _named(node: str, latencies: Latencies, core_ms: list[float]) -> dict[str, float]:
+    return {
+        f"{node}_p99_ms": latencies.percentile(99),
+        f"{node}_median_ms": latencies.percentile(50),
+        f"{node}_max_ms": latencies.percentile(100),
+        f"{node}_core_share": float(np.sum(core_ms) / np.sum(latencies.milliseconds)),
+        f"{node}_frames_per_s": latencies.frames_per_s,
+    }
+
+
+def end_to_end(world: str, arguments: Arguments) -> float:
+    """Frames/s through the whole graph on two cores, recorded meanwhile; raises ``GraphError`` where one is lost."""
+    through: list[tuple[float, int]] = []
+    frames = arguments.end_to_end_frames
+    config = SessionConfig(world, arguments.seed, frames)
+    with running_on(*two_cores()):
+        result = Session(config, arguments.out / "end_to_end" / world).run(
+            lambda _, count: through.append((time.monotonic(), count))
+        )
+    if result["frames"] != frames:
+        raise GraphError(f"{frames - result['frames']} of {frames} frames were lost")
+    # The first frames wait for the networks' first run.
+    begin_s, before = next((at_s, count) for at_s, count in through if count > frames // 10)
+    end_s, last = next((at_s, count) for at_s, count in through if count == through[-1][1])
+    return (last - before) / (end_s - begin_s)
+
+
+def table(results: dict[str, dict[str, Any]]) -> Table:
+    """A column a world."""
+    shown = Table("", *results, "bar")
+
+    def row(name: str, text: Any, bar: str = "") -> None:
+        shown.add_row(name, *(text(result) for result in results.values()), bar)
+
+    for node in ("ngo_node", "local_node"):
+        keys = [f"{node}_{name}_ms" for name in ("median", "p99", "max")]
+        bar = f"p99 {BARS[f'{node}_p99_ms']:.1f}"
+        row(f"{node} at 35 Hz: median, p99, max (ms)", lambda r, k=keys: ", ".join(f"{r[key]:.1f}" for key in k), bar)
+        row(f"{node}: share of it in the core", lambda r, n=node: f"{100 * r[f'{n}_core_share']:.0f} %")
+        row(f"{node} as fast as it goes (frames/s)", lambda r, n=node: f"{r[f'{n}_frames_per_s']:.0f}")
+    for key, name in (
+        ("optimize", "one optimisation (ms, cpu ms)"),
+        ("update", "with candidates and aggregation (ms, cpu ms)"),
+        ("gtsam_lm", "GTSAM LM from odometry (ms, cpu ms)"),
+        ("gtsam_lm_believed", "the same, without loops of little belief (ms, cpu ms)"),
+        ("isam2", "GTSAM iSAM2, one meta-pose (ms, cpu ms)"),
+    ):
+        row(name, lambda r, k=key: f"{r[k]['ms']:.1f}, {r[k]['cpu_ms']:.1f}")
+    for peer, name in (("gtsam_lm", "ours / LM"), ("isam2", "ours / iSAM2")):
+        bar = f"{BARS[key]:g}" if (key := f"ratio_to_{peer}") in BARS else ""
+        row(f"{name} (by the clock, by cpu)", lambda r, k=key: f"{r[k]:.2f}, {r[f'cpu_{k}']:.2f}", bar)
+    row("loops in the window", lambda r: str(r["loops"]))
+    errors = ("odometry", "ours", "gtsam_lm", "isam2")
+    row(f"RMSE: {', '.join(errors)} (m)", lambda r: ", ".join(f"{r['rmse_m'][name]:.3f}" for name in errors))
+    row("work of an update: Mflop, MB", lambda r: f"{r['work']['flops'] / 1e6:.0f}, {r['work']['bytes'] / 1e6:.0f}")
+    row("the machine: Gflop/s, GB/s", lambda r: f"{r['work']['gflops']:.0f}, {r['work']['gbytes']:.0f}")
+    row("least time for it (ms), optimisation / that", lambda r: f"{r['work']['bound_ms']:.1f}, {r['times_bound']:.1f}")
+    row("end to end on two cores, none lost (frames/s)", lambda r: f"{r['end_to_end_frames_per_s']:.0f}")
+    return shown
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def main(arguments: Arguments) -> int:
+    """Measure, print a table and, last, everything as one line of JSON; return the exit code."""
+    console = Console(width=120)
+    results: dict[str, dict[str, Any]] = {world: measure(world, arguments, console) for world in arguments.worlds}
+    console.print(table(results))
+    missed = [
+        f"{world}: {name} is {result[name]:g}; expected less than {bar:.4g}"
+        for world, result in results.items()
+        for name, bar in BARS.items()
+        if result[name] >= bar
+    ]
+    for line in missed:
+        console.print(line)
+    print(json.dumps(results))
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Arguments, description=__doc__)))
