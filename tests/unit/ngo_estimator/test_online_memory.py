@@ -115,6 +115,37 @@ def test_it_is_as_good_as_the_whole_trajectory_at_once_and_jumps_no_further() ->
     assert np.abs(difference[:, :2]).max() < 0.03 and np.abs(difference[:, 2]).max() < 0.02
 
 
+@pytest.mark.parametrize("per_step", [1, 2, 4])
+def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
+    steps, _ = drive(LAP + 160)
+    at_once = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16)
+    spread = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=per_step)
+    later = -(-5 // per_step) - 1
+    for count, step in enumerate(steps, start=1):
+        expected, update = at_once.update(step), spread.update(step)
+        assert update.optimized == (count >= 8 and count % 8 == later)
+        if count % 8 >= later:
+            np.testing.assert_allclose(update.pose_xyyaw, expected.pose_xyyaw, atol=1e-9)
+            np.testing.assert_allclose(update.covariance, expected.covariance, rtol=1e-6, atol=1e-9)
+        if update.optimized:
+            a, b = spread.trajectory(), at_once.trajectory()
+            assert a is not None and b is not None
+            np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
+
+
+def test_finish_ends_what_has_begun() -> None:
+    steps, _ = drive(80)
+    at_once = OnlineTrajectory(robust_graph(), SeesPoses())
+    spread = OnlineTrajectory(robust_graph(), SeesPoses(), iterations_per_step=1)
+    for step in steps:
+        at_once.update(step)
+        spread.update(step)
+    spread.finish()
+    a, b = spread.trajectory(), at_once.trajectory()
+    assert a is not None and b is not None
+    np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
+
+
 def test_what_is_kept_does_not_grow() -> None:
     core = OnlineTrajectory(robust_graph(1), SeesPoses(), window_frames=80, key_frames=16)
     steps, _ = drive(4 * LAP)

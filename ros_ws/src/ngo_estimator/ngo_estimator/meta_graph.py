@@ -3,6 +3,9 @@
 Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 the first frame, the origin of ``map``.
 """
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
@@ -11,6 +14,7 @@ from ngo_estimator.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.neural_graph_optimizer import MetaSteps, NeuralGraphOptimizer, OptimizedMetaPoses
 from ngo_estimator.online_loops import Candidates, OnlineLoops
 from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.planar_covariance import propagate
 from ngo_estimator.pose_aggregation import block_variances, poses_in_blocks
 from ngo_estimator.rows import GrowingRows, SlidingRows
 
@@ -22,6 +26,18 @@ _MOST_DRIFT = 4.0
 
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
+
+
+@dataclass
+class _Running:
+    """An optimisation in progress, of which so many iterations are ``left``."""
+
+    iterations: Iterator[OptimizedMetaPoses]
+    left: int
+    keys: np.ndarray
+    first: int
+    numbers: np.ndarray
+    result: OptimizedMetaPoses | None = None
 
 
 class MetaGraph:
@@ -58,6 +74,7 @@ class MetaGraph:
         self.loop_frames = np.zeros((0, 2), np.int64)
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._running: _Running | None = None
         self._active, self._before = np.zeros(0, np.int64), np.zeros((0, 3))
 
     @property
@@ -76,12 +93,6 @@ class MetaGraph:
         moved = self._nodes.values[self._active, :2] - self._before[:, :2]
         return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
 
-    @property
-    def last(self) -> np.ndarray:
-        """Pose of the last node ``(3,)``."""
-        pose: np.ndarray = self._nodes.values[-1]
-        return pose
-
     def append(self, relative: np.ndarray, log_std: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
         """Take a step ``(3,)`` with what belongs to it; returns whether it completed a block."""
         last = torch.from_numpy(self.odometry.values[-1])
@@ -93,6 +104,8 @@ class MetaGraph:
             self._loops.append(code)
         if (len(self.odometry) - 1) % self._block:
             return False
+        if self._running is not None:
+            self.advance(self._running.left)  # what comes now changes the nodes that it is about
         self._complete_block()
         return True
 
@@ -195,9 +208,14 @@ class MetaGraph:
             limits[k] = _MOST_DRIFT * (np.diagonal(jacobian @ covariance @ jacobian.T) + own)
         return limits
 
+    @property
+    def running(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+        return self._running is not None
+
     @torch.inference_mode()
-    def optimize(self) -> None:
-        """Optimise all nodes of the window and the key frames before it."""
+    def begin(self) -> None:
+        """Begin to optimise all nodes of the window and the key frames before it."""
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
@@ -207,15 +225,35 @@ class MetaGraph:
         steps = MetaSteps(
             torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, self.blocks - first
         )
-        loops = None
+        loops, numbers = None, np.zeros(0, np.int64)
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
-        result = self._optimizer.optimize(steps, loops)
+        self._running = _Running(
+            self._optimizer.iterate(steps, loops), self._optimizer.config.iterations, keys, first, numbers
+        )
+
+    @torch.inference_mode()
+    def advance(self, iterations: int) -> bool:
+        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose."""
+        running = self._running
+        if running is None:
+            raise RuntimeError("no optimisation has begun")
+        for _ in range(min(iterations, running.left)):
+            running.result = next(running.iterations)
+            running.left -= 1
+        if running.left or running.result is None:
+            return False
+        self._running = None
+        self._apply(running, running.result)
+        return True
+
+    def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> None:
+        keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
-            self.loop_frames, self.loop_relative = self._loops.edges(numbers)
+            self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
             self.loop_std = result.loop_information[0].double().clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
             self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(numbers, self.loop_weights)
+            self._loops.weigh(running.numbers, self.loop_weights)
         poses = se2.r2g(result.meta_relative[-1][0].double())
         poses[:, 2] = se2.wrap(poses[:, 2])
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
@@ -223,6 +261,21 @@ class MetaGraph:
         self._nodes.values[self._active[1:]] = poses.numpy()
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._result, self._result_keys, self._result_first, self._result_last = result, keys, first, self.blocks
+
+    def abandon(self) -> None:
+        """Leave undone what has begun."""
+        self._running = None
+
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
+        whole = self.blocks * self._block
+        odometry = torch.from_numpy(self.odometry.values[whole:])
+        poses = se2.compose(torch.from_numpy(self._nodes.values[-1]), se2.between(odometry[0], odometry)).numpy()
+        covariance = self.end_covariance()
+        steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
+        for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
+            covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))
+        return poses[-1], covariance
 
     def end_covariance(self) -> np.ndarray:
         """Covariance ``(3, 3)`` of the last node that was optimised, in the map."""

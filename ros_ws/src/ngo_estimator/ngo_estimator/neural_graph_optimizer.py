@@ -1,6 +1,7 @@
 """The Neural Graph Optimizer (paper, section "Neural Graph Optimization"), with and without loop closures."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -346,6 +347,13 @@ class NeuralGraphOptimizer(nn.Module):
         self, steps: MetaSteps, loops: Loops | None = None, fixes: CompassFixes | None = None
     ) -> OptimizedMetaPoses:
         """Optimise meta-poses; ``loops`` and ``fixes`` as in ``forward``, their indices count all ``steps``."""
+        *_, last = self.iterate(steps, loops, fixes)
+        return last
+
+    def iterate(
+        self, steps: MetaSteps, loops: Loops | None = None, fixes: CompassFixes | None = None
+    ) -> Iterator[OptimizedMetaPoses]:
+        """What ``optimize`` gives, after each of its iterations."""
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
@@ -416,7 +424,7 @@ class NeuralGraphOptimizer(nn.Module):
                 deviation = deviation + change.to(deviation.dtype)
                 lattice = None if lattice is None else lattice + step[:, nodes]
             results.append(adjusted + deviation)
-        return OptimizedMetaPoses(results, loops, weights, information, step_std, equations)
+            yield OptimizedMetaPoses(list(results), loops, weights, information, step_std, equations)
 
     def _structure(self, loops: Loops | None, odometry: Tensor) -> GraphStructure | None:
         """Of the graph that every iteration solves, where a single one is optimised and no gradient asked for."""

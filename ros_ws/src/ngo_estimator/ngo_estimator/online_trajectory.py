@@ -58,7 +58,7 @@ class TrajectoryUpdate:
 
     ``pose_xyyaw`` (3,) of the newest frame, corrected, in ``map``, whose origin is the first frame, with its
     ``covariance`` (3, 3), that of the first frame being zero; ``map_from_odom_xyyaw`` (3,). ``frames``
-    counts all of the trajectory. ``optimized`` says whether this step ran the optimizer, ``restarted`` whether it
+    counts all of the trajectory. ``optimized`` says whether this step ended an optimisation, ``restarted`` whether it
     began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
     ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
     optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. The arrays are
@@ -109,6 +109,10 @@ class OnlineTrajectory:
     optimised together; up to so many steps the result is that of ``optimize_offline``. Of the poses before, at most
     ``key_frames`` (and a few more for a while) are optimised with them; all others move with these, and loops are
     closed with their frames. So the cost of a step does not depend on how long the trajectory is.
+
+    An optimisation takes several iterations. All are run at the step that completes a meta-pose, or, so that no step
+    takes much longer than the others, ``iterations_per_step`` at it and at each of those after it: the same result, a
+    few steps later.
     """
 
     def __init__(
@@ -117,6 +121,7 @@ class OnlineTrajectory:
         pair_head: PairHead | None,
         window_frames: int = 2000,
         key_frames: int = 128,
+        iterations_per_step: int = 0,
     ) -> None:
         block = optimizer.config.aggregation.block
         if window_frames < 2 * block:
@@ -128,24 +133,32 @@ class OnlineTrajectory:
         self._optimizer, self._pair_head = optimizer.eval(), pair_head
         self._block = block
         self._window = window_frames // block * block
+        if iterations_per_step < 0:
+            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
         self._key_frames = key_frames
+        self._iterations_per_step = iterations_per_step or optimizer.config.iterations
         self.reset()
 
     @classmethod
     def load(
-        cls, weights: Path, window_frames: int = 2000, world: str | None = None, key_frames: int = 128
+        cls,
+        weights: Path,
+        window_frames: int = 2000,
+        world: str | None = None,
+        key_frames: int = 128,
+        iterations_per_step: int = 0,
     ) -> "OnlineTrajectory":
         """Load the networks in the folder ``weights``; raises ``CheckpointError``, of one clear line."""
         optimizer, description = load_optimizer(weights, world)
         if not optimizer.config.loops:
-            return cls(optimizer, None, window_frames, key_frames)
+            return cls(optimizer, None, window_frames, key_frames, iterations_per_step)
         place, place_description = load_place(weights, description["world"])
         expected = description.get("place_encoder_sha256", place_description["sha256"])
         if place_description["sha256"] != expected:
             raise CheckpointError(
                 f"{weights}: the optimizer was trained with another place encoder than the one beside it"
             )
-        return cls(optimizer, place.pair_head, window_frames, key_frames)
+        return cls(optimizer, place.pair_head, window_frames, key_frames, iterations_per_step)
 
     @property
     def block(self) -> int:
@@ -207,14 +220,27 @@ class OnlineTrajectory:
                     restarted, relative, variance = True, step.relative_xyyaw, np.diagonal(step.covariance)
         if self._count == 0:
             self._begin(step)
-        self._append(step, relative, np.clip(variance, *_VARIANCES))
-        self._optimized = optimize and self._count % self._block == 0
-        if self._optimized:
-            self._graph.optimize()
-            self._pose = self._graph.last.copy()
-            self._covariance = self._graph.end_covariance()
+        completed = self._append(step, relative, np.clip(variance, *_VARIANCES))
+        self._optimized = False
+        if not optimize:
+            self._graph.abandon()
+        elif completed:
+            self._graph.begin()
+        if self._graph.running:
+            self._optimized = self._advance(self._iterations_per_step)
         self._online.append(self._pose)
         return self._result(restarted, gap)
+
+    def _advance(self, iterations: int) -> bool:
+        done = self._graph.advance(iterations)
+        if done:
+            self._pose, self._covariance = self._graph.newest()
+        return done
+
+    def finish(self) -> None:
+        """Run what is left of an optimisation that has begun, when no more steps are to come."""
+        if self._graph.running:
+            self._optimized = self._advance(self._optimizer.config.iterations)
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""
@@ -290,15 +316,16 @@ class OnlineTrajectory:
         self._odometry.append(before.numpy())
         self._online.append(np.zeros(3))
 
-    def _append(self, step: RelativeStep, relative: np.ndarray, variance: np.ndarray) -> None:
+    def _append(self, step: RelativeStep, relative: np.ndarray, variance: np.ndarray) -> bool:
         code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
         self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
         self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
-        self._graph.append(relative, 0.5 * np.log(variance), step.motion_feature, code)
+        completed = self._graph.append(relative, 0.5 * np.log(variance), step.motion_feature, code)
         self._stamps.append(step.stamp_ns)
         self._odometry.append(step.odom_xyyaw)
         self._odometry_std.append(np.sqrt(variance))
         self._last_odom = np.array(step.odom_xyyaw)
+        return completed
 
     def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
         graph = self._graph
