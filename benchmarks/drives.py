@@ -15,7 +15,7 @@ import torch
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_place
-from ngo_estimator.online_trajectory import RelativeStep
+from ngo_estimator.relative_step import RelativeStep
 from ngo_sim.drivers import driver_generator, make_driver
 from ngo_sim.episodes import Episode
 from training.featurise import features_of

@@ -12,8 +12,9 @@ from ngo_estimator.checkpoint import WORLD_IMAGES, PlaceNetworks
 from ngo_estimator.frame_pairing import FramePairing
 from ngo_estimator.local_odometry import RESTART_AFTER_NS, LocalEstimate, LocalOdometry, RejectedFrame
 from ngo_estimator.local_pose_network import LocalPoseNetwork
-from ngo_estimator.online_trajectory import OnlineTrajectory, RejectedStep, RelativeStep, TrajectoryUpdate
+from ngo_estimator.online_trajectory import OnlineTrajectory, TrajectoryUpdate
 from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.relative_step import RejectedStep, RelativeStep
 from tests.unit.ngo_estimator.samples import local_config, place_config, small_optimizer
 
 PERIOD_NS = 100_000_000

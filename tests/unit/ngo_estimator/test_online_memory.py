@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
-from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep
+from ngo_estimator.online_trajectory import OnlineTrajectory
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.relative_step import RelativeStep
 from tests.unit.ngo_estimator.samples import place_config
 
 SIDE_STEPS = 100  # of a square that the robot drives round and round

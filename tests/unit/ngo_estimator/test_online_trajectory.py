@@ -12,14 +12,8 @@ from hypothesis import strategies as st
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import CheckpointError, write_untrained
 from ngo_estimator.local_odometry import RESTART_AFTER_NS
-from ngo_estimator.online_trajectory import (
-    OnlineTrajectory,
-    RejectedStep,
-    RelativeStep,
-    Trajectory,
-    TrajectoryUpdate,
-    optimize_offline,
-)
+from ngo_estimator.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate, optimize_offline
+from ngo_estimator.relative_step import RejectedStep, RelativeStep
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 
 PERIOD_NS = 100_000_000

@@ -9,8 +9,9 @@ import torch
 from ngo_estimator.checkpoint import PlaceNetworks
 from ngo_estimator.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.local_pose_network import LocalPoseNetwork
-from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep, Trajectory, TrajectoryUpdate
+from ngo_estimator.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
 from ngo_estimator.recording_run import RecordedRun, RecordedStep, RecordingRun
+from ngo_estimator.relative_step import RelativeStep
 from ngo_recordings.frames import Frame, ScanGeometry
 from tests.unit.ngo_estimator.samples import local_config, observations, place_config, small_optimizer, small_pair_head
 

@@ -10,7 +10,8 @@ import pytest
 from evo.tools import file_interface
 
 from ngo_estimator import se2
-from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep
+from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.relative_step import RelativeStep
 from ngo_estimator.trajectory_file import ENDINGS, PoseEdges, SpatialPoses, edges_of, read_tum, write_trajectory
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 

@@ -15,41 +15,10 @@ from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, Optimized
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.planar_covariance import propagate
 from ngo_estimator.pose_aggregation import in_block_poses
+from ngo_estimator.relative_step import LARGEST_VALUE, DuplicateStep, LateStep, RelativeStep, check_step
 from ngo_estimator.rows import GrowingRows
 
-LARGEST_VALUE = 1e4
-"""Largest size of a coordinate (m, rad), feature or code: beyond it the optimizer's float32 has no room to compute."""
-
-LARGEST_ODOMETRY = 1e9
-"""Largest size of a coordinate (m, rad) of the pose in ``odom``, which enters in float64 only."""
-
 _VARIANCES = (1e-12, 1e4)  # what lies below or above is as good as exact or unknown, and float32 has no room for it
-
-
-class RejectedStep(ValueError):
-    """A relative pose that cannot be used; the trajectory is as it was before."""
-
-
-class DuplicateStep(RejectedStep):
-    """A step to the frame that is the newest already."""
-
-
-class LateStep(RejectedStep):
-    """A step to a frame that is a little older than the newest one."""
-
-
-@dataclass(frozen=True)
-class RelativeStep:
-    """One step of the local odometry; the fields are those of ``LocalEstimate``."""
-
-    stamp_ns: int
-    from_stamp_ns: int
-    relative_xyyaw: np.ndarray
-    covariance: np.ndarray
-    origin_stamp_ns: int
-    odom_xyyaw: np.ndarray
-    motion_feature: np.ndarray
-    place_code: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -135,6 +104,7 @@ class OnlineTrajectory:
         self._window = window_frames // block * block
         if iterations_per_step < 0:
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
+        self._code_size = None if pair_head is None else pair_head.config.code_size
         self._key_frames = key_frames
         self._iterations_per_step = iterations_per_step or optimizer.config.iterations
         self.reset()
@@ -201,7 +171,7 @@ class OnlineTrajectory:
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
                 that is a little late. The trajectory is as it was before.
         """
-        self._check(step)
+        check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_size)
         restarted, gap = False, False
         relative, variance = step.relative_xyyaw, np.diagonal(step.covariance)
         if self._count:
@@ -273,30 +243,6 @@ class OnlineTrajectory:
         corrected = se2.compose(nodes[:-1].unsqueeze(1), in_block_poses(in_blocks, steps)[0]).flatten(0, 1)
         tail = se2.compose(nodes[-1:], se2.between(starts[-1], odometry[whole + 1 :]))
         return torch.cat((nodes[:1], corrected, tail)).numpy()
-
-    def _check(self, step: RelativeStep) -> None:
-        config = self._optimizer.config
-        vectors = {
-            "relative_xyyaw": (step.relative_xyyaw, (3,)),
-            "covariance": (step.covariance, (3, 3)),
-            "odom_xyyaw": (step.odom_xyyaw, (3,)),
-            "motion_feature": (step.motion_feature, (config.aggregation.motion_feature_size,)),
-        }
-        if self._pair_head is not None:
-            vectors["place_code"] = (step.place_code, (self._pair_head.config.code_size,))
-        for name, (value, shape) in vectors.items():
-            if value.shape != shape:
-                raise RejectedStep(f"{name} is of shape {value.shape}; expected {shape}")
-            if not np.isfinite(value).all():
-                raise RejectedStep(f"{name} has values that are not finite")
-            if name != "covariance":
-                _check_size(name, value, LARGEST_ODOMETRY if name == "odom_xyyaw" else LARGEST_VALUE)
-        if not (np.diagonal(step.covariance) > 0.0).all():
-            raise RejectedStep(
-                f"covariance has the variances {np.diagonal(step.covariance).tolist()}; expected positive ones"
-            )
-        if step.from_stamp_ns >= step.stamp_ns:
-            raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")
 
     def _over_gap(self, step: RelativeStep, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Relative pose and variances from the last frame that is known to the one of ``step``.
@@ -381,8 +327,3 @@ def _read_only(array: np.ndarray) -> np.ndarray:
     view = array.view()
     view.flags.writeable = False
     return view
-
-
-def _check_size(name: str, value: np.ndarray, limit: float) -> None:
-    if (largest := np.abs(value).max(initial=0.0)) > limit:
-        raise RejectedStep(f"{name} has values as large as {largest:g}; expected at most {limit:g}")

@@ -10,7 +10,8 @@ import numpy as np
 from ngo_estimator.frame_pairing import FramePairing
 from ngo_estimator.local_odometry import RESTART_AFTER_NS, DuplicateFrame, LateFrame, LocalEstimate, LocalOdometry
 from ngo_estimator.observations import observation
-from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep, Trajectory, TrajectoryUpdate
+from ngo_estimator.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
+from ngo_estimator.relative_step import RelativeStep
 from ngo_estimator.trajectory_file import SpatialPoses, seconds
 from ngo_recordings.frames import Frame
 

@@ -26,8 +26,8 @@ from ngo_estimator.planar_covariance import to_planar, to_spatial
 
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
     from ngo_estimator.local_odometry import LocalEstimate
-    from ngo_estimator.online_trajectory import RelativeStep
     from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
+    from ngo_estimator.relative_step import RelativeStep
 
 _NS = 1_000_000_000
 _LOOP_WIDTH_M = 0.03
@@ -72,7 +72,7 @@ def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> Relativ
 
 def relative_step(message: RelativePose) -> "RelativeStep":
     """What ``OnlineTrajectory`` takes, from a message."""
-    from ngo_estimator.online_trajectory import RelativeStep
+    from ngo_estimator.relative_step import RelativeStep
 
     return RelativeStep(
         stamp_ns=to_ns(message.header.stamp),

@@ -1,0 +1,39 @@
+"""What a robot would have known at the time: each pose as the online estimator first gives it."""
+
+import numpy as np
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.relative_step import RelativeStep
+
+
+def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
+    """Each pose ``(steps + 1, 3)`` as it was first published, the origin in front, of the steps in ``features``.
+
+    ``features`` are those of ``features_of``, ``core`` forgets what it held.
+    """
+    core.reset()
+    odometry = se2.r2g(torch.from_numpy(features["relative"]).double()).numpy()
+    variances = np.exp(2.0 * features["log_std"].astype(np.float64))
+    for k, relative in enumerate(features["relative"]):
+        core.update(
+            RelativeStep(
+                stamp_ns=k + 1,
+                from_stamp_ns=k,
+                relative_xyyaw=relative.astype(np.float64),
+                covariance=np.diag(variances[k]),
+                origin_stamp_ns=0,
+                odom_xyyaw=odometry[k],
+                motion_feature=features["motion"][k].astype(np.float32),
+                place_code=features["codes"][k].astype(np.float32),
+            )
+        )
+    trajectory = core.trajectory()
+    assert trajectory is not None
+    return trajectory.online_xyyaw.copy()
+
+
+def with_origin(poses: np.ndarray) -> np.ndarray:
+    """Poses ``(steps + 1, 3)`` with the origin in front of those after each step."""
+    return np.concatenate((np.zeros((1, 3)), poses))
