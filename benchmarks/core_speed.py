@@ -57,16 +57,28 @@ class Watched:
         self.block = self.core.block
         self.optimisations = Times()
         self._given: tuple[MetaSteps, Loops] | None = None
-        solve, graph = optimizer.optimize, self.core._graph
-        whole = graph.optimize
+        self._begun = Times()
+        iterate, graph = optimizer.iterate, self.core._graph
+        begin, advance = graph.begin, graph.advance
 
         def remembered(steps: MetaSteps, loops: Loops | None = None, *others: Any) -> Any:
             assert loops is not None, "expected an optimizer with loops"
             self._given = (steps, loops)
-            return solve(steps, loops, *others)
+            return iterate(steps, loops, *others)
 
-        optimizer.optimize = remembered  # type: ignore[assignment,method-assign]
-        graph.optimize = lambda: self.optimisations.take(whole)  # type: ignore[method-assign]
+        def beginning() -> None:
+            self._begun = Times()
+            self._begun.take(begin)
+
+        def advancing(iterations: int) -> bool:
+            done = self._begun.take(advance, iterations)
+            if done:
+                self.optimisations.wall_ms.append(sum(self._begun.wall_ms))
+                self.optimisations.cpu_ms.append(sum(self._begun.cpu_ms))
+            return done
+
+        vars(optimizer)["iterate"] = remembered
+        vars(graph).update(begin=beginning, advance=advancing)
 
     def problem(self) -> Problem:
         """What the optimizer was given last."""

@@ -1,0 +1,59 @@
+"""The benchmarks of the online core and the nodes at toy size: real processes, and a last line of JSON."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import long_run, online
+
+KEYS = ("ngo_node_p99_ms", "local_node_p99_ms", "ratio_to_gtsam_lm", "ratio_to_isam2")
+
+
+def test_online(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = online.Arguments(worlds=("maze2d",), window=64, live=35, repeats=3, end_to_end_frames=40, out=tmp_path)
+    monkeypatch.setattr(online, "BARS", dict.fromkeys(online.BARS, 1e9))
+    assert online.main(arguments) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])["maze2d"]
+    for key in KEYS:
+        assert result[key] > 0.0, key
+    assert result["ratio_to_gtsam_lm"] == pytest.approx(result["optimize"]["ms"] / result["gtsam_lm"]["ms"], rel=0.01)
+    assert result["ngo_node_median_ms"] <= result["ngo_node_p99_ms"] <= result["ngo_node_max_ms"]
+    assert result["end_to_end_frames_per_s"] > 1.0
+
+
+def test_a_missed_bar_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    result = dict.fromkeys(KEYS, 1.5)
+    monkeypatch.setattr(online, "measure", lambda *_: result)
+    monkeypatch.setattr(online, "table", lambda _: "")
+    assert online.main(online.Arguments(worlds=("maze3d",))) == 1
+    *_, line, last = capsys.readouterr().out.splitlines()
+    assert line == "maze3d: ratio_to_gtsam_lm is 1.5; expected less than 1"
+    assert json.loads(last) == {"maze3d": result}
+
+
+def test_a_long_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = long_run.Arguments(
+        frames=640, every=32, window=160, key_frames=8, plot=tmp_path / "curves.png", cache=tmp_path
+    )
+    code = long_run.main(arguments)
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    # How long so few frames take is left to chance.
+    assert code == int(result["cpu_ratio"] > long_run.LONGEST_RATIO)
+    assert result["memory_growth_mb"] < long_run.MOST_GROWTH_MB
+    assert result["end"]["frames"] == 640
+    assert 0.0 < result["end"]["optimised_rmse_m"] < result["end"]["odometry_rmse_m"] * 2.0
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"window": 60}, "window, repeats are 60, 24"),
+        ({"repeats": 1}, "window, repeats are 2000, 1"),
+        ({"live": 0}, "live, end_to_end_frames are 0, 1000"),
+    ],
+)
+def test_sizes_that_measure_nothing_are_refused(changes: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        online.Arguments(**changes)  # type: ignore[arg-type]
