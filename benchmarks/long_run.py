@@ -49,6 +49,8 @@ class Arguments:
     """Frames that are optimised together."""
     key_frames: int = 128
     """Key frames from before the window."""
+    iterations_per_step: int = 1
+    """Iterations of an optimisation that one frame pays for, as in ngo_node; 0: all at once."""
     plot: Path = ROOT / "docs" / "images" / "online_100000.png"
     """Picture of the curves."""
     cache: Path = CACHE
@@ -82,7 +84,11 @@ def points(arguments: Arguments) -> list[Point]:
     torch.set_num_threads(1)
     drive = drive_of(arguments.world, arguments.seed, arguments.frames, arguments.cache)
     core = OnlineTrajectory.load(
-        WEIGHTS / arguments.world, arguments.window, arguments.world, key_frames=arguments.key_frames
+        WEIGHTS / arguments.world,
+        arguments.window,
+        arguments.world,
+        arguments.key_frames,
+        arguments.iterations_per_step,
     )
     truth, odometry = np.concatenate((np.zeros((1, 3)), drive.truth)), drive.odometry()
     wall_ms, cpu_ms = np.zeros(arguments.every), np.zeros(arguments.every)
