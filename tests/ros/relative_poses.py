@@ -90,7 +90,7 @@ class Optimizer:
     def __init__(self, process: NodeProcess, weights: Path, probe: Probe, namespace: str = "") -> None:
         self.process, self.weights, self.probe = process, weights, probe
         self.name = f"{namespace}/ngo_node"
-        self.core = OnlineTrajectory.load(weights)
+        self.core = OnlineTrajectory.load(weights, iterations_per_step=1)  # as ngo_node by default
         self.publisher = probe.node.create_publisher(RelativePose, f"{namespace}/relative_pose", 5000)
         self.poses: list[PoseWithCovarianceStamped] = probe.collect(
             PoseWithCovarianceStamped, f"{namespace}/ngo/pose", 5000

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -209,6 +210,8 @@ def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: d
         images = probe.node.create_publisher(Image, "/returning/image", 1000)
         actions = probe.node.create_publisher(DiscreteAction, "/returning/action", 1000)
         relative_poses = probe.collect(RelativePose, "/returning/relative_pose")
+        poses = probe.collect(PoseWithCovarianceStamped, "/returning/ngo/pose")
+        ngo.wait_for_log("ready")
         step = 0
 
         def drive_until_heard() -> None:
@@ -218,9 +221,10 @@ def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: d
                 actions.publish(DiscreteAction(header=Image().header.__class__(stamp=stamp), action=0))
                 step += 1
                 images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
-                return len(relative_poses) > 3
+                return len(relative_poses) > 3 and len(poses) > 3
 
             relative_poses.clear()
+            poses.clear()
             probe.spin_until(heard, "relative poses")
 
         with NodeProcess("ngo_estimator", "local_node", local, arguments) as process:

@@ -52,7 +52,7 @@ def test_two_robots_drive_at_once(tmp_path: Path) -> None:
                 stack.enter_context(NodeProcess(package, executable, parameters, arguments))
         probe.spin_until(lambda: all(len(found) == FRAMES - 1 for found in poses.values()), "every pose of both")
         probe.spin_until(lambda: len(transforms) == 4 * (FRAMES - 1), "every transform of both")
-    core = OnlineTrajectory.load(tmp_path)
+    core = OnlineTrajectory.load(tmp_path, iterations_per_step=1)  # as ngo_node by default
     for name in ROBOTS:
         core.reset()
         assert len(steps[name]) == FRAMES - 1

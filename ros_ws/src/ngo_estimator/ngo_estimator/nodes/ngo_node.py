@@ -114,12 +114,12 @@ class NgoNode(LifecycleNode):
         from ngo_estimator.online_trajectory import OnlineTrajectory
         from ngo_estimator.tf_smoothing import SmoothedCorrection
 
-        self._core = load_core(
-            lambda folder, world: OnlineTrajectory.load(
-                folder, settings.window_frames, world, key_frames=settings.key_frames
-            ),
-            settings,
-        )
+        def load(folder: Path, world: str) -> OnlineTrajectory:
+            return OnlineTrajectory.load(
+                folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
+            )
+
+        self._core = load_core(load, settings)
         self._origin_of = MapOrigin
         self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
         self._paused = False

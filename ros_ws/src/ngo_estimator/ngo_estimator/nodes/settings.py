@@ -126,6 +126,13 @@ class NgoNodeSettings(EstimatorSettings):
         minimum=2,
         maximum=100_000,
     )
+    iterations_per_step: int = setting(
+        1,
+        "Iterations of an optimisation for each relative pose, so that none takes much longer than the others; 0: all "
+        "at the one that completes a meta-pose.",
+        minimum=0,
+        maximum=100,
+    )
     map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump.")
     initial_pose: tuple[float, float, float] = pose(
         (0.0, 0.0, 0.0), "Where in map_frame the first frame of a trajectory lies, from the next one on.", live=True
