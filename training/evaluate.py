@@ -1,18 +1,20 @@
 """Measure how far estimated trajectories are from the truth.
 
     python -m training.evaluate --world maze2d --split validation
+    python -m training.evaluate --data drive_1.mcap drive_2.mcap --name my_robot
     python -m training.evaluate --estimate odometry.tum online.tum corrected.tum --truth truth.tum
 
 With `--world`, a world's networks drive through whole trajectories of a split: their odometry, the online estimate
-(each pose as it was first published) and the corrected one (the final path). With `--estimate`, trajectories in the TUM
-format are compared by ATE, RPE and KITTI's segment errors, as evo does. The last line printed is the table as one JSON
-object.
+(each pose as it was first published) and the corrected one (the final path). With `--data`, what was trained on
+recordings is measured on the one that was held out, with plots in RUNS/NAME/results. With `--estimate`,
+trajectories in the TUM format are compared by ATE, RPE and KITTI's segment errors, as evo does. The last line printed
+is the table as one JSON object.
 """
 
 import dataclasses
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -25,26 +27,30 @@ from tqdm import tqdm
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
-from ngo_estimator.online_trajectory import OnlineTrajectory, RelativeStep, optimize_offline
+from ngo_estimator.online_trajectory import OnlineTrajectory, optimize_offline
 from ngo_estimator.trajectory_errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory_report import ReportSettings
 from training import runs
 from training.evaluate_files import evaluate_files
+from training.evaluate_recorded import FEATURES, evaluate_recorded
 from training.featurise import features_of
 from training.metrics import TrajectoryError, trajectory_error
+from training.online_estimate import online_poses, with_origin
+from training.recorded import RecordedArguments, open_recorded
 from training.streams import simulate
 from training.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
 
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
-_FEATURES = ("relative", "log_std", "motion", "codes")
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Settings of an evaluation, of a world or of files."""
+    """Settings of an evaluation, of a world, of recordings or of files."""
 
     world: WorldName | None = None
     """World to measure in."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings that networks were trained on, and how: as given to the training."""
     split: Literal["validation", "test"] = "validation"
     """Mazes to measure on."""
     trajectories: int = 20
@@ -52,14 +58,14 @@ class Arguments:
     frames: int = 0
     """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
     weights: Path = runs.WEIGHTS
-    """Folder with WORLD/*.safetensors."""
+    """Folder with NAME/*.safetensors."""
     online: bool = True
     """Whether to measure the online estimate, too, which runs the optimizer at every eighth frame."""
     estimate: tuple[Path, ...] = ()
     """Estimated trajectories in the TUM format, to be compared with `--truth` instead of measuring in a world."""
     truth: Path | None = None
     """True trajectory in the TUM format."""
-    tolerance_s: float = 0.01
+    files_tolerance_s: float = 0.01
     """Files: how far apart in time an estimated and a true pose of one moment may be."""
     delta: float = 1.0
     """Files: between poses how far apart the RPE is taken."""
@@ -69,20 +75,26 @@ class Arguments:
     """Files: whether the RPE is taken from every pose, or from the end of one pair to the next."""
     segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
     """Files: lengths of KITTI's segments."""
+    runs: Path = runs.ROOT / "runs"
+    """Recordings: folder of what was read from them; gets NAME/results/."""
 
     def __post_init__(self) -> None:
-        if (self.world is None) == (not self.estimate) or bool(self.estimate) != (self.truth is not None):
-            raise ValueError("expected either --world, or --estimate FILES and --truth FILE")
+        given = (self.world is not None) + bool(self.recordings.data) + bool(self.estimate)
+        if given != 1 or bool(self.estimate) != (self.truth is not None):
+            raise ValueError("expected one of --world, --data FILES, or --estimate FILES and --truth FILE")
 
     @property
     def report_settings(self) -> ReportSettings:
         """What is measured of files."""
         delta = RelativeDelta(self.delta, self.delta_unit, self.all_pairs)
-        return ReportSettings(self.tolerance_s, delta, self.segment_lengths_m)
+        return ReportSettings(self.files_tolerance_s, delta, self.segment_lengths_m)
 
 
 def main(arguments: Arguments) -> dict[str, object]:
     """Print the table and return it."""
+    if arguments.recordings.data:
+        data = open_recorded(arguments.recordings, arguments.runs)
+        return evaluate_recorded(data, arguments.weights, arguments.runs, arguments.online)
     if arguments.world is None:
         assert arguments.truth is not None
         return {**evaluate_files(arguments.estimate, arguments.truth, arguments.report_settings)}
@@ -99,11 +111,11 @@ def main(arguments: Arguments) -> dict[str, object]:
         for group in (seeds[i : i + 8] for i in range(0, len(seeds), 8)):
             for episode in simulate(world, group, frames):
                 features = features_of(world, episode, folder, (local, place))
-                arrays = [torch.from_numpy(features[name]) for name in _FEATURES]
+                arrays = [torch.from_numpy(features[name]) for name in FEATURES]
                 corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
                 poses = {
-                    "odometry": _with_origin(se2.r2g(arrays[0]).numpy()),
-                    "corrected": _with_origin(corrected.numpy()),
+                    "odometry": with_origin(se2.r2g(arrays[0]).numpy()),
+                    "corrected": with_origin(corrected.numpy()),
                 }
                 if arguments.online:
                     poses["online"] = online_poses(core, features)
@@ -131,36 +143,6 @@ def main(arguments: Arguments) -> dict[str, object]:
     Console().print(table)
     print(json.dumps(result))
     return result
-
-
-def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
-    """Each pose ``(steps + 1, 3)`` as it was first published, the origin in front, of the steps in ``features``.
-
-    ``features`` are those of ``features_of``, ``core`` forgets what it held.
-    """
-    core.reset()
-    odometry = se2.r2g(torch.from_numpy(features["relative"]).double()).numpy()
-    variances = np.exp(2.0 * features["log_std"].astype(np.float64))
-    for k, relative in enumerate(features["relative"]):
-        core.update(
-            RelativeStep(
-                stamp_ns=k + 1,
-                from_stamp_ns=k,
-                relative_xyyaw=relative.astype(np.float64),
-                covariance=np.diag(variances[k]),
-                origin_stamp_ns=0,
-                odom_xyyaw=odometry[k],
-                motion_feature=features["motion"][k].astype(np.float32),
-                place_code=features["codes"][k].astype(np.float32),
-            )
-        )
-    trajectory = core.trajectory()
-    assert trajectory is not None
-    return trajectory.online_xyyaw.copy()
-
-
-def _with_origin(poses: np.ndarray) -> np.ndarray:
-    return np.concatenate((np.zeros((1, 3)), poses))
 
 
 def command_line() -> int:

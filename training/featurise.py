@@ -1,38 +1,51 @@
 """Compute the optimizer's training data once: odometry, motion features and place codes of whole trajectories.
 
     python -m training.featurise --world maze2d
+    python -m training.featurise --data drive_1.mcap drive_2.mcap --name my_robot
 
 Images are far too many to keep (2000 a trajectory): what the local network and the place encoder make of them goes into
 memory-mapped arrays, the features as float16. Run again, it goes on where it was stopped.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 import tyro
+from torch import Tensor
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import load_local, load_place
+from ngo_estimator.checkpoint import PlaceNetworks, load_local, load_place
 from ngo_estimator.compass import Compass, load_compass, read_frames
 from ngo_estimator.compass_closure import frames_to_read
+from ngo_estimator.local_pose_network import LocalPoseNetwork
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
-from ngo_sim.episodes import Episode
 from training import runs
+from training.domains import Domain
 from training.metrics import seen_from_first
-from training.streams import images_of, simulate
+from training.recorded import RecordedArguments, check_source, open_recorded
+from training.recorded_streams import known_to, told, windows
+from training.recorded_tracks import Part, Track
+from training.streams import Batch, images_of, mirrored, simulate
 from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, MazeSize, World, WorldName, world_named
+
+if TYPE_CHECKING:
+    from ngo_sim.episodes import Episode
 
 _GROUP = 8  # mazes of one size
 _MADE_WITH = "networks.json"
 _COMPASS = ("compass", "compass_log_scale")
+_MOST_STEPS = 1000  # of a stretch of a recording
 _BLOCK = PoseAggregationConfig(1).block
 
 
@@ -40,8 +53,10 @@ _BLOCK = PoseAggregationConfig(1).block
 class Arguments:
     """Settings of the feature store."""
 
-    world: WorldName
+    world: WorldName | None = None
     """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
     trajectories: int = 960
     """Trajectories for training, each in a maze of its own that the local network has not seen."""
     validation_trajectories: int = 24
@@ -49,9 +64,9 @@ class Arguments:
     test_trajectories: int = 0
     """Trajectories of the test split for each table of results."""
     weights: Path = runs.WEIGHTS
-    """Folder with WORLD/local_pose_network.safetensors and WORLD/place_encoder.safetensors."""
+    """Folder with NAME/local_pose_network.safetensors and NAME/place_encoder.safetensors."""
     out: Path = runs.ROOT / "runs"
-    """Folder that gets WORLD/features/."""
+    """Folder that gets NAME/features/."""
     compass: Path | None = None
     """Folder with WORLD/compass.safetensors, for stores that also hold the readings of a compass."""
     part: int = 0
@@ -59,25 +74,64 @@ class Arguments:
     parts: int = 1
     """... when divided by this: several processes can share the work."""
 
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
 
-@torch.inference_mode()
-def features_of(world: World, episode: Episode, weights: Path, networks: tuple | None = None) -> dict[str, np.ndarray]:
+
+class Networks(NamedTuple):
+    """What makes features of frames."""
+
+    local: LocalPoseNetwork
+    place: PlaceNetworks
+
+
+def features_of(
+    world: World, episode: Episode, weights: Path, networks: tuple[LocalPoseNetwork, PlaceNetworks] | None = None
+) -> dict[str, np.ndarray]:
     """What the estimator makes of an episode in ``frames - 1`` steps, and the true poses after each of them."""
     local, place = networks or (load_local(weights, world.name)[0], load_place(weights, world.name)[0])
     images = images_of(world, episode)
-    actions = torch.from_numpy(episode.actions).long() if world.actions else None
-    parts: list[tuple[torch.Tensor, ...]] = []
-    for chunk in torch.arange(len(images) - 1).split(256):
-        action = None if actions is None else actions[chunk]
-        relative, log_std, motion = local(images[chunk], images[chunk + 1], action)
-        parts.append((relative, log_std, motion, place.encoder(images[chunk + 1])))
+    actions = {"action": torch.from_numpy(episode.actions).long()} if world.actions else {}
+    return step_features(lambda index: images[index], actions, episode.poses_xyyaw, Networks(local, place))
+
+
+def features_of_track(domain: Domain, track: Track, networks: Networks, mirror: bool = False) -> dict[str, np.ndarray]:
+    """The same of a track of a recording, or of what its mirror image would have given."""
+    told_steps = known_to(domain, told(track, slice(None)))
+    poses = track.poses_xyyaw
+    if mirror:
+        told_steps, poses = mirrored(told_steps), seen_from_first(poses) * np.array([1.0, -1.0, -1.0])
+
+    def frames(index: slice) -> Tensor:
+        return track.frames(index).flip(-2) if mirror else track.frames(index)
+
+    return step_features(frames, told_steps, poses, networks)
+
+
+@torch.inference_mode()
+def step_features(
+    frames: Callable[[slice], Tensor], told_steps: Batch, poses_xyyaw: np.ndarray, networks: Networks
+) -> dict[str, np.ndarray]:
+    """Features of ``steps`` steps, and the true poses after each of them, seen from the first frame.
+
+    Args:
+        frames: gives images of a range of frames ``(n, height, width, channels)``.
+        told_steps: ``action`` ``(steps,)`` and ``twist`` ``(steps, 3)``, where the networks take them.
+        poses_xyyaw: ``(steps + 1, 3)``.
+    """
+    parts: list[tuple[Tensor, ...]] = []
+    for chunk in torch.arange(len(poses_xyyaw) - 1).split(256):
+        images = frames(slice(int(chunk[0]), int(chunk[-1]) + 2))
+        side = {name: value[chunk] for name, value in told_steps.items()}
+        relative, log_std, motion = networks.local(images[:-1], images[1:], side.get("action"), side.get("twist"))
+        parts.append((relative, log_std, motion, networks.place.encoder(images[1:])))
     relative, log_std, motion, codes = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
     return {
         "relative": relative,
         "log_std": log_std,
         "motion": motion.astype(np.float16),
         "codes": codes.astype(np.float16),
-        "truth": seen_from_first(episode.poses_xyyaw)[1:],
+        "truth": seen_from_first(poses_xyyaw)[1:],
     }
 
 
@@ -98,8 +152,12 @@ def _groups(seeds: list[int], part: int, parts: int) -> Iterator[tuple[int, list
 def main(arguments: Arguments) -> None:
     """Make the arrays ``WORLD/features/STORE/NAME.npy`` of shape ``(trajectories, steps, ...)``.
 
-    The stores are ``train`` and, for each table of results, ``validation_TABLE`` and ``test_TABLE``.
+    The stores are ``train`` and, for each table of results, ``validation_TABLE`` and ``test_TABLE``; of recordings
+    ``train`` and ``validation``, stretches that overlap, and their mirror images.
     """
+    if arguments.world is None:
+        _main_recorded(arguments)
+        return
     world = world_named(arguments.world)
     folder = arguments.weights / world.name
     local, local_description = load_local(folder, world.name)
@@ -120,6 +178,28 @@ def main(arguments: Arguments) -> None:
         if arguments.compass is not None:
             compass, _ = load_compass(arguments.compass / world.name, world.name)
             _fill(store, "compass_done", world, seeds, size, part, partial(readings_of, world, compass))
+
+
+def _main_recorded(arguments: Arguments) -> None:
+    data = open_recorded(arguments.recordings, arguments.out)
+    folder = arguments.weights / data.domain.name
+    local, local_description = load_local(folder, data.domain.name)
+    place, place_description = load_place(folder, data.domain.name)
+    stores: tuple[tuple[str, Part, int], ...] = (
+        ("train", "optimizer", 8 * _BLOCK),
+        ("validation", "validation", 2 * _BLOCK),
+    )
+    for name, part, fewest in stores:
+        found = windows(data.domain, data.tracks(part), _MOST_STEPS, fewest, _BLOCK)
+        store = arguments.out / data.domain.name / "features" / name
+        # Made in minutes: rather anew than from several versions of networks or recordings.
+        shutil.rmtree(store, ignore_errors=True)
+        store.mkdir(parents=True)
+        (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
+        for row, (track, mirror) in enumerate(tqdm(found.cuts, desc=f"{data.domain.name} {name}")):
+            for key, value in features_of_track(data.domain, track, Networks(local, place), mirror).items():
+                _array(store / f"{key}.npy", (len(found.cuts), *value.shape), value.dtype)[row] = value
+        (store / "done.0of1.json").write_text(json.dumps(list(range(0, len(found.cuts), _GROUP))))
 
 
 def _fill(

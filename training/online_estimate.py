@@ -1,5 +1,7 @@
 """What a robot would have known at the time: each pose as the online estimator first gives it."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 
@@ -14,24 +16,28 @@ def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.
     ``features`` are those of ``features_of``, ``core`` forgets what it held.
     """
     core.reset()
-    odometry = se2.r2g(torch.from_numpy(features["relative"]).double()).numpy()
-    variances = np.exp(2.0 * features["log_std"].astype(np.float64))
-    for k, relative in enumerate(features["relative"]):
-        core.update(
-            RelativeStep(
-                stamp_ns=k + 1,
-                from_stamp_ns=k,
-                relative_xyyaw=relative.astype(np.float64),
-                covariance=np.diag(variances[k]),
-                origin_stamp_ns=0,
-                odom_xyyaw=odometry[k],
-                motion_feature=features["motion"][k].astype(np.float32),
-                place_code=features["codes"][k].astype(np.float32),
-            )
-        )
+    for step in steps_of(features):
+        core.update(step)
     trajectory = core.trajectory()
     assert trajectory is not None
     return trajectory.online_xyyaw.copy()
+
+
+def steps_of(features: dict[str, np.ndarray]) -> Iterator[RelativeStep]:
+    """The steps in ``features`` as the local odometry would have given them, a nanosecond apart."""
+    odometry = se2.r2g(torch.from_numpy(features["relative"]).double()).numpy()
+    variances = np.exp(2.0 * features["log_std"].astype(np.float64))
+    for k, relative in enumerate(features["relative"]):
+        yield RelativeStep(
+            stamp_ns=k + 1,
+            from_stamp_ns=k,
+            relative_xyyaw=relative.astype(np.float64),
+            covariance=np.diag(variances[k]),
+            origin_stamp_ns=0,
+            odom_xyyaw=odometry[k],
+            motion_feature=features["motion"][k].astype(np.float32),
+            place_code=features["codes"][k].astype(np.float32),
+        )
 
 
 def with_origin(poses: np.ndarray) -> np.ndarray:

@@ -146,7 +146,7 @@ def _optimizer(arguments: train_optimizer.Arguments) -> Callable[[], None]:
     def make() -> None:
         train_optimizer.main(arguments)
         # The scripts write WORLD/NAME, for folders that hold several worlds; a row has a folder for each world.
-        written = arguments.out / arguments.world
+        written = arguments.out / str(arguments.world)
         for path in sorted(written.iterdir()):  # the description first: what is complete has both
             path.replace(arguments.out / path.name)
         written.rmdir()
@@ -162,7 +162,7 @@ def _end_to_end(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[
         arguments = replace(scripts.end_to_end, weights=stages, out=own.weights, **changes)
 
         def make(sources: Sources = sources, arguments: train_end_to_end.Arguments = arguments) -> None:
-            folder = arguments.weights / arguments.world
+            folder = arguments.weights / str(arguments.world)
             folder.mkdir(parents=True, exist_ok=True)
             trained = sources.row_folder("ngo_5", 0)
             for kind, source in ((LOCAL, sources.networks), (PLACE, sources.networks), (OPTIMIZER, trained)):

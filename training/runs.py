@@ -4,7 +4,7 @@ import dataclasses
 import json
 import shlex
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 
 from training.curves import Batch, Curves, rows, write_at_once
 
@@ -55,29 +55,73 @@ def revision() -> str:
 def record(script: str, arguments: Any) -> dict[str, Any]:
     """How this run was made: command, arguments and revision, for the JSON beside its weights.
 
-    Folders are left out: they say where a network was made, not how.
+    Folders are left out: they say where a network was made, not how; of recordings, the names are kept.
     """
     values, changed = {}, []
-    for field in dataclasses.fields(arguments):
-        value = getattr(arguments, field.name)
+    for field, value in _flat(arguments):
         if isinstance(value, Path):
             continue
-        values[field.name] = value
+        if isinstance(value, tuple) and value and isinstance(value[0], Path):
+            values[field.name] = tuple(path.name for path in value)
+        else:
+            values[field.name] = value
         if value != field.default:
             flag = field.name.replace("_", "-")
             if isinstance(value, bool):
                 changed.append(f"--{flag}" if value else f"--no-{flag}")
             else:
-                changed += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
+                kept = values[field.name]
+                changed += [f"--{flag}", *map(str, kept if isinstance(kept, tuple) else (kept,))]
     command = shlex.join(["python", "-m", f"training.{script}", *changed])
     return {"command": command, "arguments": values, "revision": revision()}
+
+
+def _flat(arguments: Any) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
+    """Fields and their values, those of nested arguments among them where any of these was given."""
+    for field in dataclasses.fields(arguments):
+        value = getattr(arguments, field.name)
+        if not dataclasses.is_dataclass(value):
+            yield field, value
+        elif field.default_factory is dataclasses.MISSING or value != field.default_factory():
+            yield from _flat(value)
+
+
+class BestWeights(Callback):
+    """Keeps the weights of the epoch with the lowest value of what is logged as ``name``.
+
+    For small data, which networks begin to learn by heart. Its state travels in the checkpoint.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name, self.value, self.epoch = name, float("inf"), -1
+        self.weights: dict[str, torch.Tensor] = {}
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        value = float(trainer.callback_metrics.get(self.name, torch.tensor(float("inf"))))
+        if value < self.value:
+            self.value, self.epoch = value, trainer.current_epoch
+            self.weights = {name: tensor.detach().cpu().clone() for name, tensor in pl_module.state_dict().items()}
+
+    def restore(self, training: lightning.LightningModule) -> None:
+        """Give the training the best weights, if there were any."""
+        if self.weights:
+            training.load_state_dict(self.weights)
+            print(f"kept epoch {self.epoch + 1}, of the lowest {self.name} ({self.value:.4g})")
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"value": self.value, "epoch": self.epoch, "weights": self.weights}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.value, self.epoch, self.weights = state_dict["value"], state_dict["epoch"], state_dict["weights"]
 
 
 class Run:
     """A training in a folder of its own: ``run.json``, ``metrics.csv`` and ``last.ckpt``, and its trainer.
 
     Begun again with the same arguments, it goes on after its last whole epoch and ends as if it had not been stopped.
-    Several processes hold the same run; only the one that ``is_first`` writes.
+    Several processes hold the same run; only the one that ``is_first`` writes. With ``best``, the name of something
+    that is logged, the weights of the epoch in which that was lowest are kept, not the last ones. ``data`` identifies
+    recordings, which count as arguments.
 
     Raises:
         ValueError: the folder holds a run that was begun with other arguments.
@@ -91,18 +135,23 @@ class Run:
         epochs: int,
         seed: int,
         datapoints: Callable[[Batch], int] = rows,
+        best: str | None = None,
+        data: str | None = None,
     ) -> None:
         self.folder = folder
         self.record = record(script, arguments)
+        if data is not None:
+            self.record["arguments"]["data_sha256"] = data
         self._description = {**self.record, "started": _now(), "resumed": [], "state": "running"}
         self._check_arguments()
         self.curves = Curves(folder / "metrics.csv", datapoints)
+        self.best = None if best is None else BestWeights(best)
         self.trainer = make_trainer(
             folder,
             epochs,
             seed,
             arguments.precision,
-            self.curves,
+            [self.curves, *([] if self.best is None else [self.best])],
             accelerator=arguments.accelerator,
             devices=arguments.devices,
             strategy=arguments.strategy,
@@ -132,6 +181,8 @@ class Run:
         if self.is_first:
             self._write()
         self.trainer.fit(training, datamodule=data, ckpt_path=resume_from(self.folder))
+        if self.best is not None:
+            self.best.restore(training)
 
     def finish(self, metrics: dict[str, Any]) -> dict[str, Any]:
         """Complete ``run.json``; returns the ``training`` entry of the JSON beside the weights."""
@@ -149,7 +200,7 @@ def _now() -> str:
 
 
 def make_trainer(
-    folder: Path, epochs: int, seed: int, precision: str, curves: Curves | None = None, **options: Any
+    folder: Path, epochs: int, seed: int, precision: str, callbacks: Sequence[Callback] = (), **options: Any
 ) -> lightning.Trainer:
     """A trainer that keeps ``metrics.csv`` and ``last.ckpt`` in ``folder`` after each epoch, and shows its progress."""
     lightning.seed_everything(seed, workers=True)
@@ -159,7 +210,11 @@ def make_trainer(
         max_epochs=epochs,
         precision=precision,  # type: ignore[arg-type]
         gradient_clip_val=1.0,
-        callbacks=[checkpoint, curves or Curves(folder / "metrics.csv"), TQDMProgressBar(refresh_rate=20, leave=True)],
+        callbacks=[
+            checkpoint,
+            *(callbacks or [Curves(folder / "metrics.csv")]),
+            TQDMProgressBar(refresh_rate=20, leave=True),
+        ],
         logger=False,
         reload_dataloaders_every_n_epochs=1,
         # The streams deal the training data out themselves; every process measures all of the validation data, so that

@@ -4,8 +4,11 @@ An epoch of a stream is a function of its number alone (through its maze seeds),
 the data that an unbroken one would have met.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,9 +16,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ngo_estimator import se2
-from ngo_sim.drivers import Action
-from ngo_sim.episodes import Episode, record_episode
+from training.domains import MIRRORED_ACTIONS
 from training.worlds import DRAWN, MazeSize, World
+
+if TYPE_CHECKING:
+    from ngo_sim.episodes import Episode
 
 Batch = dict[str, Tensor]
 
@@ -25,6 +30,8 @@ _GROUP = 8
 
 def simulate(world: World, seeds: list[int], frames: int, size: MazeSize = DRAWN) -> Iterator[Episode]:
     """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one size; what is drawn depends on the first."""
+    from ngo_sim.episodes import record_episode  # training on recordings does without the simulators
+
     env = world.make_random(np.random.default_rng(seeds[0]), size)
     try:
         if hasattr(env, "preload"):
@@ -52,10 +59,10 @@ def mirrored(batch: Batch) -> Batch:
     for name, value in batch.items():
         if name in ("earlier", "later", "a", "b", "images"):
             result[name] = value.flip(-2)
-        elif name in ("relative", "poses"):
+        elif name in ("relative", "poses", "twist"):
             result[name] = value * value.new_tensor([1.0, -1.0, -1.0])
         elif name == "action":
-            result[name] = value.new_tensor([Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT])[value]
+            result[name] = value.new_tensor(MIRRORED_ACTIONS)[value]
     return result
 
 
@@ -63,7 +70,8 @@ def reversed_in_time(batch: Batch) -> Batch:
     """Frame pairs (without actions) as a robot meets them that drives the same way backwards."""
     origin = torch.zeros_like(batch["relative"])
     relative = se2.between(batch["relative"], origin)
-    return {**batch, "earlier": batch["later"], "later": batch["earlier"], "relative": relative}
+    told = {"twist": -batch["twist"]} if "twist" in batch else {}
+    return {**batch, "earlier": batch["later"], "later": batch["earlier"], "relative": relative, **told}
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,19 @@
 """Train the local pose network of a world on pairs of frames that worker processes simulate.
 
     python -m training.train_local --world maze2d
+    python -m training.train_local --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. It ends with the network's output calibrated on mazes that it has not seen
-(one bias and scale a component, folded into its normalisation) and its weights written into the estimator's package.
+Run again, it goes on where it was stopped. With `--data`, it learns from recordings, each pair many times over, and
+keeps the epoch that was best on the parts that it does not learn from. It ends with the network's output calibrated on
+mazes (or those parts) that it has not seen, one bias and scale a component, folded into its normalisation, and its
+weights written into the estimator's package.
 """
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import lightning
 import numpy as np
@@ -18,12 +21,15 @@ import torch
 import tyro
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, IterableDataset
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import LOCAL, save_checkpoint
+from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from training import runs
+from training.domains import Domain
+from training.recorded import RecordedArguments, check_source, open_recorded
+from training.recorded_streams import RecordedSteps
 from training.streams import Batch, PairStream, Share, images_of, loader, relative_poses, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
 
@@ -35,16 +41,18 @@ LIKELIHOOD_WEIGHT = 0.1
 class Arguments(runs.TrainerArguments):
     """Settings of a training of the local pose network."""
 
-    world: WorldName
+    world: WorldName | None = None
     """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8
     """Passes of new data."""
     datapoints: int = 200_000
-    """Frame pairs in an epoch, of all processes."""
+    """Frame pairs in an epoch, of all processes; of recordings at most each pair twice."""
     batch_size: int = 256
-    """Frame pairs in a step of the optimiser, in each process."""
+    """Frame pairs in a step of the optimiser, in each process; less on small recordings."""
     learning_rate: float = 2e-3
     """Highest learning rate of the one-cycle schedule."""
     validation_mazes: int = 8
@@ -54,21 +62,24 @@ class Arguments(runs.TrainerArguments):
     seed: int = 0
     """Seed of the initial weights."""
     out: Path = runs.WEIGHTS
-    """Folder that gets WORLD/local_pose_network.safetensors."""
+    """Folder that gets NAME/local_pose_network.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of checkpoints and logs."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
 
 
 class LocalTraining(lightning.LightningModule):
     """The losses of single steps, ``step_losses``."""
 
-    def __init__(self, arguments: Arguments, world: World, network: LocalPoseNetwork) -> None:
+    def __init__(self, arguments: Arguments, network: LocalPoseNetwork) -> None:
         super().__init__()
-        self.arguments, self.world, self.network = arguments, world, network
+        self.arguments, self.network = arguments, network
         self.validation: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch.get("action"))
+        mean, log_std = estimated(self.network, batch)[:2]
         pose_loss, likelihood = step_losses(mean, log_std, batch["relative"], self.network.relative_std)
         self.log_dict(
             {"pose_loss": pose_loss, "likelihood": likelihood},
@@ -81,12 +92,14 @@ class LocalTraining(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, _: int) -> None:
         with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
-            mean, log_std, _ = self.network(batch["earlier"], batch["later"], batch.get("action"))
+            mean, log_std = estimated(self.network, batch)[:2]
         self.validation.append((mean, log_std, batch["relative"]))
 
     def on_validation_epoch_end(self) -> None:
         mean, log_std, truth = (torch.cat(parts) for parts in zip(*self.validation, strict=True))
         self.validation.clear()
+        loss = float(step_losses(mean, log_std, truth, self.network.relative_std)[0])
+        self.log("validation_loss", loss, on_epoch=True, sync_dist=True)
         metrics = {f"validation_{k}": v for k, v in step_metrics(mean, log_std, truth).items()}
         self.log_dict(metrics, prog_bar=True, sync_dist=True)
 
@@ -95,26 +108,60 @@ class LocalTraining(lightning.LightningModule):
         return runs.one_cycle(optimizer, self.trainer)
 
 
-class _Data(lightning.LightningDataModule):
+class Steps(Protocol):
+    """Where the pairs of frames come from."""
+
+    def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
+        """Those of an epoch, for one of the processes that train together."""
+
+    def validation(self) -> list[Batch]:
+        """Those that each epoch is measured on."""
+
+    def unseen(self) -> list[Batch]:
+        """Those that the network's output is calibrated with."""
+
+    def typical(self) -> Tensor:
+        """Relative poses ``(n, 3)`` like those of the training."""
+
+
+class SimulatedSteps:
+    """Pairs from the mazes of a world, each used once."""
+
     def __init__(self, arguments: Arguments, world: World) -> None:
-        super().__init__()
         self.arguments, self.world = arguments, world
         self.fixed: list[Batch] = []
 
+    def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
+        return PairStream(self.world, TRAIN_SEEDS, epoch, self.arguments.datapoints, self.arguments.batch_size, share)
+
+    def validation(self) -> list[Batch]:
+        if not self.fixed:
+            self.fixed = episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
+        return self.fixed
+
+    def unseen(self) -> list[Batch]:
+        return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-64:]))
+
+    def typical(self) -> Tensor:
+        return torch.cat([p["relative"] for p in episode_pairs(self.world, list(TRAIN_SEEDS[:8]))])
+
+
+class _Data(lightning.LightningDataModule):
+    def __init__(self, arguments: Arguments, steps: Steps) -> None:
+        super().__init__()
+        self.arguments, self.steps = arguments, steps
+
     def train_dataloader(self) -> DataLoader[Batch]:
         assert self.trainer is not None
-        a = self.arguments
-        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
-        return loader(PairStream(self.world, TRAIN_SEEDS, epoch, a.datapoints, a.batch_size, share), a.workers)
+        share = Share(self.trainer.global_rank, self.trainer.world_size)
+        return loader(self.steps.pairs(self.trainer.current_epoch, share), self.arguments.workers)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
 
     def validation(self) -> list[Batch]:
         """The batches of the validation split, made when they are first needed."""
-        if not self.fixed:
-            self.fixed = episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
-        return self.fixed
+        return self.steps.validation()
 
 
 def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
@@ -127,6 +174,14 @@ def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
             pairs["action"] = torch.from_numpy(episode.actions).long()
         result.append(pairs)
     return result
+
+
+def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    """What a network makes of a batch of pairs, from what it is told of each step."""
+    estimate: tuple[Tensor, Tensor, Tensor] = network(
+        batch["earlier"], batch["later"], batch.get("action"), batch.get("twist")
+    )
+    return estimate
 
 
 def step_losses(mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,7 +215,7 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
     The deviations get a scale each that makes their mean square that of the errors.
     """
     network = network.eval()
-    parts = [network(p["earlier"], p["later"], p.get("action")) for p in pairs]
+    parts = [estimated(network, p) for p in pairs]
     estimates, log_std = (torch.cat([part[k] for part in parts]).double() for k in (0, 1))
     truth = torch.cat([p["relative"] for p in pairs]).double()
     mean, std = list(network.config.relative_mean), list(network.config.relative_std)
@@ -183,39 +238,82 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
-    world = world_named(arguments.world)
-    run = runs.Run(arguments.runs / world.name / "local", "train_local", arguments, arguments.epochs, arguments.seed)
-    some = torch.cat([p["relative"] for p in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
-    config = LocalPoseConfig(
-        image=world.image,
-        width=arguments.width,
-        actions=world.actions,
-        period_s=world.period_s,
-        relative_mean=(float(some[:, 0].mean()), 0.0, 0.0),
-        relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
-        symmetric=True,
-        mirrored_actions=world.mirrored_actions,
+    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
+    steps: Steps
+    if recorded is None:
+        domain: Domain = world_named(str(arguments.world))
+        steps = SimulatedSteps(arguments, world_named(str(arguments.world)))
+    else:
+        domain = recorded.domain
+        steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
+    run = runs.Run(
+        arguments.runs / domain.name / "local",
+        "train_local",
+        arguments,
+        arguments.epochs,
+        arguments.seed,
+        best=None if recorded is None else "validation_loss",
+        data=None if recorded is None else recorded.sha256,
     )
-    training = LocalTraining(arguments, world, LocalPoseNetwork(config))
-    data = _Data(arguments, world)
+    network, begun = initial_network(arguments, domain, steps)
+    training = LocalTraining(arguments, network)
+    data = _Data(arguments, steps)
     run.fit(training, data)
     if not run.is_first:
         return {}
     training.cpu()
-    unseen = episode_pairs(world, list(OPTIMIZER_TRAIN_SEEDS[-64:]))
-    final = LocalPoseNetwork(calibrated(training.network, unseen)).eval()
+    final = LocalPoseNetwork(calibrated(training.network, steps.unseen())).eval()
     final.load_state_dict(training.network.state_dict())
     metrics = measure(final, data.validation())
-    details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
-    save_checkpoint(arguments.out / world.name / f"{LOCAL}.safetensors", final, LOCAL, world.name, details)
+    about = {} if recorded is None else {"data": recorded.about}
+    details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
+    save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", final, LOCAL, domain.name, details)
     print("validation", {name: round(value, 5) for name, value in metrics.items()})
     return metrics
+
+
+def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple[LocalPoseNetwork, dict[str, str]]:
+    """A fresh network, or that of the weights to begin with, and what is to be said of them in the JSON.
+
+    Raises ``ValueError`` where those weights are told other things of a step than the recordings tell.
+    """
+    folder = arguments.recordings.from_weights
+    if folder is not None:
+        network, description = load_local(folder)
+        config = network.config
+        if (config.actions, config.twist) != (domain.actions, domain.twist):
+            raise ValueError(
+                f"{folder} takes {_told(config.actions, config.twist)}, the recordings have "
+                f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave them out)"
+            )
+        changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s))
+        changed.load_state_dict(network.state_dict())
+        return changed, {"began_with_sha256": description["sha256"]}
+    some = steps.typical()
+    config = LocalPoseConfig(
+        image=domain.image,
+        width=arguments.width,
+        actions=domain.actions,
+        period_s=domain.period_s,
+        relative_mean=(float(some[:, 0].mean()), 0.0, 0.0),
+        # A robot that never moves sideways gives no scale for it.
+        relative_std=(float(some[:, 0].std()), max(float(some[:, 1].std()), 1e-4), max(float(some[:, 2].std()), 1e-4)),
+        symmetric=domain.mirrors,
+        mirrored_actions=domain.mirrored_actions,
+        twist=domain.twist,
+        twist_scale=domain.twist_scale,
+    )
+    return LocalPoseNetwork(config), {}
+
+
+def _told(actions: int, twist: bool) -> str:
+    return "actions" if actions else "velocities" if twist else "images alone"
 
 
 @torch.no_grad()
 def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
     """``step_metrics`` of a network over episodes."""
-    parts = [network(p["earlier"], p["later"], p.get("action"))[:2] for p in pairs]
+    parts = [estimated(network, p)[:2] for p in pairs]
     truth = torch.cat([p["relative"] for p in pairs])
     return step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
 

@@ -1,8 +1,11 @@
 """Train the pose aggregation and the Neural Graph Optimizer on whole trajectories of the feature store.
 
     python -m training.train_optimizer --world maze2d
+    python -m training.train_optimizer --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. It ends with the weights written into the estimator's package.
+Run again, it goes on where it was stopped. Trained on recordings, an optimizer that does not correct the trajectories
+of the validation part is replaced by one that closes no loops and leaves the odometry as it is. It ends with the
+weights written into the estimator's package.
 """
 
 from dataclasses import dataclass, field
@@ -18,15 +21,17 @@ from torch.nn.functional import huber_loss
 from torch.utils.data import DataLoader
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_place, save_checkpoint
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
+from training.domains import Domain
 from training.featurise import check_networks
+from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded
 from training.streams import Batch, Share
 from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, fixes_of, loops_of
-from training.worlds import World, WorldName, world_named
+from training.worlds import WorldName, world_named
 
 POSITION_SCALE = 0.1  # corridor widths: errors below count by their square, so that large ones do not rule the rest
 HEADING_SCALE = 0.02  # rad
@@ -38,8 +43,10 @@ RELATIVE_WEIGHT = 0.05
 class Arguments(runs.TrainerArguments):
     """Settings of a training of the optimizer."""
 
-    world: WorldName
+    world: WorldName | None = None
     """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
     form: Literal["loops", "gauss_newton", "paper"] = "loops"
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
     iterations: int = 5
@@ -67,11 +74,14 @@ class Arguments(runs.TrainerArguments):
     precision: Literal["bf16-mixed", "32-true"] = field(default="32-true", kw_only=True)
     """Arithmetic of the network; what closes loops is in float64 always."""
     weights: Path = runs.WEIGHTS
-    """Folder with the world's other networks."""
+    """Folder with NAME's other networks."""
     out: Path = runs.WEIGHTS
-    """Folder that gets WORLD/neural_graph_optimizer.safetensors."""
+    """Folder that gets NAME/neural_graph_optimizer.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
 
 
 def trajectory_loss(meta_relative: list[Tensor], truth: Tensor, correction_std: Tensor, scale_m: float) -> Tensor:
@@ -156,23 +166,24 @@ class _Data(lightning.LightningDataModule):
         assert self.trainer is not None
         a, trainer = self.arguments, self.trainer
         share = Share(trainer.global_rank, trainer.world_size)
-        data = RandomStretches(self.train, a.steps, a.batch_size, a.seed, trainer.current_epoch, share)
+        batch_size = a.batch_size if a.world is not None else min(a.batch_size, len(self.train))
+        data = RandomStretches(self.train, a.steps, batch_size, a.seed, trainer.current_epoch, share)
         return DataLoader(data, batch_size=None)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return DataLoader(self.fixed, batch_size=None)  # type: ignore[arg-type]
 
 
-def config_of(arguments: Arguments, world: World, scale: tuple[float, float, float]) -> NeuralGraphOptimizerConfig:
+def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, float]) -> NeuralGraphOptimizerConfig:
     """What the optimizer is made of; ``scale`` is the typical error of the odometry over a meta-pose."""
-    local, _ = load_local(arguments.weights / world.name, world.name)
+    local, _ = load_local(arguments.weights / domain.name, domain.name)
     aggregation = PoseAggregationConfig(
         motion_feature_size=local.config.feature_size, width=arguments.width, relative_std=local.config.relative_std
     )
     changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale}
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
-    search = LoopSearch(per_pose=arguments.loops_per_pose, most=arguments.max_loops, views=world.loop_views)
+    search = LoopSearch(per_pose=arguments.loops_per_pose, most=arguments.max_loops, views=domain.loop_views)
     return NeuralGraphOptimizerConfig(
         aggregation=aggregation,
         search=search,
@@ -185,37 +196,67 @@ def config_of(arguments: Arguments, world: World, scale: tuple[float, float, flo
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    world = world_named(arguments.world)
-    folder = arguments.weights / world.name
-    _, local_description = load_local(folder, world.name)
-    place, place_description = load_place(folder, world.name)
-    features = arguments.runs / world.name / "features"
-    stores = [features / "train", *(features / f"validation_{table}" for table in world.tables)]
+    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
+    domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
+    folder = arguments.weights / domain.name
+    _, local_description = load_local(folder, domain.name)
+    place, place_description = load_place(folder, domain.name)
+    about: dict[str, Any] = {"place_encoder_sha256": place_description["sha256"]}
+    if recorded is not None:
+        about["data"] = recorded.about
+    if NO_LOOPS in place_description:
+        return _without_loops(arguments, domain, about, str(place_description[NO_LOOPS]))
+    features = arguments.runs / domain.name / "features"
+    stores = [features / "train", *(features / name for name in domain.validation_stores)]
     for store in stores:
         check_networks(store, local_description, place_description)
-    search = config_of(arguments, world, (1.0, 1.0, 1.0)).search if arguments.form != "paper" else None
+    began = arguments.recordings.from_weights
+    optimizer = None if began is None else load_optimizer(began)[0].requires_grad_(True)
+    config = config_of(arguments, domain, (1.0, 1.0, 1.0)) if optimizer is None else optimizer.config
+    search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
     train = StoredTrajectories(stores[:1], search, place.pair_head, block, arguments.compass)
     validation = StoredTrajectories(stores[1:], search, place.pair_head, block, arguments.compass)
     form = arguments.form + ("-compass" if arguments.compass else "")
-    name = f"optimizer-{form}-{arguments.iterations}-seed{arguments.seed}"
-    run = runs.Run(arguments.runs / world.name / name, "train_optimizer", arguments, arguments.epochs, arguments.seed)
-    optimizer = NeuralGraphOptimizer(config_of(arguments, world, correction_scale(train)))
-    training = OptimizerTraining(arguments, optimizer, world.block_m)
+    run = runs.Run(
+        arguments.runs / domain.name / f"optimizer-{form}-{arguments.iterations}-seed{arguments.seed}",
+        "train_optimizer",
+        arguments,
+        arguments.epochs,
+        arguments.seed,
+        best=None if recorded is None else "corrected_m",
+        data=None if recorded is None else recorded.sha256,
+    )
+    if optimizer is None:
+        optimizer = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train)))
+    training = OptimizerTraining(arguments, optimizer, domain.block_m)
     data = _Data(arguments, train, validation)
     run.fit(training, data)
     metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
     if not run.is_first:
         return {}
-    details = {
-        "place_encoder_sha256": place_description["sha256"],
-        "training": run.finish(metrics),
-        "metrics": {"validation": metrics},
-    }
-    path = arguments.out / world.name / f"{OPTIMIZER}.safetensors"
-    save_checkpoint(path, optimizer.cpu(), OPTIMIZER, world.name, details)
+    details = {**about, "training": run.finish(metrics), "metrics": {"validation": metrics}}
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
+    if recorded is not None and metrics["corrected_m"] >= metrics["odometry_m"]:
+        why = (
+            f"on the validation part the corrected path is no better ({metrics['corrected_m']:.3f} m) than the "
+            f"odometry ({metrics['odometry_m']:.3f} m): record more, with more places seen again"
+        )
+        return {**metrics, **_without_loops(arguments, domain, about, why)}
+    path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
+    save_checkpoint(path, optimizer.cpu(), OPTIMIZER, domain.name, details)
     return metrics
+
+
+def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], why: str) -> dict[str, float]:
+    """Write an optimizer that returns the odometry: a fresh one of the paper's form."""
+    print(f"no loops will be closed: {why}")
+    aggregation = config_of(arguments, domain, (1.0, 1.0, 1.0)).aggregation
+    optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig.paper_form(aggregation, iterations=1))
+    details = {NO_LOOPS: why, **about, "training": runs.record("train_optimizer", arguments), "metrics": {}}
+    path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
+    save_checkpoint(path, optimizer, OPTIMIZER, domain.name, details)
+    return {}
 
 
 if __name__ == "__main__":

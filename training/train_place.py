@@ -1,25 +1,31 @@
 """Train the place encoder and its pair head on pairs of frames that show one place, well apart in time.
 
     python -m training.train_place --world maze2d
+    python -m training.train_place --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. It ends with the weights written into the estimator's package.
+Run again, it goes on where it was stopped. Recordings in which too few places are seen twice teach nothing about
+places: then it says so and writes the encoder untrained, and the optimizer will close no loops. It ends with the
+weights written into the estimator's package.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import lightning
 import torch
 import tyro
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, IterableDataset
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import PLACE, PlaceNetworks, save_checkpoint
+from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
 from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
+from training.domains import Domain
+from training.recorded import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded
+from training.recorded_streams import RecordedPlaces
 from training.streams import Batch, PlaceStream, Share, loader
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
 
@@ -28,16 +34,18 @@ from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, wor
 class Arguments(runs.TrainerArguments):
     """Settings of a training of the place encoder."""
 
-    world: WorldName
+    world: WorldName | None = None
     """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 10
     """Passes of new data."""
     batches: int = 256
-    """Batches in an epoch, of all processes."""
+    """Batches in an epoch, of all processes; of recordings with few places less."""
     pairs_a_maze: int = 24
-    """Pairs of frames from each of the 8 mazes of a batch."""
+    """Pairs of frames from each of the 8 mazes of a batch; of recordings 8 times as many from one."""
     learning_rate: float = 1.5e-3
     """Highest learning rate of the one-cycle schedule."""
     validation_batches: int = 16
@@ -47,9 +55,12 @@ class Arguments(runs.TrainerArguments):
     seed: int = 0
     """Seed of the initial weights."""
     out: Path = runs.WEIGHTS
-    """Folder that gets WORLD/place_encoder.safetensors."""
+    """Folder that gets NAME/place_encoder.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of checkpoints and logs."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
 
 
 class PlaceTraining(lightning.LightningModule):
@@ -60,9 +71,9 @@ class PlaceTraining(lightning.LightningModule):
 
     BRIGHTNESS = 0.15
 
-    def __init__(self, arguments: Arguments, world: World, networks: PlaceNetworks) -> None:
+    def __init__(self, arguments: Arguments, domain: Domain, networks: PlaceNetworks) -> None:
         super().__init__()
-        self.arguments, self.world, self.networks = arguments, world, networks
+        self.arguments, self.domain, self.networks = arguments, domain, networks
         self.log_temperature = nn.Parameter(torch.tensor(2.5))
 
     def forward(self, batch: Batch, augment: bool) -> dict[str, Tensor]:
@@ -78,7 +89,7 @@ class PlaceTraining(lightning.LightningModule):
         pose_a, pose_b = batch["poses"].unbind(1)
         ambiguous = (
             (batch["maze"][:, None] == batch["maze"])
-            & (torch.cdist(pose_a[:, :2], pose_b[:, :2]) < 2.0 * self.world.place_radius_m)
+            & (torch.cdist(pose_a[:, :2], pose_b[:, :2]) < 2.0 * self.domain.place_radius_m)
             & ~torch.eye(len(pose_a), dtype=torch.bool, device=pose_a.device)
         )
         logits = (similarity * self.log_temperature.clamp(max=4.0).exp()).masked_fill(ambiguous, -1e4)
@@ -134,49 +145,114 @@ class PlaceTraining(lightning.LightningModule):
         return runs.one_cycle(optimizer, self.trainer)
 
 
-class _Data(lightning.LightningDataModule):
+class Places(Protocol):
+    """Where the pairs of frames come from."""
+
+    def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
+        """Those of an epoch, for one of the processes that train together."""
+
+    def validation(self) -> list[Batch]:
+        """Those that each epoch is measured on."""
+
+
+class SimulatedPlaces:
+    """Pairs from the mazes of a world."""
+
     def __init__(self, arguments: Arguments, world: World) -> None:
-        super().__init__()
         self.arguments, self.world = arguments, world
         self.fixed: list[Batch] = []
 
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        a = self.arguments
+    def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
         # A stream of its own: the local network's mazes come from the front of the range.
         seeds = TRAIN_SEEDS[len(TRAIN_SEEDS) // 2 :]
-        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
-        return loader(PlaceStream(self.world, seeds, epoch, a.batches, a.pairs_a_maze, share), a.workers)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
+        return PlaceStream(self.world, seeds, epoch, self.arguments.batches, self.arguments.pairs_a_maze, share)
 
     def validation(self) -> list[Batch]:
-        """The batches of the validation split, made when they are first needed."""
         if not self.fixed:
             a = self.arguments
             self.fixed = list(PlaceStream(self.world, VALIDATION_SEEDS, 0, a.validation_batches, a.pairs_a_maze))
         return self.fixed
 
 
+class _Data(lightning.LightningDataModule):
+    def __init__(self, arguments: Arguments, places: Places) -> None:
+        super().__init__()
+        self.arguments, self.places = arguments, places
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        assert self.trainer is not None
+        share = Share(self.trainer.global_rank, self.trainer.world_size)
+        return loader(self.places.pairs(self.trainer.current_epoch, share), self.arguments.workers)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
+
+    def validation(self) -> list[Batch]:
+        """The batches of the validation split, made when they are first needed."""
+        return self.places.validation()
+
+
 def main(arguments: Arguments) -> dict[str, float]:
-    """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    world = world_named(arguments.world)
-    run = runs.Run(arguments.runs / world.name / "place", "train_place", arguments, arguments.epochs, arguments.seed)
-    config = PlaceConfig(image=world.image, width=arguments.width, offset_scale_m=world.place_radius_m)
-    training = PlaceTraining(arguments, world, PlaceNetworks(config))
-    data = _Data(arguments, world)
+    """Train, write the weights, and return the validation metrics (in the first process, which does so).
+
+    There are none where recordings hold too few places.
+    """
+    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
+    places: Places
+    if recorded is None:
+        domain: Domain = world_named(str(arguments.world))
+        places = SimulatedPlaces(arguments, world_named(str(arguments.world)))
+    else:
+        domain = recorded.domain
+        found = RecordedPlaces(recorded, arguments.batches, 8 * arguments.pairs_a_maze, arguments.validation_batches)
+        places = found
+        if found.too_few is not None:
+            _write_untrained(arguments, recorded, found.too_few)
+            return {}
+    run = runs.Run(
+        arguments.runs / domain.name / "place",
+        "train_place",
+        arguments,
+        arguments.epochs,
+        arguments.seed,
+        best=None if recorded is None else "validation_loss",
+        data=None if recorded is None else recorded.sha256,
+    )
+    networks, begun = initial_networks(arguments, domain)
+    training = PlaceTraining(arguments, domain, networks)
+    data = _Data(arguments, places)
     run.fit(training, data)
     if not run.is_first:
         return {}
     training.cpu().eval()
     with torch.no_grad():
         figures = [training(batch, augment=False) for batch in data.validation()]
-    metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]}
-    details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
-    save_checkpoint(arguments.out / world.name / f"{PLACE}.safetensors", training.networks, PLACE, world.name, details)
+    metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]} if figures else {}
+    about = {} if recorded is None else {"data": recorded.about}
+    details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
+    path = arguments.out / domain.name / f"{PLACE}.safetensors"
+    save_checkpoint(path, training.networks, PLACE, domain.name, details)
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics
+
+
+def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetworks, dict[str, str]]:
+    """Fresh networks, or those of the weights to begin with, and what is to be said of them in the JSON."""
+    if arguments.recordings.from_weights is None:
+        config = PlaceConfig(image=domain.image, width=arguments.width, offset_scale_m=domain.place_radius_m)
+        return PlaceNetworks(config), {}
+    networks, description = load_place(arguments.recordings.from_weights)
+    return networks.requires_grad_(True), {"began_with_sha256": description["sha256"]}
+
+
+def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> None:
+    """The encoder as it was, which the estimator needs to run, and which tells the optimizer to close no loops."""
+    print(f"places are not learned: {why}")
+    networks, begun = initial_networks(arguments, recorded.domain)
+    training = {**runs.record("train_place", arguments), **begun}
+    details = {NO_LOOPS: why, "training": training, "data": recorded.about, "metrics": {}}
+    path = arguments.out / recorded.domain.name / f"{PLACE}.safetensors"
+    save_checkpoint(path, networks, PLACE, recorded.domain.name, details)
 
 
 if __name__ == "__main__":

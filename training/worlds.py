@@ -1,16 +1,20 @@
-"""The simulated worlds as training data: which mazes, which seeds, which driver."""
+"""The simulated worlds as training data: which mazes, which seeds, which driver.
+
+The simulators are loaded where an environment is made: training on recordings does without them.
+"""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import gymnasium
 import numpy as np
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
-from ngo_estimator.images import ImageFormat
-from ngo_sim.drivers import Action
-from ngo_sim.maze2d import Maze2D, Maze2DConfig
-from training.scans import ScannedMaze
+from training.domains import Domain
+
+if TYPE_CHECKING:
+    import gymnasium
 
 WorldName = Literal["maze2d", "maze3d", "scan"]
 
@@ -37,33 +41,24 @@ class MazeSize:
 DRAWN = MazeSize()
 
 
-@dataclass(frozen=True)
-class World:
+@dataclass(frozen=True, kw_only=True)
+class World(Domain):
     """A simulated world.
 
-    ``block_m`` is the corridor width, ``actions`` the number of discrete actions (0: networks see images alone),
-    ``mirrored_actions`` what each of them becomes in a mirror, ``episode_frames`` the length of the
-    paper's trajectories, ``rows`` and ``extra_openings`` the ranges (both ends included) that training mazes are
-    drawn from, ``heading_limit_rad`` how far two frames of one place may be turned against each other,
-    ``loop_views`` between how many pairs of frames a loop is measured. ``tables`` names the kinds of mazes that results
-    are given for; ``reverses`` says that robots of its kind may drive backwards, which no driver here does.
+    ``block_m`` is the corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and
+    ``extra_openings`` the ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of
+    mazes that results are given for. No driver here drives backwards, whether the world ``reverses`` or not.
     """
 
-    name: str
-    image: ImageFormat
     driver: str
-    block_m: float
-    period_s: float
     episode_frames: int
     rows: tuple[int, int]
     extra_openings: tuple[int, int]
-    place_radius_m: float
-    heading_limit_rad: float
-    loop_views: int
     tables: dict[str, MazeSize]
-    reverses: bool = False
-    actions: int = 3
-    mirrored_actions: tuple[int, ...] = (Action.FORWARD, Action.TURN_RIGHT, Action.TURN_LEFT)
+
+    @property
+    def validation_stores(self) -> tuple[str, ...]:
+        return tuple(f"validation_{table}" for table in self.tables)
 
     def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size, by default the simulator's own size."""
@@ -71,8 +66,12 @@ class World:
         if extra_openings is not None:
             changes["extra_openings"] = extra_openings
         if self.name == "maze2d":
+            from ngo_sim.maze2d import Maze2D, Maze2DConfig
+
             return Maze2D(Maze2DConfig(**changes))
         if self.name == "scan":
+            from training.scans import ScannedMaze
+
             return ScannedMaze(self.image, changes)
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 

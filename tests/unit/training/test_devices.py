@@ -40,7 +40,7 @@ def images(*shape: int) -> torch.Tensor:
 
 
 def test_the_check_fails_where_devices_meet(weights: Path) -> None:
-    module = train_local.LocalTraining(train_local.Arguments("maze3d"), WORLD, load_local(weights)[0])
+    module = train_local.LocalTraining(train_local.Arguments("maze3d"), load_local(weights)[0])
     batch = {"earlier": images(2), "later": images(2), "action": torch.zeros(2).long(), "relative": torch.zeros(2, 3)}
     module.to("meta")
     with pytest.raises(RuntimeError, match="device"):
@@ -48,7 +48,7 @@ def test_the_check_fails_where_devices_meet(weights: Path) -> None:
 
 
 def test_the_local_networks_loss_stays_on_its_device(weights: Path) -> None:
-    module = train_local.LocalTraining(train_local.Arguments("maze3d"), WORLD, load_local(weights)[0].requires_grad_())
+    module = train_local.LocalTraining(train_local.Arguments("maze3d"), load_local(weights)[0].requires_grad_())
     batch = {
         "earlier": images(BATCH),
         "later": images(BATCH),

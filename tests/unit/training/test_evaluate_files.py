@@ -122,5 +122,5 @@ def test_the_command_line_says_in_one_line_what_is_wrong(
 def test_a_world_and_files_exclude_each_other() -> None:
     file = Path("a.tum")
     for given in ({}, {"world": "maze2d", "estimate": (file,)}, {"estimate": (file,)}, {"truth": file}):
-        with pytest.raises(ValueError, match="either --world, or --estimate"):
+        with pytest.raises(ValueError, match="one of --world, --data FILES, or --estimate"):
             Arguments(**given)  # type: ignore[arg-type]

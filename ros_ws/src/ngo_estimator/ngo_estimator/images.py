@@ -28,6 +28,8 @@ class ImageFormat:
 
     Depth d enters a network as ``depth_gain_m / (depth_softening_m + d)``: near walls, which say most about motion, get
     most of the range.
+
+    ``reduction`` k says that the sensor's pictures are k times as high and wide, and made smaller by ``reduced``.
     """
 
     height: int
@@ -37,6 +39,7 @@ class ImageFormat:
     field_of_view_deg: float | None = None
     depth_gain_m: float = 0.6
     depth_softening_m: float = 0.3
+    reduction: int = 1
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 8:
@@ -51,6 +54,8 @@ class ImageFormat:
                 f"depth_gain_m, depth_softening_m are {self.depth_gain_m}, {self.depth_softening_m}; "
                 "expected positive distances"
             )
+        if self.reduction < 1 or (self.reduction > 1 and self.is_scan):
+            raise ValueError(f"reduction is {self.reduction}; expected a whole number from 1 on, and 1 for scans")
         if self.field_of_view_deg is not None:
             if (self.height, self.channels, self.dtype) != (1, 1, "float32"):
                 raise ValueError(f"a scan is {self.shape} of {self.dtype}; expected (1, rays, 1) of float32")
@@ -109,6 +114,23 @@ def to_network(images: Tensor, image: ImageFormat) -> Tensor:
     if image.channels == 1:
         return depth.movedim(-1, -3)
     return torch.cat((images[..., :-1].float() - 0.5, depth - 0.5), dim=-1).movedim(-1, -3)
+
+
+def reduced(picture: np.ndarray, factor: int) -> np.ndarray:
+    """A picture ``(height, width, channels)`` made smaller: ``(height // factor, width // factor, channels)``.
+
+    Colours are the means of ``factor`` x ``factor`` pixels, depths those of the middle of them (a mean over an edge would
+    be a distance at which nothing is). Rows and columns that are left over, at the bottom and on the right, are dropped.
+    """
+    height, width, channels = picture.shape
+    rows, columns = height // factor, width // factor
+    blocks = picture[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor, channels)
+    middle = blocks[:, factor // 2, :, factor // 2]
+    if picture.dtype == np.uint8:
+        total = blocks.sum(axis=(1, 3), dtype=np.uint32)
+        return ((total + factor * factor // 2) // (factor * factor)).astype(np.uint8)
+    colours = blocks[..., :-1].mean(axis=(1, 3), dtype=np.float32)
+    return np.concatenate((colours, middle[..., -1:]), axis=-1)
 
 
 def scan_image(

@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ngo_estimator.images import ImageFormat, scan_image
+from ngo_estimator.images import ImageFormat, reduced, scan_image
 
 
 class ScanGeometry(Protocol):
@@ -51,7 +51,12 @@ def observation(
         return scan_image(image_format, ranges, left + scan_yaw_rad, -scan.angle_increment_rad, *limits)
     if scan is not None:
         raise ValueError(f"image is a laser scan of {image.shape[1]} rays; expected {_format_words(image_format)}")
-    if image.shape != image_format.shape or image.dtype != np.dtype(image_format.dtype):
+    factor = image_format.reduction
+    if factor > 1 and image.dtype == np.dtype(image_format.dtype):
+        height, width, channels = image.shape
+        if (height // factor, width // factor, channels) == image_format.shape:
+            return reduced(image, factor)
+    if factor > 1 or image.shape != image_format.shape or image.dtype != np.dtype(image_format.dtype):
         raise ValueError(f"image is {_words(image)}; expected {_format_words(image_format)}")
     return image
 
@@ -62,4 +67,6 @@ def _words(image: np.ndarray) -> str:
 
 
 def _format_words(image_format: ImageFormat) -> str:
-    return f"{image_format.width} x {image_format.height} pixels of {image_format.channels} x {image_format.dtype}"
+    factor = image_format.reduction
+    size = f"{factor * image_format.width} x {factor * image_format.height} pixels"
+    return f"{size} of {image_format.channels} x {image_format.dtype}"

@@ -1,0 +1,40 @@
+"""What a training must know of where its data come from, a simulated world or a robot's recordings."""
+
+from dataclasses import dataclass
+
+from ngo_estimator.images import ImageFormat
+
+MIRRORED_ACTIONS = (0, 2, 1)
+"""What the actions of ngo_msgs/DiscreteAction become in a mirror: forward stays, left and right change places."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Domain:
+    """The sensor, the robot and the scale of its surroundings.
+
+    ``actions`` is the number of discrete actions (0: networks see images alone), ``mirrored_actions`` what each of them
+    becomes in a mirror, ``block_m`` the length that errors of positions are measured by (a corridor's width).
+    ``place_radius_m`` and ``heading_limit_rad`` say how far two frames of one place may be apart and turned against
+    each other, ``loop_views`` between how many pairs of frames a loop is measured. ``reverses`` says that the robot may
+    drive backwards. With ``twist`` the networks are told the velocity of each step, which they divide by
+    ``twist_scale`` (m/s, m/s, rad/s). ``mirrors`` says that a frame seen in a mirror is a frame that could be.
+    """
+
+    name: str
+    image: ImageFormat
+    period_s: float
+    block_m: float
+    place_radius_m: float
+    heading_limit_rad: float
+    loop_views: int
+    reverses: bool = False
+    actions: int = 3
+    mirrored_actions: tuple[int, ...] = MIRRORED_ACTIONS
+    twist: bool = False
+    twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mirrors: bool = True
+
+    @property
+    def validation_stores(self) -> tuple[str, ...]:
+        """Names of the feature stores that the optimizer is measured on while it trains."""
+        return ("validation",)
