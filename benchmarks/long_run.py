@@ -54,7 +54,7 @@ class Arguments:
     plot: Path = ROOT / "docs" / "images" / "online_100000.png"
     """Picture of the curves."""
     cache: Path = CACHE
-    """Folder for the drive, which is made once."""
+    """Folder for the drive, which is made once, and the curves as JSON."""
 
     def __post_init__(self) -> None:
         if self.every < 8 or self.frames % self.every or self.frames < 20 * self.every:
@@ -191,6 +191,8 @@ def save_plot(path: Path, found: list[Point], title: str) -> None:
     for axes in (above, middle, below):
         axes.grid(color="#dddddd", linewidth=0.5)
         axes.legend(frameon=False, fontsize=9)
+    for axis_formatter in (below.yaxis.set_major_formatter, below.yaxis.set_minor_formatter):
+        axis_formatter("{x:g}")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110, bbox_inches="tight")
 
@@ -203,6 +205,7 @@ def main(arguments: Arguments) -> int:
     """Drive, plot, print everything as one line of JSON; return the exit code."""
     found = in_process(two_cores()[0], points, arguments)
     result = summary(found)
+    (arguments.cache / "long_run.json").write_text(json.dumps([asdict(point) for point in found]))
     save_plot(arguments.plot, found, f"{arguments.world}, {arguments.frames:,} frames on one core")
     print(json.dumps(result))
     return 0 if result["cpu_ratio"] <= LONGEST_RATIO and result["memory_growth_mb"] <= MOST_GROWTH_MB else 1
