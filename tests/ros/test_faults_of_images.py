@@ -214,27 +214,29 @@ def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: d
         ngo.wait_for_log("ready")
         step = 0
 
-        def drive_until_heard() -> None:
+        def drive_until_heard(after_ns: int) -> int:
+            """Until there are poses of an odometry that began later; returns when it did."""
+
+            def origin_ns() -> int:
+                return to_ns(relative_poses[-1].origin_stamp) if relative_poses else 0
+
             def heard() -> bool:
                 nonlocal step
                 stamp = to_time(RUN_NS + step * STEP_NS)
                 actions.publish(DiscreteAction(header=Image().header.__class__(stamp=stamp), action=0))
                 step += 1
                 images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
-                return len(relative_poses) > 3 and len(poses) > 3
+                return origin_ns() > after_ns and bool(poses) and to_ns(poses[-1].header.stamp) > origin_ns()
 
-            relative_poses.clear()
-            poses.clear()
             probe.spin_until(heard, "relative poses")
+            return origin_ns()
 
         with NodeProcess("ngo_estimator", "local_node", local, arguments) as process:
-            drive_until_heard()
-            origin_ns = to_ns(relative_poses[0].origin_stamp)
+            first_ns = drive_until_heard(0)
             process.send(signal.SIGKILL)
             process.wait()
         stack.enter_context(NodeProcess("ngo_estimator", "local_node", local, arguments))
-        drive_until_heard()
-        assert to_ns(relative_poses[0].origin_stamp) > origin_ns
+        assert drive_until_heard(first_ns) > first_ns
         ngo.wait_for_log("the relative poses have a new origin: their source restarted")
         assert "only the first that was heard" not in ngo.log
     probe.close()
