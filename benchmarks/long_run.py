@@ -22,6 +22,7 @@ import torch
 import tyro
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.drives import CACHE, drive_of
 from benchmarks.pinned import in_process, two_cores
@@ -191,8 +192,9 @@ def save_plot(path: Path, found: list[Point], title: str) -> None:
     for axes in (above, middle, below):
         axes.grid(color="#dddddd", linewidth=0.5)
         axes.legend(frameon=False, fontsize=9)
-    for axis_formatter in (below.yaxis.set_major_formatter, below.yaxis.set_minor_formatter):
-        axis_formatter("{x:g}")
+    below.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    below.yaxis.set_major_formatter("{x:g}")
+    below.yaxis.set_minor_formatter(NullFormatter())
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110, bbox_inches="tight")
 
