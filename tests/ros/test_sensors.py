@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
 from PIL import Image as Picture
 from sensor_msgs.msg import CompressedImage, LaserScan
 
+from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint, write_untrained
 from ngo_estimator.images import ImageFormat, scan_image
 from ngo_estimator.local_odometry import LocalOdometry
@@ -119,3 +120,36 @@ def test_compressed_pictures_for_weights_that_take_depth_end_the_start(probe: Pr
         assert local.wait() == 2, local.log
         local.wait_for_log("parameter 'image_transport': the weights take 4 channels of float32")
         assert len(local.lines) == 1, local.log
+
+
+def test_the_shipped_scan_model_follows_the_simulator(probe: Probe) -> None:
+    """Both estimators as a user starts them, on a maze of the validation split."""
+    frames = 160
+    truth, odometry = probe.collect(Odometry, "ground_truth"), probe.collect(Odometry, "odom")
+    poses = probe.collect(PoseWithCovarianceStamped, "ngo/pose")
+    maze = {"frames": frames, "rate": 0.0, "seed": 1500, "wait_for_flow_control": True}
+    with (
+        NodeProcess("ngo_estimator", "local_node", {"world": "scan", **RELIABLE}) as local,
+        NodeProcess("ngo_estimator", "ngo_node", {"world": "scan"}) as ngo,
+    ):
+        local.wait_for_log("ready: scan")
+        ngo.wait_for_log("ready: scan")
+        with NodeProcess("ngo_sim", "maze2d", maze) as simulator:
+            probe.spin_until(lambda: len(odometry) == len(poses) == frames - 1, "a pose for every scan")
+            probe.spin_until(lambda: len(truth) == frames, "the truth")
+            assert simulator.wait() == 0, simulator.log
+        assert "dropped" not in local.log + ngo.log, local.log + ngo.log
+    driven = np.array([[m.pose.pose.position.x, m.pose.pose.position.y] for m in truth])
+    length_m = np.linalg.norm(np.diff(driven, axis=0), axis=1).sum()
+    start, end = (seen_as_planar(message) for message in (truth[0], truth[-1]))
+    moved = se2.between(torch.from_numpy(start), torch.from_numpy(end)).numpy()
+    assert length_m > 10.0 and np.linalg.norm(moved[:2]) > 1.0
+    for estimate in (odometry[-1], poses[-1]):
+        error = seen_as_planar(estimate) - moved
+        assert np.linalg.norm(error[:2]) < 0.03 * length_m, error
+        assert abs(np.remainder(error[2] + np.pi, 2.0 * np.pi) - np.pi) < np.radians(6.0), error
+
+
+def seen_as_planar(message: Odometry | PoseWithCovarianceStamped) -> np.ndarray:
+    pose = message.pose.pose
+    return np.array([pose.position.x, pose.position.y, 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)])
