@@ -6,6 +6,8 @@ SHELL := /bin/bash
 WORLD ?= maze3d
 SEED ?= 2000
 FRAMES ?= 1000
+DATA ?=
+NAME ?= my_robot
 ARGS ?=
 
 export PYTHON ROS V
@@ -33,9 +35,9 @@ build: venv ## the workspace, with colcon
 demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000
 	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
 
-train: build ## every network of a world, from simulated data, into the estimator's package: WORLD=maze3d|maze2d|scan
+train: build ## every network of a world, into the estimator's package: WORLD=maze3d|maze2d|scan, or DATA="a.mcap b.mcap" NAME=my_robot
 	@$(OPEN) && for script in train_local train_place featurise train_optimizer evaluate; do \
-		python -m training.$$script --world $(WORLD) || exit; done
+		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) || exit; done
 
 results: build ## tables and figures of a world, from networks to docs/: WORLD=maze2d
 	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)

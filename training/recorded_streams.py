@@ -89,6 +89,12 @@ def pairs_at(track: Track, steps: np.ndarray) -> Batch:
     }
 
 
+def track_pairs(domain: Domain, track: Track) -> list[Batch]:
+    """All steps of a track in order, in batches."""
+    parts = np.array_split(np.arange(len(track) - 1), -(-len(track) // 256))
+    return [known_to(domain, pairs_at(track, steps)) for steps in parts]
+
+
 class RecordedSteps:
     """What the local pose network learns from."""
 
@@ -104,8 +110,7 @@ class RecordedSteps:
         """All steps of the parts that the networks do not learn from, in batches."""
         if not self._validation:
             for track in self.data.tracks("optimizer", "validation"):
-                for steps in np.array_split(np.arange(len(track) - 1), -(-len(track) // 256)):
-                    self._validation.append(known_to(self.domain, pairs_at(track, steps)))
+                self._validation += track_pairs(self.domain, track)
         return self._validation
 
     def unseen(self) -> list[Batch]:

@@ -37,6 +37,7 @@ POSITION_SCALE = 0.1  # corridor widths: errors below count by their square, so 
 HEADING_SCALE = 0.02  # rad
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
+_FEWEST_STEPS = 8  # of an epoch
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Arguments(runs.TrainerArguments):
     epochs: int = 6
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
-    """Steps of the optimiser in an epoch."""
+    """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
     batch_size: int = 8
     """Trajectories in a step."""
     learning_rate: float = 1e-3
@@ -166,8 +167,10 @@ class _Data(lightning.LightningDataModule):
         assert self.trainer is not None
         a, trainer = self.arguments, self.trainer
         share = Share(trainer.global_rank, trainer.world_size)
-        batch_size = a.batch_size if a.world is not None else min(a.batch_size, len(self.train))
-        data = RandomStretches(self.train, a.steps, batch_size, a.seed, trainer.current_epoch, share)
+        steps, batch_size = a.steps, a.batch_size
+        if a.world is None:  # recordings have few stretches
+            steps, batch_size = min(steps, max(_FEWEST_STEPS, len(self.train))), min(batch_size, len(self.train))
+        data = RandomStretches(self.train, steps, batch_size, a.seed, trainer.current_epoch, share)
         return DataLoader(data, batch_size=None)
 
     def val_dataloader(self) -> DataLoader[Batch]:

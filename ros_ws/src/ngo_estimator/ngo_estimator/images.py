@@ -119,8 +119,8 @@ def to_network(images: Tensor, image: ImageFormat) -> Tensor:
 def reduced(picture: np.ndarray, factor: int) -> np.ndarray:
     """A picture ``(height, width, channels)`` made smaller: ``(height // factor, width // factor, channels)``.
 
-    Colours are the means of ``factor`` x ``factor`` pixels, depths those of the middle of them (a mean over an edge would
-    be a distance at which nothing is). Rows and columns that are left over, at the bottom and on the right, are dropped.
+    Colours are the means of ``factor`` x ``factor`` pixels, depths those of the middle of them (a mean over an edge
+    would be a distance at which nothing is). Rows and columns that are left over at the bottom and on the right go.
     """
     height, width, channels = picture.shape
     rows, columns = height // factor, width // factor
