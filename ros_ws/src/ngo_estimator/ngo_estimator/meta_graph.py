@@ -48,6 +48,7 @@ class MetaGraph:
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
+        self._scale = optimizer.config.covariance_scale
         keep = (2 * _CONTEXT + 2) * self._block
         self.odometry = GrowingRows((3,), np.float64)
         self.odometry.append(np.zeros(3))
@@ -205,7 +206,8 @@ class MetaGraph:
             covariance[which, which] = self._result.equations.covariance([start, last] if start else [last])
             x, y = self._nodes.values[self._result_last, :2] - self._nodes.values[found.start[k], :2]
             jacobian = np.hstack((np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]), -np.eye(3)))
-            limits[k] = _MOST_DRIFT * (np.diagonal(jacobian @ covariance @ jacobian.T) + own)
+            drift = np.diagonal(jacobian @ covariance @ jacobian.T)
+            limits[k] = _MOST_DRIFT * (self._scale * drift + own)
         return limits
 
     @property
@@ -280,4 +282,4 @@ class MetaGraph:
     def end_covariance(self) -> np.ndarray:
         """Covariance ``(3, 3)`` of the last node that was optimised, in the map."""
         assert self._result is not None
-        return self._result.end_covariance()[0].numpy()
+        return self._scale * self._result.end_covariance()[0].numpy()

@@ -44,6 +44,7 @@ class NeuralGraphOptimizerConfig:
     ``network`` this step is all there is: no attention and no convolutions, one learned factor for the odometry's
     deviations.
     ``correction_std`` (m, m, rad), the typical error of a relative meta-pose, is the unit of the adjustments.
+    ``covariance_scale`` multiplies the covariance of a pose: how far errors were beyond it on validation.
     """
 
     aggregation: PoseAggregationConfig
@@ -57,6 +58,7 @@ class NeuralGraphOptimizerConfig:
     compass: bool = False
     search: LoopSearch = field(default_factory=LoopSearch)
     correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
+    covariance_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if self.attention not in ("softmax", "sum"):
@@ -73,6 +75,8 @@ class NeuralGraphOptimizerConfig:
             )
         if min(self.correction_std) <= 0.0:
             raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
+        if not 0.0 < self.covariance_scale < math.inf:
+            raise ValueError(f"covariance_scale is {self.covariance_scale}; expected a positive number")
 
     @classmethod
     def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> "NeuralGraphOptimizerConfig":

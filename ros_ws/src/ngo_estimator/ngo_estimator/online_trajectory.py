@@ -207,10 +207,17 @@ class OnlineTrajectory:
             self._pose, self._covariance = self._graph.newest()
         return done
 
-    def finish(self) -> None:
-        """Run what is left of an optimisation that has begun, when no more steps are to come."""
-        if self._graph.running:
-            self._optimized = self._advance(self._optimizer.config.iterations)
+    @property
+    def unfinished(self) -> bool:
+        """Whether an optimisation has begun that later steps, or ``finish``, are to end."""
+        return self._graph.running
+
+    def finish(self) -> TrajectoryUpdate | None:
+        """Run what is left of an optimisation that has begun, when no more steps come; None where there is none."""
+        if not self._graph.running:
+            return None
+        self._optimized = self._advance(self._optimizer.config.iterations)
+        return self._result(restarted=False, gap=False)
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""

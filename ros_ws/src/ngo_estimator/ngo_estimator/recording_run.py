@@ -136,6 +136,7 @@ class RecordingRun:
 
     def _finished(self, truth: "_Truth") -> Iterator[RecordedRun]:
         """The trajectory that ends here, if there is one."""
+        self._online.finish()
         trajectory = self._online.trajectory()
         self._local.reset()
         self._online.reset()

@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecyclePublisher, LifecycleState, TransitionCallbackReturn
 from rclpy.task import Future
 from std_srvs.srv import SetBool
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 NAME = "ngo_node"
 _DEPTH = 100
+_PENDING_S = 0.3
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -179,6 +181,10 @@ class NgoNode(LifecycleNode):
                 qos_overriding_options=overridable(),
             )
             listening.callback(self.destroy_subscription, initial)
+        # When no more relative poses come, nothing else would end an optimisation that is spread over them.
+        self._pending = self.create_timer(_PENDING_S, self._finish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._pending.cancel()
+        listening.callback(self.destroy_timer, self._pending)
         self._inputs = [steps]
         listening.callback(self._inputs.clear)
         self._status.idle = ""
@@ -217,17 +223,34 @@ class NgoNode(LifecycleNode):
         self._publish(update, step.odom_xyyaw)
         # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last one.
         self._whole.changed(loops=update.optimized or begins)
+        self._odom_xyyaw = step.odom_xyyaw
+        if self._core.unfinished:
+            self._pending.reset()
+        else:
+            self._pending.cancel()
+
+    def _finish(self) -> None:
+        """End the optimisation that has begun."""
+        self._pending.cancel()
+        if self._paused or (update := self._core.finish()) is None:
+            return
+        self._latest, self._last_correction_m = update, update.largest_move_m
+        self._publish_transform(update, self._odom_xyyaw)
+        self._whole.changed(loops=True)
 
     def _publish(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
-        settings, stamp_ns, origin = self._settings, update.stamp_ns, self._origin
-        map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
+        self._publish_transform(update, odom_xyyaw)
+        pose, map_frame = self._origin.poses(update.pose_xyyaw), self._settings.framed(self._settings.map_frame)
+        self._covariance = self._origin.covariance_of(pose, update.covariance)
+        self._pose.publish(messages.pose_message(update.stamp_ns, map_frame, pose, self._covariance))
+
+    def _publish_transform(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
+        settings, stamp_ns = self._settings, update.stamp_ns
         if settings.publish_tf:
-            newest = origin.poses(update.map_from_odom_xyyaw)
+            map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
+            newest = self._origin.poses(update.map_from_odom_xyyaw)
             map_from_odom = self._smoothing.update(stamp_ns, newest, odom_xyyaw)
             self._tf.publish(messages.transform_message(stamp_ns, map_frame, odom_frame, map_from_odom))
-        pose = origin.poses(update.pose_xyyaw)
-        self._covariance = origin.covariance_of(pose, update.covariance)
-        self._pose.publish(messages.pose_message(stamp_ns, map_frame, pose, self._covariance))
 
     def _trajectory(self) -> "Trajectory | None":
         """The whole trajectory, with its poses in map."""

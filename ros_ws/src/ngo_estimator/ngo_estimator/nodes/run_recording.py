@@ -54,6 +54,8 @@ class Arguments:
     """How many of the newest frames are optimised together."""
     key_frames: int = 128
     """How many older poses are kept as key frames: they close loops, and all other old poses move with them."""
+    iterations_per_step: int = 1
+    """Iterations of an optimisation at each frame, which spreads it over frames; 0 for all at once."""
     scan_yaw_deg: float = 0.0
     """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead."""
     base_frame: str = "base_link"
@@ -116,7 +118,8 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         torch.set_num_threads(1)
         folder = arguments.weights_folder
         local = LocalOdometry.load(folder, arguments.world)
-        online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, arguments.key_frames)
+        bounds = (arguments.key_frames, arguments.iterations_per_step)
+        online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, *bounds)
         topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
         _check_side_information(topics, local)
         console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
@@ -135,6 +138,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         "weights": local.world,
         "window_frames": arguments.window_frames,
         "key_frames": arguments.key_frames,
+        "iterations_per_step": arguments.iterations_per_step,
         "topics": {field.name: _plain(getattr(topics, field.name)) for field in fields(topics)},
         "frames": core.frames,
         "not_used": dict(core.rejected),

@@ -1,0 +1,80 @@
+"""Fit how far errors of the corrected pose are beyond the covariance that the optimizer states, on validation mazes.
+
+    python -m training.calibrate_covariance --world maze3d
+
+The covariance follows from what the optimizer believes of steps and loops, and it believes too much where their errors
+are alike. One factor, the mean normalised squared error of the newest pose (1 where the covariance is right), goes into
+the description of the weights.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
+from ngo_estimator.online_trajectory import OnlineTrajectory
+from training import runs
+from training.featurise import features_of
+from training.online_estimate import steps_of
+from training.streams import simulate
+from training.worlds import VALIDATION_SEEDS, WorldName, world_named
+
+_OWN = ("format", "network", "world", "sha256", "config")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of a calibration."""
+
+    world: WorldName
+    """World whose optimizer is calibrated."""
+    trajectories: int = 12
+    """Trajectories, each in a validation maze of its own."""
+    frames: int = 0
+    """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/*.safetensors; the optimizer's description gets the factor."""
+
+
+def main(arguments: Arguments) -> float:
+    """Write the factor into the description, and return it."""
+    world = world_named(arguments.world)
+    folder = arguments.weights / world.name
+    networks = load_local(folder, world.name)[0], load_place(folder, world.name)[0]
+    optimizer, description = load_optimizer(folder, world.name)
+    plain = dataclasses.replace(optimizer.config, covariance_scale=1.0)
+    optimizer.config = plain
+    core = OnlineTrajectory(optimizer, networks[1].pair_head if plain.loops else None)
+    found = []
+    seeds, frames = list(VALIDATION_SEEDS[-arguments.trajectories :]), arguments.frames or world.episode_frames
+    for group in (seeds[i : i + 4] for i in range(0, len(seeds), 4)):
+        for episode in tqdm(simulate(world, group, frames), total=len(group), desc=world.name):
+            features = features_of(world, episode, folder, networks)
+            found.append(normalized_errors(core, features))
+    scale = float(np.mean(np.concatenate(found)))
+    optimizer.config = dataclasses.replace(plain, covariance_scale=scale)
+    details = {key: value for key, value in description.items() if key not in _OWN}
+    save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, world.name, details)
+    print(f"{world.name}: squared errors are {scale:.2f} times what the covariance says; it is multiplied with that")
+    return scale
+
+
+def normalized_errors(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
+    """Squared errors of the newest pose in units of its covariance ``(n,)``, after each optimisation; 1 is right."""
+    core.reset()
+    result = []
+    for step, truth in zip(steps_of(features), features["truth"], strict=True):
+        update = core.update(step)
+        if update.optimized:
+            error = update.pose_xyyaw - truth
+            error[2] = np.angle(np.exp(1j * error[2]))
+            result.append(error @ np.linalg.solve(update.covariance, error) / 3.0)
+    return np.array(result)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
