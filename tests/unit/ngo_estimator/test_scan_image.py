@@ -82,6 +82,23 @@ def test_a_greatest_range_that_the_driver_leaves_open_is_none(range_max_m: float
     assert (seen == 50.0).all()
 
 
+def test_a_fine_scanner_may_lose_rays_that_others_stand_for() -> None:
+    angles = np.radians(np.arange(0, 720) / 2.0)
+    lost = room(angles)
+    lost[::2] = np.inf  # every other ray, half a degree beside one that is left
+    seen = scan_image(SCAN, lost, 0.0, math.radians(0.5), 0.0, 30.0).ravel()
+    np.testing.assert_allclose(seen, room(SCAN.ray_angles_rad), rtol=0.05)
+    lost[np.arange(720) % 10 != 1] = (
+        np.inf
+    )  # one in 5 degrees is left, at 0.5: only the format's ray at 0 is near enough
+    seen = scan_image(SCAN, lost, 0.0, math.radians(0.5), 0.0, 30.0).ravel()
+    degrees = np.degrees(SCAN.ray_angles_rad)
+    np.testing.assert_array_equal(np.isfinite(seen), np.abs((degrees - 0.5 + 2.5) % 5.0 - 2.5) <= 0.625)
+    coarse = np.array([2.0, np.inf, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
+    seen = scan_image(EIGHT, coarse, -math.pi, math.pi / 4, 0.0, 30.0).ravel()
+    assert np.isinf(seen).tolist() == [False] * 7 + [True, False]  # no other ray looks there
+
+
 def test_between_two_rays_one_surface_is_interpolated_and_an_edge_is_not() -> None:
     # Rays 22.5 degrees beside those of the format: each of its rays lies in the middle of two.
     ranges = np.array([2.0, 2.2, 2.0, 2.0, 4.0, 4.0, 4.0, 2.0])

@@ -144,9 +144,10 @@ def scan_image(
     """Resample a laser scan to the rays of a format.
 
     Each ray gets the range of the scanner's nearest ray, interpolated towards the next one where both end on one
-    surface. Rays that the scanner does not look at, or whose range is NaN, 0, below ``range_min_m`` or above
-    ``range_max_m``, become ``+inf``. Angles count counter-clockwise from straight ahead, as in sensor_msgs/LaserScan;
-    the scanner may turn either way and begin anywhere.
+    surface. Where that one has no return, the next nearest counts that is at most half a ray of the format away: of a
+    fine scanner some may be lost. Rays that the scanner does not look at, or whose range is NaN, 0, below
+    ``range_min_m`` or above ``range_max_m``, become ``+inf``. Angles count counter-clockwise from straight ahead, as in
+    sensor_msgs/LaserScan; the scanner may turn either way and begin anywhere.
 
     Args:
         image: the format, with a ``field_of_view_deg``.
@@ -178,20 +179,27 @@ def scan_image(
     ranges = np.where(measured, ranges, np.float32(np.inf))
 
     # The place of each wanted ray among the scanner's, from half a ray before the first to just before a turn later.
-    turn = math.copysign(1.0, angle_increment_rad) * (image.ray_angles_rad - angle_min_rad)
+    wanted = image.ray_angles_rad
+    turn = math.copysign(1.0, angle_increment_rad) * (wanted - angle_min_rad)
     place = (np.mod(turn + 0.5 * step, math.tau) - 0.5 * step) / step
     nearest = np.floor(place + 0.5).astype(np.int64)
-    beside = nearest + np.where(place >= nearest, 1, -1)
     count = len(ranges)
-    if count * step > math.tau - 0.5 * step:  # a whole turn: the last ray is the first one's neighbour
-        seen = np.ones(len(place), dtype=np.bool_)
-        nearest, beside_index = nearest % count, beside % count
-    else:
-        seen = nearest < count
-        nearest, beside_index = np.minimum(nearest, count - 1), np.clip(beside, 0, count - 1)
-    value, other = ranges[nearest], ranges[beside_index]
-    share = np.abs(place - np.floor(place + 0.5))
+    closed = count * step > math.tau - 0.5 * step  # a whole turn: the last ray is the first one's neighbour
+
+    def at(ray: np.ndarray) -> np.ndarray:
+        if closed:
+            return ranges[ray % count]
+        return np.where((ray >= 0) & (ray < count), ranges[np.clip(ray, 0, count - 1)], np.float32(np.inf))
+
+    side = np.where(place >= nearest, 1, -1)
+    value, other = at(nearest), at(nearest + side)
     with np.errstate(invalid="ignore"):
         together = np.abs(other - value) <= _EDGE_SHARE * np.minimum(value, other)
-        blended = np.where(together, value + share * (other - value), value)
-    return np.where(seen, blended, np.inf).astype(np.float32).reshape(1, -1, 1)
+        result = np.where(together, value + np.abs(place - nearest) * (other - value), value)
+    reach = 0.5 * abs(float(wanted[1] - wanted[0])) / step
+    looked_at = closed | (nearest < count)
+    for distance in range(1, int(reach + 0.5) + 1):
+        for ray in (nearest + side * distance, nearest - side * distance):
+            lost = np.isinf(result) & looked_at & (np.abs(place - ray) <= reach)
+            result = np.where(lost, at(ray), result)
+    return result.astype(np.float32).reshape(1, -1, 1)
