@@ -33,7 +33,7 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.domains import Domain
 from training.metrics import seen_from_first
-from training.recorded import RecordedArguments, check_source, open_recorded
+from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import known_to, told, windows
 from training.recorded_tracks import Part, Track
 from training.streams import Batch, images_of, mirrored, simulate
@@ -266,4 +266,4 @@ def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_script(main, Arguments, __doc__)

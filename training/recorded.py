@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from ngo_estimator.checkpoint import load_local
+from ngo_estimator.checkpoint import CheckpointError, load_local
 from ngo_estimator.images import ImageFormat
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
@@ -63,6 +64,14 @@ class RecordedArguments:
             raise ValueError(f"reduction is {self.reduction}; expected a whole number from 1 on")
         if "/" in self.name or not self.name:
             raise ValueError(f"name is {self.name!r}; expected one that a folder can have")
+
+
+def run_script(main: Callable[[Any], object], arguments: type[Any], description: str | None) -> None:
+    """Run a script with the command line's arguments; what recordings or weights lack ends it with one line."""
+    try:
+        main(tyro.cli(arguments, description=description))
+    except (RecordingError, CheckpointError) as error:
+        sys.exit(f"unusable: {error}")
 
 
 def check_source(world: str | None, recordings: RecordedArguments) -> None:

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
+from ngo_recordings.errors import RecordingError
 from training.domains import Domain
 from training.recorded import RecordedData
 from training.recorded_tracks import Track
@@ -260,7 +261,7 @@ class Windows:
 def windows(domain: Domain, tracks: Sequence[Track], most: int, fewest: int, block: int) -> Windows:
     """Windows that overlap, as long as most of the tracks allow, in whole blocks.
 
-    Raises ``ValueError`` where no track has ``fewest`` steps.
+    Raises ``RecordingError`` where no track has ``fewest`` steps.
     """
     lengths = sorted((len(track) - 1 for track in tracks), reverse=True)
     total, along, steps = sum(lengths), 0, 0
@@ -271,7 +272,7 @@ def windows(domain: Domain, tracks: Sequence[Track], most: int, fewest: int, blo
     steps = min(steps, most) // block * block
     while True:
         if steps < fewest:
-            raise ValueError(
+            raise RecordingError(
                 f"the longest stretch without a gap has {max(lengths, default=0)} steps; expected {fewest} or more: "
                 "record longer"
             )

@@ -26,9 +26,10 @@ from torch.utils.data import DataLoader, IterableDataset
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_recordings.errors import RecordingError
 from training import runs
 from training.domains import Domain
-from training.recorded import RecordedArguments, check_source, open_recorded
+from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedSteps
 from training.streams import Batch, PairStream, Share, images_of, loader, relative_poses, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
@@ -275,14 +276,14 @@ def main(arguments: Arguments) -> dict[str, float]:
 def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple[LocalPoseNetwork, dict[str, str]]:
     """A fresh network, or that of the weights to begin with, and what is to be said of them in the JSON.
 
-    Raises ``ValueError`` where those weights are told other things of a step than the recordings tell.
+    Raises ``RecordingError`` where those weights are told other things of a step than the recordings tell.
     """
     folder = arguments.recordings.from_weights
     if folder is not None:
         network, description = load_local(folder)
         config = network.config
         if (config.actions, config.twist) != (domain.actions, domain.twist):
-            raise ValueError(
+            raise RecordingError(
                 f"{folder} takes {_told(config.actions, config.twist)}, the recordings have "
                 f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave them out)"
             )
@@ -319,4 +320,4 @@ def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_script(main, Arguments, __doc__)

@@ -28,7 +28,7 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.domains import Domain
 from training.featurise import check_networks
-from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded
+from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
 from training.streams import Batch, Share
 from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, fixes_of, loops_of
 from training.worlds import WorldName, world_named
@@ -214,7 +214,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     for store in stores:
         check_networks(store, local_description, place_description)
     began = arguments.recordings.from_weights
-    optimizer = None if began is None else load_optimizer(began)[0].requires_grad_(True)
+    optimizer = None if began is None else load_optimizer(began)[0].requires_grad_(True).train()
     config = config_of(arguments, domain, (1.0, 1.0, 1.0)) if optimizer is None else optimizer.config
     search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
@@ -263,4 +263,4 @@ def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_script(main, Arguments, __doc__)

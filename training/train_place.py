@@ -24,7 +24,7 @@ from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_chec
 from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
 from training.domains import Domain
-from training.recorded import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded
+from training.recorded import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedPlaces
 from training.streams import Batch, PlaceStream, Share, loader
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
@@ -242,7 +242,7 @@ def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetwork
         config = PlaceConfig(image=domain.image, width=arguments.width, offset_scale_m=domain.place_radius_m)
         return PlaceNetworks(config), {}
     networks, description = load_place(arguments.recordings.from_weights)
-    return networks.requires_grad_(True), {"began_with_sha256": description["sha256"]}
+    return networks.requires_grad_(True).train(), {"began_with_sha256": description["sha256"]}
 
 
 def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> None:
@@ -256,4 +256,4 @@ def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_script(main, Arguments, __doc__)

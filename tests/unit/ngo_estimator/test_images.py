@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
-from ngo_estimator.images import ImageFormat, to_network
+from ngo_estimator.images import ImageFormat, reduced, to_network
+from ngo_estimator.observations import observation
 
 
 @pytest.mark.parametrize(
@@ -72,3 +73,27 @@ def test_colour_with_a_depth_that_did_not_return_is_as_far_as_can_be() -> None:
     scan[0, 0, 3] = np.inf
     image.check(scan)
     assert to_network(torch.from_numpy(scan), image)[:, 0, 0].tolist() == [0.0, 0.0, 0.0, -0.5]
+
+
+def test_larger_pictures_are_averaged_and_their_depths_taken_from_the_middle() -> None:
+    picture = np.arange(5 * 7 * 1, dtype=np.uint8).reshape(5, 7, 1)
+    small = reduced(picture, 2)
+    assert small.shape == (2, 3, 1) and small.dtype == np.uint8
+    assert small[0, 0, 0] == round((0 + 1 + 7 + 8) / 4) and small[1, 2, 0] == round((18 + 19 + 25 + 26) / 4 + 0.01)
+    depth = np.full((4, 4, 4), 0.5, np.float32)
+    depth[..., 3] = np.inf
+    depth[1, 1, 3] = 2.0
+    found = reduced(depth, 2)
+    np.testing.assert_array_equal(found[..., :3], 0.5)
+    np.testing.assert_array_equal(found[..., 3], [[2.0, np.inf], [np.inf, np.inf]])
+
+
+def test_an_observation_is_reduced_as_the_format_says_and_no_other_size_is_taken() -> None:
+    image = ImageFormat(60, 80, 3, "uint8", reduction=8)
+    assert observation(image, np.zeros((480, 640, 3), np.uint8)).shape == (60, 80, 3)
+    assert observation(image, np.zeros((487, 647, 3), np.uint8)).shape == (60, 80, 3)
+    for shape in ((60, 80, 3), (480, 648, 3), (480, 640, 1)):
+        with pytest.raises(ValueError, match="expected 640 x 480 pixels of 3 x uint8"):
+            observation(image, np.zeros(shape, np.uint8))
+    with pytest.raises(ValueError, match="reduction is 0"):
+        ImageFormat(60, 80, 3, "uint8", reduction=0)
