@@ -217,6 +217,7 @@ def test_of_two_publishers_the_first_is_held_and_both_are_named(optimizer: Optim
             return optimizer.stamps_ns()[-1] > intruder.origin_ns
 
         optimizer.probe.spin_until(taken_over, "the second to take over")
+        optimizer.wait_for_stamp(intruder.stamp_ns(step))
     finally:
         other.node.destroy_publisher(publisher)
         other.close()
