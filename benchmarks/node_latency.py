@@ -23,7 +23,7 @@ from std_msgs.msg import Header
 
 from benchmarks.drives import CACHE, drive_of, episodes, stamp_ns
 from benchmarks.pinned import running_on
-from demo.graph import Graph, NodeSpec
+from demo.graph import Graph, GraphError, NodeSpec
 from ngo_estimator.local_odometry import LocalEstimate
 from ngo_estimator.nodes.messages import relative_pose_message, to_time
 from ngo_sim.flow_control import header_stamp_ns
@@ -52,8 +52,8 @@ class Latencies:
 class Feed:
     """Publishes frames to a node, and remembers when the answer to each stamp came."""
 
-    def __init__(self, graph: Graph, inputs: dict[str, type], answer: tuple[str, type]) -> None:
-        self._graph = graph
+    def __init__(self, graph: Graph, name: str, inputs: dict[str, type], answer: tuple[str, type]) -> None:
+        self._graph, self._name = graph, name
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=graph.domain_id)
         self._node = rclpy.create_node("feed", context=self._context, start_parameter_services=False)
@@ -117,8 +117,12 @@ class Feed:
             while (left := due - time.monotonic()) > 0.0:
                 self._spin(left)
             stamps.append(self._send(frame))
-        for stamp in stamps:
-            self._wait(stamp)
+        self._wait(stamps[-1])
+        if lost := [number for number, stamp in enumerate(stamps) if stamp not in self.answered]:
+            raise GraphError(
+                f"{len(lost)} of {len(stamps)} frames were not answered, numbers {lost[0]} to {lost[-1]}; "
+                f"{self._name} wrote last:\n{self._graph.tail(self._name)}"
+            )
         return [1e3 * (self.answered[stamp] - self._sent[stamp]) for stamp in stamps]
 
     def _send(self, frame: Frame) -> int:
@@ -168,7 +172,7 @@ def local_node(world_name: str, seed: int, before: int, live: int, cores: tuple[
     spec = NodeSpec(
         "ngo_estimator",
         "local_node",
-        {"world": world_name, "image_reliability": "reliable", "image_depth": 100, "threads": 1},
+        {"world": world_name, "image_reliability": "reliable", "image_depth": 5000, "threads": 1},
     )
     inputs = {"image": Image, "action": DiscreteAction}
     return _measured(spec, inputs, ("relative_pose", RelativePose), frames, live, cores, logs, again=False)
@@ -189,7 +193,7 @@ def _measured(
     with Graph(logs) as graph, running_on(own_core):
         with running_on(node_core):
             graph.start(spec)
-        with Feed(graph, inputs, answer) as feed:
+        with Feed(graph, spec.executable, inputs, answer) as feed:
             sent = feed.connect(frames[:first], again)
             frames_per_s = feed.fast(frames[sent:first])
             milliseconds = feed.paced(frames[first:])

@@ -140,7 +140,7 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
         ("optimize", "one optimisation (ms, cpu ms)"),
         ("update", "with candidates and aggregation (ms, cpu ms)"),
         ("gtsam_lm", "GTSAM LM from odometry (ms, cpu ms)"),
-        ("gtsam_lm_believed", "the same, without loops of little belief (ms, cpu ms)"),
+        ("gtsam_lm_believed", "the same with likely loops alone (ms, cpu ms)"),
         ("isam2", "GTSAM iSAM2, one meta-pose (ms, cpu ms)"),
     ):
         row(name, lambda r, k=key: f"{r[k]['ms']:.1f}, {r[k]['cpu_ms']:.1f}")
