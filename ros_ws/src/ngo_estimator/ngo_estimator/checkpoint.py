@@ -96,12 +96,17 @@ def _from_json(hint: Any, value: Any) -> Any:
     return value
 
 
-def save_checkpoint(path: Path, network: nn.Module, kind: str, world: str, details: dict[str, Any]) -> None:
+def save_checkpoint(
+    path: Path, network: nn.Module, kind: str, world: str, details: dict[str, Any], half: bool = False
+) -> None:
     """Write ``path`` (``.safetensors``) and its ``.json``, each at once or not at all.
 
-    ``details`` goes into the JSON beside the configuration: the training command, seed, revision and metrics.
+    ``details`` goes into the JSON beside the configuration: the training command, seed, revision and metrics. With
+    ``half`` the weights are stored as float16; a network computes in float32 all the same.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    if half:
+        tensors = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
     weights = save(tensors)
     description = {
         "format": FORMAT,
