@@ -29,7 +29,8 @@ from training.streams import relative_poses
 from training.trained import learning_curve
 
 FEATURES = ("relative", "log_std", "motion", "codes")
-COLORS = {"mean step": "#9a9a9a", "odometry": "#2ca02c", "online": "#9467bd", "corrected": "#ff7f0e"}
+COLORS = {"odometry": "#2ca02c", "online": "#9467bd", "corrected": "#ff7f0e"}
+_MEAN_STEP = "mean step"
 _CURVES = {
     "local": ("local network", "validation_rmse_deg", "heading RMSE of a step, deg"),
     "place": ("place encoder", "validation_median_m", "median error of a pair, m"),
@@ -62,7 +63,7 @@ def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: boo
         features = features_of_track(data.domain, track, networks)
         arrays = [torch.from_numpy(features[key]) for key in FEATURES]
         corrected = optimize_offline(optimizer, networks.place.pair_head, *arrays).poses[0]
-        poses = {"mean step": mean_steps.poses(track), "odometry": with_origin(se2.r2g(arrays[0]).numpy())}
+        poses = {_MEAN_STEP: mean_steps.poses(track), "odometry": with_origin(se2.r2g(arrays[0]).numpy())}
         if online:
             core = OnlineTrajectory(optimizer, networks.place.pair_head, max(len(track), 2 * optimizer.block))
             poses["online"] = online_poses(core, features)
@@ -129,6 +130,8 @@ def draw(out: Path, run: Path, measured: list[tuple[Track, Poses]]) -> list[Path
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     for kind, estimate in poses.items():
+        if kind == _MEAN_STEP:  # so far off that nothing else could be seen
+            continue
         error = np.linalg.norm(estimate[:, :2] - truth[:, :2], axis=1)
         axes.plot(error, color=COLORS[kind], label=kind, linewidth=1.3)
     axes.set(xlabel="frame", ylabel="distance from the truth, m", title="held out")
