@@ -47,11 +47,12 @@ def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: boo
     of the training part with its action.
 
     Raises:
-        ValueError: there are no steps to measure on.
+        ValueError: there are no steps to measure on, or the networks were trained on other ones.
     """
     name = data.domain.name
     folder = weights / name
     networks = Networks(load_local(folder, name)[0], load_place(folder, name)[0])
+    data.check_trained(networks.local.config)
     optimizer, description = load_optimizer(folder, name)
     tracks = [track for track in data.tracks("test") if len(track) > 2 * optimizer.block]
     tracks = [track for track in tracks if path_length_m(track.poses_xyyaw) > 0.0]

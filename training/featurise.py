@@ -189,6 +189,7 @@ def _main_recorded(arguments: Arguments) -> None:
         ("train", "optimizer", 8 * _BLOCK),
         ("validation", "validation", 2 * _BLOCK),
     )
+    data.check_trained(local.config)
     for name, part, fewest in stores:
         found = windows(data.domain, data.tracks(part), _MOST_STEPS, fewest, _BLOCK)
         store = arguments.out / data.domain.name / "features" / name

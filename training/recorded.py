@@ -16,6 +16,7 @@ import tyro
 
 from ngo_estimator.checkpoint import CheckpointError, load_local
 from ngo_estimator.images import ImageFormat
+from ngo_estimator.local_pose_network import LocalPoseConfig
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
 from training.domains import MIRRORED_ACTIONS, Domain
@@ -92,6 +93,15 @@ class RecordedData:
     def tracks(self, *parts: Part) -> list[Track]:
         """The tracks of some parts."""
         return [track for part in parts for track in self.parts.tracks[part]]
+
+    def check_trained(self, config: LocalPoseConfig) -> None:
+        """Raise ``RecordingError`` unless a network was trained on what the recordings give with these settings."""
+        domain = self.domain
+        if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
+            raise RecordingError(
+                f"the weights of {domain.name} were trained on these recordings with other settings: give the same "
+                "--data, topics, --reduction and --from-weights as to train_local, or train anew"
+            )
 
     @property
     def about(self) -> dict[str, Any]:
