@@ -197,5 +197,4 @@ def _measured(
             sent = feed.connect(frames[:first], again)
             frames_per_s = feed.fast(frames[sent:first])
             milliseconds = feed.paced(frames[first:])
-        graph.stop()
     return Latencies(milliseconds, frames_per_s)

@@ -1,25 +1,57 @@
 """The benchmarks of the online core and the nodes at toy size: real processes, and a last line of JSON."""
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from benchmarks import long_run, online
+from demo.graph import GraphError
+from demo.session import SessionConfig
 
 KEYS = ("ngo_node_p99_ms", "local_node_p99_ms", "ratio_to_gtsam_lm", "ratio_to_isam2")
 
 
+@pytest.mark.timeout(300)
 def test_online(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = online.Arguments(worlds=("maze2d",), window=64, live=35, repeats=3, end_to_end_frames=40, out=tmp_path)
+    arguments = online.Arguments(worlds=("maze2d",), window=64, live=20, repeats=3, out=tmp_path)
     monkeypatch.setattr(online, "BARS", dict.fromkeys(online.BARS, 1e9))
+    monkeypatch.setattr(online, "end_to_end", lambda *_: 123.0)  # tests/ros/test_demo.py runs the whole graph
     assert online.main(arguments) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])["maze2d"]
     for key in KEYS:
         assert result[key] > 0.0, key
     assert result["ratio_to_gtsam_lm"] == pytest.approx(result["optimize"]["ms"] / result["gtsam_lm"]["ms"], rel=0.01)
     assert result["ngo_node_median_ms"] <= result["ngo_node_p99_ms"] <= result["ngo_node_max_ms"]
-    assert result["end_to_end_frames_per_s"] > 1.0
+    assert result["end_to_end_frames_per_s"] == 123.0
+
+
+class TenFramesASecond:
+    """A session of as many frames as are asked for, of which some may be lost."""
+
+    def __init__(self, config: SessionConfig, _: Path, lost: int = 0) -> None:
+        self.frames, self.lost = config.frames, lost
+
+    def run(self, show: Callable[[str, int], None]) -> dict[str, int]:
+        show("loading the networks", 0)
+        for count in range(1, self.frames + 1):
+            TenFramesASecond.now_s = 100.0 + 0.1 * count
+            show("driving", count)
+        return {"frames": self.frames - self.lost}
+
+    now_s = 0.0
+
+
+def test_frames_end_to_end_are_counted_and_none_may_be_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = online.Arguments(end_to_end_frames=50, out=tmp_path)
+    monkeypatch.setattr(online.time, "monotonic", lambda: TenFramesASecond.now_s)
+    monkeypatch.setattr(online, "Session", TenFramesASecond)
+    assert online.end_to_end("maze2d", arguments) == pytest.approx(10.0)
+    monkeypatch.setattr(online, "Session", partial(TenFramesASecond, lost=2))
+    with pytest.raises(GraphError, match="2 of 50 frames were lost"):
+        online.end_to_end("maze2d", arguments)
 
 
 def test_a_missed_bar_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
