@@ -147,6 +147,18 @@ def test_finish_ends_what_has_begun() -> None:
     np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
 
 
+@pytest.mark.parametrize("per_step", [0, 1])
+def test_a_pause_of_many_windows_is_caught_up_with(per_step: int) -> None:
+    steps, truth = drive(4 * LAP)
+    core = OnlineTrajectory(robust_graph(), SeesPoses(), window_frames=40, key_frames=40, iterations_per_step=per_step)
+    for count, step in enumerate(steps):
+        core.update(step, optimize=not 1.5 * LAP < count < 3 * LAP)
+    trajectory = core.trajectory()
+    assert trajectory is not None
+    assert len(trajectory.poses_xyyaw) == len(truth)
+    assert rmse(trajectory.poses_xyyaw, truth) < 0.5 * rmse(trajectory.odometry_xyyaw, truth)
+
+
 def test_what_is_kept_does_not_grow() -> None:
     core = OnlineTrajectory(robust_graph(1), SeesPoses(), window_frames=80, key_frames=16)
     steps, _ = drive(4 * LAP)

@@ -191,8 +191,8 @@ class MetaGraph:
         The odometry alone would let a pose of long ago lie anywhere; the loops that were closed since say more.
         """
         limits = np.full((len(found), 3), np.inf)
-        if self._result is None or self._result.equations is None:
-            return limits
+        if self._result is None or self._result.equations is None or self._result_last < self._first:
+            return limits  # nothing was optimised, or all of what was lies behind the window by now
         last = int(len(self._result_keys) + self._result_last - self._result_first)
         since = self._std.slice(self._result_last).astype(np.float64)
         travelled = self._nodes.values[self._result_last + 1 :, :2] - self._nodes.values[-1, :2]
