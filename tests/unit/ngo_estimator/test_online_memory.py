@@ -134,6 +134,16 @@ def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
             np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
 
 
+def test_more_iterations_than_steps_in_a_block_are_done_before_the_next_block() -> None:
+    steps, _ = drive(LAP + 80)
+    at_once = OnlineTrajectory(robust_graph(12), SeesPoses(), 160, 16)
+    spread = OnlineTrajectory(robust_graph(12), SeesPoses(), 160, 16, iterations_per_step=1)
+    for count, step in enumerate(steps, start=1):
+        expected, update = at_once.update(step), spread.update(step)
+        if count % 8 == 7:
+            np.testing.assert_allclose(update.pose_xyyaw, expected.pose_xyyaw, atol=1e-9)
+
+
 def test_finish_ends_what_has_begun() -> None:
     steps, _ = drive(80)
     at_once = OnlineTrajectory(robust_graph(), SeesPoses())

@@ -106,7 +106,11 @@ class OnlineTrajectory:
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
         self._code_size = None if pair_head is None else pair_head.config.code_size
         self._key_frames = key_frames
-        self._iterations_per_step = iterations_per_step or optimizer.config.iterations
+        iterations = optimizer.config.iterations
+        # An optimisation must be done when the next one begins, a block later.
+        self._iterations_per_step = (
+            max(iterations_per_step, -(-iterations // block)) if iterations_per_step else iterations
+        )
         self.reset()
 
     @classmethod
