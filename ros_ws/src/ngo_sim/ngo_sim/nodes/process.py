@@ -21,13 +21,24 @@ def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | N
     0 in both cases, 2 after a bad parameter, which one line on stderr names.
     """
     # rclpy's own handlers shut down from another thread while this one publishes, which now and then ends in a crash.
-    # These raise in this thread, between two calls; the node waits for short times only, so they are never late.
+    # These raise in this thread; the node waits for short times only, so they are never late.
+    ended = False
+
+    def end(*_: object) -> None:
+        nonlocal ended
+        ended = True
+        raise KeyboardInterrupt
+
     for number in _SIGNALS:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, end)
     try:
         return _run(node_type, name, args)
     except KeyboardInterrupt:
         return 0
+    except RuntimeError:
+        if not ended:
+            raise
+        return 0  # what rclpy makes of an exception in the middle of taking a message
 
 
 def _run(node_type: type[SimulatorNode], name: str, args: list[str] | None) -> int:
