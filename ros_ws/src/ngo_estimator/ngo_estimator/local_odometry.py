@@ -10,6 +10,7 @@ from ngo_estimator import se2
 from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local, load_place
 from ngo_estimator.images import ImageFormat
 from ngo_estimator.local_pose_network import LocalPoseNetwork
+from ngo_estimator.relative_step import RelativeStep
 
 RESTART_AFTER_NS = 1_000_000_000
 """A stamp this far in the past means that the source restarted; anything less is a late frame."""
@@ -32,23 +33,9 @@ class UnusableImage(RejectedFrame):
 
 
 @dataclass(frozen=True)
-class LocalEstimate:
-    """Motion between two consecutive frames.
+class LocalEstimate(RelativeStep):
+    """Motion between two consecutive frames; ``missed_frames`` counts the frames missing between the two."""
 
-    ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
-    ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
-    ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``missed_frames`` counts the frames
-    missing between the two.
-    """
-
-    stamp_ns: int
-    from_stamp_ns: int
-    relative_xyyaw: np.ndarray
-    covariance: np.ndarray
-    origin_stamp_ns: int
-    odom_xyyaw: np.ndarray
-    motion_feature: np.ndarray
-    place_code: np.ndarray
     missed_frames: int
 
 

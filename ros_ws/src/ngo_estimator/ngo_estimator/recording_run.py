@@ -11,7 +11,6 @@ from ngo_estimator.frame_pairing import FramePairing
 from ngo_estimator.local_odometry import RESTART_AFTER_NS, DuplicateFrame, LateFrame, LocalEstimate, LocalOdometry
 from ngo_estimator.observations import observation
 from ngo_estimator.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
-from ngo_estimator.relative_step import RelativeStep
 from ngo_estimator.trajectory_file import SpatialPoses, seconds
 from ngo_recordings.frames import Frame
 
@@ -118,7 +117,7 @@ class RecordingRun:
                 local = self._local.update(pair.stamp_ns, pair.image, pair.action, pair.twist)
                 if local is None:
                     continue
-                update = self._online.update(_step(local))
+                update = self._online.update(local)
             except ValueError as error:
                 self._reject("not usable", f"{seconds(pair.stamp_ns)} s: {error}")
                 continue
@@ -162,16 +161,3 @@ class _Truth:
         if len(values) == 0:
             return None, values[:, 3:]
         return SpatialPoses.from_planar(np.array(self._stamps_ns), values[:, :3]), values[:, 3:]
-
-
-def _step(local: LocalEstimate) -> RelativeStep:
-    return RelativeStep(
-        stamp_ns=local.stamp_ns,
-        from_stamp_ns=local.from_stamp_ns,
-        relative_xyyaw=local.relative_xyyaw,
-        covariance=local.covariance,
-        origin_stamp_ns=local.origin_stamp_ns,
-        odom_xyyaw=local.odom_xyyaw,
-        motion_feature=local.motion_feature,
-        place_code=local.place_code,
-    )

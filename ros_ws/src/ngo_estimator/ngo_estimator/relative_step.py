@@ -25,7 +25,12 @@ class LateStep(RejectedStep):
 
 @dataclass(frozen=True)
 class RelativeStep:
-    """One step of the local odometry; the fields are those of ``LocalEstimate``."""
+    """Motion between two frames, as the local odometry has it.
+
+    ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
+    ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
+    ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors.
+    """
 
     stamp_ns: int
     from_stamp_ns: int
