@@ -19,7 +19,9 @@ from ngo_msgs.msg import RelativePose
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
+from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.messages import to_ns, to_time
+from ngo_estimator.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe, wait_until
 from .relative_poses import Optimizer, assert_pose_is, write_weights
@@ -99,6 +101,29 @@ def test_a_burst_is_taken_whole(optimizer: Optimizer) -> None:
     optimizer.publish(*drive.steps(1, 500))
     optimizer.wait_for_stamp(drive.stamp_ns(500))
     assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 501)]
+
+
+def test_a_stream_that_ends_within_an_optimisation_leaves_the_whole_path_optimised(optimizer: Optimizer) -> None:
+    paths = optimizer.probe.collect(PathMessage, "ngo/path")
+    optimizer.probe.spin_until(lambda: optimizer.probe.node.count_subscribers("ngo/path") >= 1, "a subscription")
+    drive = optimizer.drive()
+    steps = drive.steps(1, 40)  # the fifth meta-pose is complete, and one of five iterations done
+    core = OnlineTrajectory.load(optimizer.weights, iterations_per_step=1)
+    for step in steps:
+        core.update(messages.relative_step(step))
+    assert core.unfinished
+    core.finish()
+    expected = core.trajectory()
+    assert expected is not None
+
+    def ended_so() -> bool:
+        if not paths or to_ns(paths[-1].header.stamp) != drive.stamp_ns(40):
+            return False
+        found = np.array([(pose.pose.position.x, pose.pose.position.y) for pose in paths[-1].poses])
+        return found.shape == (41, 2) and bool(np.allclose(found, expected.poses_xyyaw[:, :2], atol=1e-9))
+
+    optimizer.publish(*steps)
+    optimizer.probe.spin_until(ended_so, "the path that is optimised to its end")
 
 
 def test_doubled_late_and_reordered_steps_change_nothing(optimizer: Optimizer) -> None:

@@ -144,6 +144,20 @@ def test_more_iterations_than_steps_in_a_block_are_done_before_the_next_block() 
             np.testing.assert_allclose(update.pose_xyyaw, expected.pose_xyyaw, atol=1e-9)
 
 
+def test_loops_found_in_a_pause_are_closed_after_it() -> None:
+    """The pause spans the whole second lap, more than a window: what was recognised in it is not forgotten."""
+    steps, truth = drive(2 * LAP + 240)
+    core = OnlineTrajectory(robust_graph(), SeesPoses(), window_frames=160, key_frames=64)
+    for count, step in enumerate(steps):
+        core.update(step, optimize=not LAP <= count < 2 * LAP)
+    whole = core.trajectory()
+    assert whole is not None
+    paused = (whole.loops[:, 1] > LAP + 80) & (whole.loops[:, 1] < 2 * LAP - 160)
+    assert (whole.loop_weights[paused] > 0.5).sum() > 3
+    lap = slice(LAP, 2 * LAP)
+    assert rmse(whole.poses_xyyaw[lap], truth[lap]) < 0.5 * rmse(whole.odometry_xyyaw[lap], truth[lap])
+
+
 def test_finish_ends_what_has_begun() -> None:
     steps, _ = drive(80)
     at_once = OnlineTrajectory(robust_graph(), SeesPoses())

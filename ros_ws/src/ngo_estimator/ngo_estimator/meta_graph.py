@@ -3,6 +3,7 @@
 Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 the first frame, the origin of ``map``.
 """
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -38,6 +39,7 @@ class _Running:
     first: int
     numbers: np.ndarray
     result: OptimizedMetaPoses | None = None
+    took_s: float = 0.0
 
 
 class MetaGraph:
@@ -76,6 +78,8 @@ class MetaGraph:
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         self._running: _Running | None = None
+        self.took_s = 0.0
+        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
         self._active, self._before = np.zeros(0, np.int64), np.zeros((0, 3))
 
     @property
@@ -218,6 +222,7 @@ class MetaGraph:
     @torch.inference_mode()
     def begin(self) -> None:
         """Begin to optimise all nodes of the window and the key frames before it."""
+        began = time.perf_counter()
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
@@ -233,6 +238,7 @@ class MetaGraph:
         self._running = _Running(
             self._optimizer.iterate(steps, loops), self._optimizer.config.iterations, keys, first, numbers
         )
+        self._running.took_s = time.perf_counter() - began
 
     @torch.inference_mode()
     def advance(self, iterations: int) -> bool:
@@ -240,12 +246,14 @@ class MetaGraph:
         running = self._running
         if running is None:
             raise RuntimeError("no optimisation has begun")
+        began = time.perf_counter()
         for _ in range(min(iterations, running.left)):
             running.result = next(running.iterations)
             running.left -= 1
+        running.took_s += time.perf_counter() - began
         if running.left or running.result is None:
             return False
-        self._running = None
+        self._running, self.took_s = None, running.took_s
         self._apply(running, running.result)
         return True
 

@@ -27,6 +27,9 @@ _MOST_TO_KEY_FRAMES = 128
 _BELIEVED = 0.1
 """A loop whose weight is less when it leaves the window is forgotten."""
 
+_UNWEIGHED = -1.0
+"""Weight of a loop that no optimisation has seen."""
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -34,7 +37,7 @@ class Candidates:
 
     ``frame`` is the earlier frame, as a number of steps before it; ``measured`` ``(n, 3)``, ``log_scale``, ``spread``
     ``(n, 2)``, ``logit`` and ``similarity`` as in ``Loops``; ``most_drift`` ``(n, 3)`` likewise, infinite where the
-    odometry says enough; ``weight`` what the optimizer gave it last.
+    odometry says enough; ``weight`` what the optimizer gave it last, negative before it did.
     """
 
     start: np.ndarray
@@ -175,7 +178,7 @@ class OnlineLoops:
             logit=logit[0].double().numpy(),
             similarity=np.array([pair.similarity for pair in pairs]),
             most_drift=np.full((count, 3), np.inf),
-            weight=np.zeros(count),
+            weight=np.full(count, _UNWEIGHED),
         )
 
     def limit_drift(self, found: Candidates, most_drift: np.ndarray) -> None:
@@ -195,8 +198,11 @@ class OnlineLoops:
         """Let go of the candidates behind the window, which begins at node ``first``, but for the ones believed."""
         behind = self._candidates.end <= first
         if behind.any():
-            believed = self._best(np.flatnonzero(behind & (self._candidates.weight >= _BELIEVED)), _MOST_TO_KEY_FRAMES)
-            self._candidates = self._candidates.where(np.concatenate((believed, np.flatnonzero(~behind))))
+            weight, logit = self._candidates.weight, self._candidates.logit
+            # Those found while nothing is optimised are as good as the pair head says.
+            believed = np.where(weight == _UNWEIGHED, logit > 0.0, weight >= _BELIEVED)
+            kept = self._best(np.flatnonzero(behind & believed), _MOST_TO_KEY_FRAMES)
+            self._candidates = self._candidates.where(np.concatenate((kept, np.flatnonzero(~behind))))
 
     def reattach(self, nodes: np.ndarray, stay: np.ndarray, poses: np.ndarray, variance: np.ndarray) -> None:
         """Hang the loops of key frames that go upon the ones before them.
@@ -218,14 +224,16 @@ class OnlineLoops:
             gone = gone[target[index[gone]] != index[gone]]
             here, there = index[gone], target[index[gone]]
             moved = torch.from_numpy(measured[gone])
+            ends_at = [torch.from_numpy(poses[k]) for k in (there, here)]
             if name == "start":
-                between = se2.between(torch.from_numpy(poses[there]), torch.from_numpy(poses[here]))
-                moved = se2.compose(between, moved)
+                moved = se2.compose(se2.between(*ends_at), moved)
                 frame[gone] = nodes[there] * self._block - 1
             else:
-                moved = se2.compose(moved, se2.between(torch.from_numpy(poses[here]), torch.from_numpy(poses[there])))
+                moved = se2.compose(moved, se2.between(*reversed(ends_at)))
             more = drift[here] - drift[there]
-            scales = np.stack((more[:, :2].mean(1), more[:, 2]), axis=1)
+            # Errors of the heading on the way swing what lies behind them.
+            lever = np.square(moved.numpy()[:, :2]).sum(1) + np.square(poses[here] - poses[there])[:, :2].sum(1)
+            scales = np.stack((more[:, :2].mean(1) + more[:, 2] * lever, more[:, 2]), axis=1)
             measured[gone] = moved.numpy()
             log_scale[gone] = 0.5 * np.log(np.exp(2.0 * log_scale[gone]) + scales)
             old[gone] = nodes[there]

@@ -216,6 +216,11 @@ class OnlineTrajectory:
         """Whether an optimisation has begun that later steps, or ``finish``, are to end."""
         return self._graph.running
 
+    @property
+    def optimization_s(self) -> float:
+        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+        return self._graph.took_s
+
     def finish(self) -> TrajectoryUpdate | None:
         """Run what is left of an optimisation that has begun, when no more steps come; None where there is none."""
         if not self._graph.running:

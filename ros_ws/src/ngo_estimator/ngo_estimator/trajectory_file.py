@@ -210,6 +210,11 @@ def _write_together(contents: Mapping[Path, Iterator[str]]) -> list[Path]:
         for path in contents:
             os.replace(written[path], path)
             del written[path]
+    except OSError as error:
+        if error.errno is None:
+            raise
+        # It names the file beside the one that was asked for.
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         for left in written.values():
             os.unlink(left)

@@ -1,6 +1,7 @@
 """Node that re-optimises the whole trajectory with every relative pose, and publishes it corrected."""
 
 import sys
+import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -207,6 +208,13 @@ class NgoNode(LifecycleNode):
         except ValueError as error:
             self._status.dropped("relative pose", error)
             return
+        except Exception:
+            # A fault of ours, not of the message: a robot is better off with a new map than without the node.
+            self.get_logger().error(f"internal error, the map starts anew:\n{traceback.format_exc()}")
+            self._core.reset()
+            self._begin_anew()
+            self._status.dropped("relative pose", "internal error", warn=False)
+            return
         self._status.received(step.stamp_ns)
         if update.restarted:
             self._begin_anew()
@@ -218,6 +226,7 @@ class NgoNode(LifecycleNode):
         self._new_gaps += update.gap
         if update.optimized:
             self._last_correction_m = update.largest_move_m
+            self._status.took("time an optimisation", self._core.optimization_s)
         begins = self._latest is None
         self._latest = update
         self._publish(update, step.odom_xyyaw)

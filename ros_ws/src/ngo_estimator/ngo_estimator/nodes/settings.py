@@ -117,7 +117,7 @@ class NgoNodeSettings(EstimatorSettings):
     window_frames: int = setting(
         2000,
         "How many of the newest frames are optimised together; older ones move with them.",
-        minimum=2,
+        minimum=16,
         maximum=100_000,
     )
     key_frames: int = setting(
