@@ -35,7 +35,7 @@ from training.evaluate_files import evaluate_files
 from training.evaluate_recorded import FEATURES, evaluate_recorded
 from training.featurise import features_of
 from training.metrics import TrajectoryError, trajectory_error
-from training.online_estimate import online_poses, with_origin
+from training.online_estimate import run_online, with_origin
 from training.recorded import RecordedArguments, open_recorded
 from training.streams import simulate
 from training.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
@@ -61,6 +61,11 @@ class Arguments:
     """Folder with NAME/*.safetensors."""
     online: bool = True
     """Whether to measure the online estimate, too, which runs the optimizer at every eighth frame."""
+    window_frames: int = 0
+    """Frames of the online estimate's window; 0 for all of them. With a window the path that it leaves at the end, with
+    key frames before it, is measured, too, as `bounded`."""
+    key_frames: int = 128
+    """Key frames before that window."""
     estimate: tuple[Path, ...] = ()
     """Estimated trajectories in the TUM format, to be compared with `--truth` instead of measuring in a world."""
     truth: Path | None = None
@@ -104,8 +109,10 @@ def main(arguments: Arguments) -> dict[str, object]:
     optimizer = load_optimizer(folder, world.name)[0]
     seeds = list(_SPLITS[arguments.split][: arguments.trajectories])
     frames = arguments.frames or world.episode_frames
-    core = OnlineTrajectory(optimizer, place.pair_head, max(frames, 2 * optimizer.block))
-    names = ("odometry", *(("online",) if arguments.online else ()), "corrected")
+    window = arguments.window_frames or max(frames, 2 * optimizer.block)
+    core = OnlineTrajectory(optimizer, place.pair_head, window, arguments.key_frames)
+    bounded = ("bounded",) if arguments.window_frames else ()
+    names = ("odometry", *(("online", *bounded) if arguments.online else ()), "corrected")
     errors: dict[str, list[TrajectoryError]] = {name: [] for name in names}
     with tqdm(total=len(seeds), desc=f"{world.name} {arguments.split}") as bar:
         for group in (seeds[i : i + 8] for i in range(0, len(seeds), 8)):
@@ -118,7 +125,8 @@ def main(arguments: Arguments) -> dict[str, object]:
                     "corrected": with_origin(corrected.numpy()),
                 }
                 if arguments.online:
-                    poses["online"] = online_poses(core, features)
+                    trajectory = run_online(core, features)
+                    poses["online"], poses["bounded"] = trajectory.online_xyyaw, trajectory.poses_xyyaw
                 for name in names:
                     errors[name].append(trajectory_error(poses[name], episode.poses_xyyaw))
                 bar.update()

@@ -6,21 +6,24 @@ import numpy as np
 import torch
 
 from ngo_estimator import se2
-from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.online_trajectory import OnlineTrajectory, Trajectory
 from ngo_estimator.relative_step import RelativeStep
 
 
-def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
-    """Each pose ``(steps + 1, 3)`` as it was first published, the origin in front, of the steps in ``features``.
-
-    ``features`` are those of ``features_of``, ``core`` forgets what it held.
-    """
+def run_online(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> Trajectory:
+    """The trajectory after all steps in ``features``, which are those of ``features_of``; ``core`` begins anew."""
     core.reset()
     for step in steps_of(features):
         core.update(step)
+    core.finish()
     trajectory = core.trajectory()
     assert trajectory is not None
-    return trajectory.online_xyyaw.copy()
+    return trajectory
+
+
+def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
+    """Each pose ``(steps + 1, 3)`` as it was first published, the origin in front; arguments as of ``run_online``."""
+    return run_online(core, features).online_xyyaw.copy()
 
 
 def steps_of(features: dict[str, np.ndarray]) -> Iterator[RelativeStep]:
