@@ -126,7 +126,7 @@ def main(arguments: Arguments) -> dict[str, object]:
                 }
                 if arguments.online:
                     trajectory = run_online(core, features)
-                    poses["online"], poses["bounded"] = trajectory.online_xyyaw, trajectory.poses_xyyaw
+                    poses["online"], poses["bounded"] = trajectory.online_xyyaw.copy(), trajectory.poses_xyyaw.copy()
                 for name in names:
                     errors[name].append(trajectory_error(poses[name], episode.poses_xyyaw))
                 bar.update()
