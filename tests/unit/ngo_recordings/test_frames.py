@@ -137,6 +137,19 @@ def test_truth_from_transforms_goes_through_the_tree(tmp_path: Path, latched_fir
         np.testing.assert_allclose(frame.pose_xyyaw, [99.5, 10.0 + k, math.pi / 2], atol=1e-9)
 
 
+def test_transforms_that_are_not_of_the_chain_may_be_late(tmp_path: Path) -> None:
+    """A detection that took 3 s, or a driver that leaves its stamps at 0, is no restart of the robot."""
+    entries: list[m.Entry] = []
+    for k in range(30):
+        at = m.transform(stamp(k), "map", "base_link", m.pose(float(k), 0.0, 0.0))
+        tag = m.transform(stamp(k) - 3 * S if k % 2 else 0, "camera", "tag", m.pose(1.0, 0.0, 0.0))
+        entries.append(("/image", stamp(k), m.image(stamp(k), pixels(k))))
+        entries.append(("/tf", stamp(k + 0.5), m.transforms(at, tag)))
+    topics = RecordingTopics("/image", ground_truth=GroundTruth(tf=("map", "base_link")))
+    found = read(m.write_mcap(tmp_path / "a.mcap", entries), topics)
+    assert [None if f.pose_xyyaw is None else f.pose_xyyaw[0] for f in found] == list(range(30))
+
+
 def test_truth_from_a_file_counts_by_the_same_rules(tmp_path: Path) -> None:
     path = m.write_mcap(tmp_path / "a.mcap", drive(6))
     truth = tmp_path / "truth.tum"

@@ -240,11 +240,14 @@ class TrueTransforms:
         self._tree = TransformTree(gap_ns)
 
     def restarts(self, message: Message) -> bool:
-        """Whether the chain's stamps jump back."""
-        until_ns = self._tree.known_until_ns(self._parent, self._child)
-        if until_ns is None or until_ns == 2**63 - 1 or _is_static(message):
+        """Whether the stamps of a transform of the chain jump back; other transforms may be as late as they like."""
+        newest_ns = self._tree.newest_ns(self._parent, self._child)
+        if not newest_ns or _is_static(message):
             return False
-        return any(header_stamp_ns(each) <= until_ns - RESTART_NS for each in message.value.transforms)
+        return any(
+            header_stamp_ns(each) <= newest_ns.get(each.child_frame_id.strip("/"), 0) - RESTART_NS
+            for each in message.value.transforms
+        )
 
     def add(self, message: Message) -> None:
         """Take all transforms of a message."""

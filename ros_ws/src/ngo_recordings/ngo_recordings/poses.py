@@ -142,16 +142,17 @@ class TransformTree:
 
     def known_until_ns(self, target: str, source: str) -> int | None:
         """Newest stamp at which the chain may be known; None where there is no chain."""
+        newest_ns = self.newest_ns(target, source)
+        return None if newest_ns is None else min(newest_ns.values(), default=2**63 - 1)
+
+    def newest_ns(self, target: str, source: str) -> dict[str, int] | None:
+        """Newest stamps of what moves in the chain, by child frame; None where there is no chain."""
         up_from_target, up_from_source = self._ancestors(target), self._ancestors(source)
-        if not set(up_from_target) & set(up_from_source):
-            return None
         shared = set(up_from_target) & set(up_from_source)
-        newest = [
-            self._moving[frame][1].newest_ns or 0
-            for frame in {*up_from_target, *up_from_source} - shared
-            if frame in self._moving
-        ]
-        return min(newest, default=2**63 - 1)
+        if not shared:
+            return None
+        chain = {*up_from_target, *up_from_source} - shared
+        return {frame: self._moving[frame][1].newest_ns or 0 for frame in chain if frame in self._moving}
 
     def frames(self) -> set[str]:
         """Names of all frames."""
