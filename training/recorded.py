@@ -48,6 +48,8 @@ class RecordedArguments:
     """How far two frames of one place may be apart; not given: four fast steps, 0.3 to 1 m."""
     heading_limit_deg: float | None = None
     """How far they may be turned against each other; not given: 35, or 180 for scanners that look around."""
+    scan_yaw_deg: float = 0.0
+    """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead; to be given live, too."""
     mirror: bool = True
     """Whether to learn from the frames' mirror images, too; not for sensors that sit far to one side."""
     from_weights: Path | None = None
@@ -63,6 +65,8 @@ class RecordedArguments:
             raise ValueError(f"data is {_names(self.data)}; expected each recording once")
         if self.reduction is not None and self.reduction < 1:
             raise ValueError(f"reduction is {self.reduction}; expected a whole number from 1 on")
+        if not math.isfinite(self.scan_yaw_deg):
+            raise ValueError(f"scan_yaw_deg is {self.scan_yaw_deg:g}; expected a finite number")
         if "/" in self.name or not self.name:
             raise ValueError(f"name is {self.name!r}; expected one that a folder can have")
 
@@ -141,23 +145,31 @@ def _opened(arguments: RecordedArguments, runs: Path) -> RecordedData:
     if arguments.from_weights is not None:
         image = load_local(arguments.from_weights)[0].config.image
     folder = runs / arguments.name / "data"
-    image, recordings, sha256 = make_store(folder, arguments.data, arguments.topics, image, arguments.reduction)
+    yaw_rad = math.radians(arguments.scan_yaw_deg)
+    image, recordings, sha256 = make_store(
+        folder, arguments.data, arguments.topics, image, arguments.reduction, yaw_rad
+    )
     period = period_s(recordings)
     tracks = [tracks_of(n, recording, period) if period else [] for n, recording in enumerate(recordings)]
     for recording, found in zip(recordings, tracks, strict=True):
         if not found:
             raise RecordingError(
-                f"{recording.name} has no {SHORTEST} frames in a row with a true pose, action and velocity as chosen: "
-                "see `python -m training.inspect_recording`"
+                f"{recording.name} has no {SHORTEST} frames in a row, one each {period:.3f} s as most of the "
+                "recordings, with a true pose, action and velocity as chosen: see `python -m "
+                "training.inspect_recording`, or leave it out"
             )
     parts = split(recordings, tracks, [arguments.data.index(path) for path in arguments.holdout], period)
     for part in PARTS:
         if not parts.tracks[part]:
-            raise RecordingError(f"the recordings are too short: no frames are left for {part} ({parts.words})")
+            raise RecordingError(
+                f"the recordings are too short: no {SHORTEST} frames in a row are left for {part}; expected a few "
+                f"thousand frames in all: record longer, or more drives ({'; '.join(parts.words)})"
+            )
     steps = sum(len(track) - 1 for track in parts.tracks["train"])
     if steps < FEWEST_STEPS:
         raise RecordingError(
-            f"the recordings are too short: {steps} steps to learn from; expected {FEWEST_STEPS} or more"
+            f"the recordings are too short: {steps} steps to learn from; expected {FEWEST_STEPS} or more: "
+            "record longer, or more drives"
         )
     data = RecordedData(
         domain_of(arguments, image, recordings, parts.tracks["train"], period), recordings, parts, sha256

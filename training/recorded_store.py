@@ -22,7 +22,8 @@ from ngo_estimator.observations import observation
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.frames import Frame, frames
 from ngo_recordings.recording import open_recording
-from ngo_recordings.topics import TopicArguments, choose_topics
+from ngo_recordings.topics import GroundTruth, TopicArguments, choose_topics
+from training.domains import MIRRORED_ACTIONS
 
 MOST_COLUMNS = 96
 """Pictures that are wider are made smaller, by the least whole factor."""
@@ -55,7 +56,12 @@ class StoredRecording:
 
 
 def make_store(
-    folder: Path, files: tuple[Path, ...], given: TopicArguments, image: ImageFormat | None, reduction: int | None
+    folder: Path,
+    files: tuple[Path, ...],
+    given: TopicArguments,
+    image: ImageFormat | None,
+    reduction: int | None,
+    scan_yaw_rad: float = 0.0,
 ) -> tuple[ImageFormat, list[StoredRecording], str]:
     """The format of the frames, the recordings, each file one, and a hash of what they were made from.
 
@@ -64,18 +70,19 @@ def make_store(
     Args:
         image: what the frames must become; None: what the first recording gives.
         reduction: how many times smaller pictures are made; None: what ``MOST_COLUMNS`` asks for.
+        scan_yaw_rad: where a scanner's angle 0 points, counter-clockwise from straight ahead.
 
     Raises:
         RecordingError: of one line, about a recording that cannot be used to train on.
     """
-    identity = _identity(files, given, image, reduction)
+    identity = _identity(files, given, image, reduction, scan_yaw_rad)
     index = folder / _INDEX
     if not index.exists() or json.loads(index.read_text())["identity"] != identity:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         described = []
         for number, path in enumerate(files):
-            image, values = _read(folder / str(number), path, given, image, reduction)
+            image, values = _read(folder / str(number), path, given, image, reduction, scan_yaw_rad)
             described.append(values)
         assert image is not None
         content = {"identity": identity, "image": dataclasses.asdict(image), "recordings": described}
@@ -88,30 +95,51 @@ def make_store(
     return image, recordings, hashlib.sha256(json.dumps(identity).encode()).hexdigest()
 
 
-def _identity(files: tuple[Path, ...], given: TopicArguments, image: ImageFormat | None, reduction: int | None) -> Any:
+def _identity(
+    files: tuple[Path, ...],
+    given: TopicArguments,
+    image: ImageFormat | None,
+    reduction: int | None,
+    scan_yaw_rad: float,
+) -> Any:
     """What the content of a store depends on, as JSON gives it back."""
-    found: list[Any] = [_VERSION, dataclasses.asdict(given), image and dataclasses.asdict(image), reduction]
+    settings = [dataclasses.asdict(given), image and dataclasses.asdict(image), reduction, scan_yaw_rad]
+    found: list[Any] = [_VERSION, *settings]
     for path in files:
         if not path.exists():
             raise RecordingError(f"there is no file {path}")
+    truth = None if given.ground_truth in (None, "none") else GroundTruth.parse(str(given.ground_truth)).tum
+    for path in (*files, *((truth,) if truth is not None and truth.exists() else ())):
         parts = sorted(path.iterdir()) if path.is_dir() else [path]
         found.append([str(path), [[part.name, part.stat().st_size, part.stat().st_mtime_ns] for part in parts]])
     return json.loads(json.dumps(found))
 
 
-def format_of(frame: Frame, reduction: int | None) -> ImageFormat:
-    """The format that fits a sensor: its resolution, made smaller where that is large, and a scan's field of view."""
+def format_of(frame: Frame, reduction: int | None, scan_yaw_rad: float = 0.0) -> ImageFormat:
+    """The format that fits a sensor: its resolution, made smaller where that is large, and a scan's field of view.
+
+    A format looks as far to the left as to the right: that of a scanner that does not, as far as its outermost ray.
+    """
     height, width, channels = frame.image.shape
     if frame.scan is not None:
-        view_deg = math.degrees((width - 1) * frame.scan.angle_increment_rad)
-        whole = view_deg + math.degrees(frame.scan.angle_increment_rad) > 359.5
-        return ImageFormat(1, min(width, MOST_RAYS), 1, "float32", 360.0 if whole else min(view_deg, 360.0))
+        step = frame.scan.angle_increment_rad
+        if math.degrees(width * step) > 359.5:
+            return ImageFormat(1, min(width, MOST_RAYS), 1, "float32", 360.0)
+        angles = frame.scan.angle_min_rad + scan_yaw_rad + step * np.arange(width)
+        half = float(np.abs((angles + math.pi) % math.tau - math.pi).max())
+        rays = min(round(2.0 * half / step) + 1, MOST_RAYS)
+        return ImageFormat(1, rays, 1, "float32", min(math.degrees(2.0 * half), 360.0))
     factor = reduction or (math.ceil(width / MOST_COLUMNS) if height > 1 else 1)
     return ImageFormat(height // factor, width // factor, channels, str(frame.image.dtype), reduction=factor)
 
 
 def _read(
-    folder: Path, path: Path, given: TopicArguments, image: ImageFormat | None, reduction: int | None
+    folder: Path,
+    path: Path,
+    given: TopicArguments,
+    image: ImageFormat | None,
+    reduction: int | None,
+    scan_yaw_rad: float,
 ) -> tuple[ImageFormat, dict[str, Any]]:
     """Write the arrays of a recording; returns the format of its frames, and what the index says of it."""
     folder.mkdir()
@@ -128,7 +156,12 @@ def _read(
             )
         count = recording.topics[topics.image].count
         for frame in tqdm(frames(recording, topics, skipped), desc=f"reading {path.name}", total=count):
-            image = _write_image(file, path, frame, image, reduction)
+            image = _write_image(file, path, frame, image, reduction, scan_yaw_rad)
+            if frame.action is not None and frame.action >= len(MIRRORED_ACTIONS):
+                raise RecordingError(
+                    f"{path}: {topics.action} holds action {frame.action}; expected 0 to {len(MIRRORED_ACTIONS) - 1}: "
+                    "leave it out with --action none"
+                )
             columns["stamps_ns"].append(frame.stamp_ns)
             columns["poses_xyyaw"].append(none if frame.pose_xyyaw is None else frame.pose_xyyaw)
             columns["residuals"].append(none if frame.pose_residual is None else frame.pose_residual)
@@ -149,11 +182,11 @@ def _read(
 
 
 def _write_image(
-    file: BinaryIO, path: Path, frame: Frame, image: ImageFormat | None, reduction: int | None
+    file: BinaryIO, path: Path, frame: Frame, image: ImageFormat | None, reduction: int | None, scan_yaw_rad: float
 ) -> ImageFormat:
     try:
-        image = image or format_of(frame, reduction)
-        file.write(np.ascontiguousarray(observation(image, frame.image, frame.scan)).tobytes())
+        image = image or format_of(frame, reduction, scan_yaw_rad)
+        file.write(np.ascontiguousarray(observation(image, frame.image, frame.scan, scan_yaw_rad)).tobytes())
     except ValueError as error:
         raise RecordingError(
             f"{path}: {error}: the recordings (and the weights to begin with) must be of one sensor"

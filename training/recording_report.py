@@ -20,6 +20,10 @@ REVISIT_M = 1.0
 """A place is visited again where the path comes this close to where it was before..."""
 REVISIT_AFTER_M = 5.0
 """...after at least this long a way."""
+FEW_REVISITS = 0.05
+"""Share of the frames; with less there is little to learn loops from."""
+FEW_FRAMES = 200
+"""Of one recording."""
 SAMPLES = 6
 """How many images of a recording are kept to be shown."""
 _REVISIT_FRAMES = 5000
@@ -342,3 +346,10 @@ class _Findings:
             yield f"{truth} jumps by {self.motion.step_m[2]:.2f} m in a step: choose one that is smooth, or cut there"
         if self.motion.path_m < 1.0:
             yield f"the robot moves {self.motion.path_m:.2f} m in all: drive further to have something to learn from"
+        elif self.motion.revisits < FEW_REVISITS:
+            yield (
+                f"{self.motion.revisits:.0%} of the frames show a place that was passed before: loops are learned "
+                "where the robot comes by again, so drive rounds"
+            )
+        if self.have["pose"] < FEW_FRAMES:
+            yield f"{self.have['pose']} frames with a true pose are few to learn from: record a few thousand in all"

@@ -116,6 +116,8 @@ def twice(entries: list[m.Entry]) -> list[m.Entry]:
         (lambda _: drive(square(), late_s=3.0), {}, r"/ground_truth is stamped \+3.00 s from /image: the clocks"),
         (lambda _: drive(square(), tilt=math.pi / 2), {}, "tilts by up to 90 deg.*optical frame"),
         (lambda _: drive(0.001 * square()), {}, "the robot moves 0.06 m in all"),
+        (lambda _: drive(square()[:120]), {}, "120 frames with a true pose are few .*: record"),
+        (lambda _: drive(square()[:120]), {}, "0% of the frames show a place that was passed before: .* drive rounds"),
         (twice, {}, "stamps of /image repeat or go back"),
     ],
 )

@@ -1,19 +1,22 @@
 """Recordings as training data: what is read, what is for what, and what is said of those that cannot be used."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ngo_estimator.images import ImageFormat
+from ngo_estimator.observations import observation
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.frames import Frame
 from ngo_recordings.images import ScanGeometry
 from ngo_recordings.topics import TopicArguments
+from tests.unit.ngo_recordings import messages as m
 from tests.unit.training import drives
 from training import recorded
 from training.recorded import RecordedArguments, open_recorded
-from training.recorded_store import format_of, make_store
+from training.recorded_store import MOST_RAYS, format_of, make_store
 from training.recorded_tracks import PARTS
 
 FRAMES = 900
@@ -128,3 +131,39 @@ def test_the_format_follows_the_sensor() -> None:
     assert scan.shape == (1, 181, 1) and scan.field_of_view_deg == pytest.approx(180.0)
     whole = ScanGeometry(-np.pi, np.pi / 180, 0.1, 10.0)
     assert format_of(Frame(0, np.ones((1, 360, 1), np.float32), whole), None).field_of_view_deg == 360.0
+
+
+def test_a_scanner_that_looks_to_one_side_keeps_all_its_rays() -> None:
+    ranges = np.linspace(1.0, 2.0, 181, dtype=np.float32)[None, :, None]  # leftmost ray first
+    left_half = Frame(0, ranges, ScanGeometry(0.0, np.pi / 180, 0.1, 10.0))
+    image = format_of(left_half, None)
+    assert image.field_of_view_deg == pytest.approx(360.0) and image.width == MOST_RAYS
+    seen = observation(image, left_half.image, left_half.scan)
+    assert seen[np.isfinite(seen)].min() == 1.0 and seen[np.isfinite(seen)].max() == 2.0
+    turned = math.radians(-90.0)  # mounted so that the middle of its view is straight ahead
+    image = format_of(left_half, None, turned)
+    assert image.field_of_view_deg == pytest.approx(180.0) and image.width == 181
+    np.testing.assert_allclose(observation(image, left_half.image, left_half.scan, turned), ranges, atol=1e-6)
+
+
+def test_a_true_trajectory_that_changes_is_read_anew(files: list[Path], tmp_path: Path) -> None:
+    def truth(x: float) -> float:
+        file.write_text("".join(f"{1.0 + 0.1 * k:.9f} {x + k} 0 0 0 0 0 1\n" for k in range(FRAMES)))
+        given = TopicArguments(ground_truth=str(file))
+        _, (stored,), _ = make_store(tmp_path / "store", (files[0],), given, None, None)
+        return float(stored.poses_xyyaw[0, 0])
+
+    file = tmp_path / "truth.tum"
+    assert (truth(0.0), truth(10.0)) == (0.0, 10.0)
+
+
+def test_actions_that_no_network_knows_are_refused(tmp_path: Path) -> None:
+    entries: list[m.Entry] = []
+    for k in range(FRAMES):
+        at = m.odometry(k * 10**8, m.pose(0.1 * k, 0.0, 0.0), m.twist(1.0, 0.0, 0.0))
+        entries.append(("/ground_truth", k * 10**8, at))
+        entries.append(("/image", k * 10**8, m.image(k * 10**8, drives.picture(k, 0))))
+        entries.append(("/action", k * 10**8, m.action(k * 10**8, 3)))
+    path = m.write_mcap(tmp_path / "drive.mcap", entries)
+    with pytest.raises(RecordingError, match=r"/action holds action 3; expected 0 to 2: .*--action none"):
+        open_recorded(RecordedArguments(data=(path,)), tmp_path)
