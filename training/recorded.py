@@ -93,6 +93,7 @@ class RecordedData:
     recordings: list[StoredRecording]
     parts: Split
     sha256: str
+    scan_yaw_deg: float = 0.0
 
     def tracks(self, *parts: Part) -> list[Track]:
         """The tracks of some parts."""
@@ -115,6 +116,7 @@ class RecordedData:
             "split": list(self.parts.words),
             "period_s": self.domain.period_s,
             "place_radius_m": self.domain.place_radius_m,
+            "scan_yaw_deg": self.scan_yaw_deg,
             "projection_residual": self.residual,
         }
 
@@ -171,9 +173,8 @@ def _opened(arguments: RecordedArguments, runs: Path) -> RecordedData:
             f"the recordings are too short: {steps} steps to learn from; expected {FEWEST_STEPS} or more: "
             "record longer, or more drives"
         )
-    data = RecordedData(
-        domain_of(arguments, image, recordings, parts.tracks["train"], period), recordings, parts, sha256
-    )
+    domain = domain_of(arguments, image, recordings, parts.tracks["train"], period)
+    data = RecordedData(domain, recordings, parts, sha256, arguments.scan_yaw_deg)
     _print(data)
     return data
 
