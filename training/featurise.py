@@ -228,23 +228,23 @@ def _fill(
 
 
 def check_networks(store: Path, local_description: dict[str, Any], place_description: dict[str, Any]) -> None:
-    """Raise ``ValueError`` if what is in ``store`` was made with other networks than those described."""
+    """Raise ``RunError`` if what is in ``store`` was made with other networks than those described."""
     path, networks = store / _MADE_WITH, [local_description["sha256"], place_description["sha256"]]
     if path.exists() and json.loads(path.read_text()) != networks:
-        raise ValueError(f"{store} was made with other networks than the present ones; remove it to make it anew")
+        raise runs.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
 def open_store(store: Path, with_compass: bool = False) -> dict[str, np.ndarray]:
-    """The arrays of a whole feature store, memory-mapped; raises ``ValueError`` if it is not whole."""
+    """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
     names = ["relative", "log_std", "motion", "codes", "truth", *(_COMPASS if with_compass else ())]
     hint = "run `python -m training.featurise` first"
     if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
-        raise ValueError(f"{store} lacks {missing}; expected a feature store: {hint}")
+        raise runs.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")
     arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in names}
     count = len(arrays["relative"])
     for name in ["done", *(["compass_done"] if with_compass else [])]:
         if left := set(range(0, count, _GROUP)) - _done(store, name):
-            raise ValueError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
+            raise runs.RunError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
     return arrays
 
 
@@ -262,7 +262,7 @@ def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:
         unfinished.unlink()
     array: np.memmap = np.load(path, mmap_mode="r+")
     if array.shape != shape:
-        raise ValueError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")
+        raise runs.RunError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")
     return array
 
 

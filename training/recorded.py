@@ -22,6 +22,7 @@ from ngo_recordings.topics import TopicArguments
 from training.domains import MIRRORED_ACTIONS, Domain
 from training.recorded_store import StoredRecording, make_store
 from training.recorded_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
+from training.runs import RunError
 from training.streams import relative_poses
 
 NO_LOOPS = "no_loops"
@@ -72,10 +73,10 @@ class RecordedArguments:
 
 
 def run_script(main: Callable[[Any], object], arguments: type[Any], description: str | None) -> None:
-    """Run a script with the command line's arguments; what recordings or weights lack ends it with one line."""
+    """Run a script with the command line's arguments; what recordings, weights or runs lack ends it with one line."""
     try:
         main(tyro.cli(arguments, description=description))
-    except (RecordingError, CheckpointError) as error:
+    except (RecordingError, CheckpointError, RunError) as error:
         sys.exit(f"unusable: {error}")
 
 

@@ -128,7 +128,7 @@ def format_of(frame: Frame, reduction: int | None, scan_yaw_rad: float = 0.0) ->
         angles = frame.scan.angle_min_rad + scan_yaw_rad + step * np.arange(width)
         half = float(np.abs((angles + math.pi) % math.tau - math.pi).max())
         rays = min(round(2.0 * half / step) + 1, MOST_RAYS)
-        return ImageFormat(1, rays, 1, "float32", min(math.degrees(2.0 * half), 360.0))
+        return ImageFormat(1, rays, 1, "float32", min(round(math.degrees(2.0 * half), 3), 360.0))
     factor = reduction or (math.ceil(width / MOST_COLUMNS) if height > 1 else 1)
     return ImageFormat(height // factor, width // factor, channels, str(frame.image.dtype), reduction=factor)
 

@@ -20,6 +20,10 @@ ROOT = Path(__file__).resolve().parents[1]
 WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
 
 
+class RunError(ValueError):
+    """What lies in the folder of a run, or was asked of it, does not fit: one line that says what to do."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainerArguments:
     """Where and how a training computes: what the arguments of every training script begin with."""
@@ -169,7 +173,7 @@ class Run:
         if differing:
             given = ", ".join(f"{name} {now.get(name)}" for name in differing)
             expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
-            raise ValueError(
+            raise RunError(
                 f"{self.folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, "
                 "or the folder removed to begin anew"
             )
@@ -230,7 +234,7 @@ def one_cycle(optimizer: torch.optim.Optimizer, trainer: lightning.Trainer) -> d
     """Warm-up over a tenth of the training, then a cosine to zero, in the form that Lightning takes."""
     steps = int(trainer.estimated_stepping_batches)
     if steps < 3:
-        raise ValueError(f"the training has {steps} step(s) of the optimiser; expected at least 3, to warm up and cool")
+        raise RunError(f"the training has {steps} step(s) of the optimiser; expected at least 3, to warm up and cool")
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer,
         [group["lr"] for group in optimizer.param_groups],

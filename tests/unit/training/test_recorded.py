@@ -15,9 +15,10 @@ from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_recordings import messages as m
 from tests.unit.training import drives
 from training import recorded
-from training.recorded import RecordedArguments, open_recorded
+from training.recorded import RecordedArguments, open_recorded, run_script
 from training.recorded_store import MOST_RAYS, format_of, make_store
 from training.recorded_tracks import PARTS
+from training.runs import RunError
 
 FRAMES = 900
 
@@ -167,3 +168,12 @@ def test_actions_that_no_network_knows_are_refused(tmp_path: Path) -> None:
     path = m.write_mcap(tmp_path / "drive.mcap", entries)
     with pytest.raises(RecordingError, match=r"/action holds action 3; expected 0 to 2: .*--action none"):
         open_recorded(RecordedArguments(data=(path,)), tmp_path)
+
+
+def test_a_run_that_does_not_fit_ends_a_script_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def main(_: object) -> None:
+        raise RunError("the folder holds another run")
+
+    monkeypatch.setattr("sys.argv", ["train_local"])
+    with pytest.raises(SystemExit, match=r"^unusable: the folder holds another run$"):
+        run_script(main, RecordedArguments, None)
