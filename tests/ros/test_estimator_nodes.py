@@ -377,7 +377,7 @@ local_node image_topic:='a/'       parameter 'image_topic' is 'a/'; allowed: a t
 local_node image_depth:=5.5        parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000
 local_node action_timeout_s:=.nan  parameter 'action_timeout_s' is nan; allowed: a number from 0.001 to 60
 local_node publish_tf:=1           parameter 'publish_tf' is 1; allowed: true or false
-ngo_node   window_frames:=one      parameter 'window_frames' is 'one'; allowed: an integer from 2 to 100000
+ngo_node   window_frames:=one      parameter 'window_frames' is 'one'; allowed: an integer from 16 to 100000
 ngo_node   window_frames:=4000     parameter 'relative_pose_depth' is 2000; allowed: at least window_frames
 ngo_node   map_frame:=odom         parameter 'map_frame' is 'odom'; allowed: another name than odom_frame's
 ngo_node   publish_tf              Couldn't parse parameter override rule: '-p publish_tf'
