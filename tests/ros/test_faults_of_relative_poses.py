@@ -250,11 +250,14 @@ def test_of_two_publishers_the_first_is_held_and_both_are_named(optimizer: Optim
 
 def test_a_subscriber_that_stalls_holds_nobody_up(optimizer: Optimizer) -> None:
     """A stopped process with a reliable subscription to the path: poses go on, and it may come back."""
+    others = optimizer.probe.node.count_subscribers("ngo/path")
     listener = subprocess.Popen(
         [sys.executable, "-m", "tests.ros.listener", "ngo/path"], stdout=subprocess.PIPE, text=True
     )
     try:
-        optimizer.probe.spin_until(lambda: optimizer.probe.node.count_subscribers("ngo/path") == 1, "the listener")
+        optimizer.probe.spin_until(
+            lambda: optimizer.probe.node.count_subscribers("ngo/path") == others + 1, "the listener"
+        )
         drive = optimizer.drive()
         optimizer.publish(*drive.steps(1, 8))
         optimizer.wait_for_stamp(drive.stamp_ns(8))
