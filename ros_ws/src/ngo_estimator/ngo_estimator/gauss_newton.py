@@ -4,6 +4,7 @@ Unknown are all poses after the origin, in the map. Each factor compares two of 
 squared residuals, each weighted with its information. Differentiable by everything that is given as a tensor.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from ngo_estimator import se2
 
-_RELATIVE_JITTER = 1e-12
+RELATIVE_JITTER = 1e-12
 """Added to the diagonal, in units of itself: what the rounding of some hundred poses can take from it."""
 
 
@@ -73,15 +74,22 @@ def pair_factors(nodes: Tensor, poses: Tensor, residual: Tensor, information: Te
     return Factors(nodes, torch.stack(rows, dim=-2), residual, information)
 
 
-def gauss_newton_step(factors: list[Factors], count: int) -> Tensor:
-    """Changes ``(batch, count, 3)``, float64, of the poses of nodes 0 to ``count - 1``; node 0 stays where it is."""
+def normal_blocks(factors: Sequence[Factors]) -> tuple[Tensor, Tensor, Tensor]:
+    """Nodes of all factors ``(batch, n, 2)``, and what each adds to the normal equations of its two, float64.
+
+    That is a matrix ``(batch, n, 6, 6)`` and a right hand side ``(batch, n, 6)``.
+    """
     nodes = torch.cat([f.nodes for f in factors], dim=1)
     jacobian = torch.cat([f.jacobian for f in factors], dim=1).double()
     information = torch.cat([f.information for f in factors], dim=1).double()
     residual = torch.cat([f.residual for f in factors], dim=1).double()
     weighted = jacobian * information.unsqueeze(-1)
-    hessian = weighted.mT @ jacobian
-    gradient = (weighted.mT @ residual.unsqueeze(-1)).squeeze(-1)
+    return nodes, weighted.mT @ jacobian, (weighted.mT @ residual.unsqueeze(-1)).squeeze(-1)
+
+
+def gauss_newton_step(factors: list[Factors], count: int) -> Tensor:
+    """Changes ``(batch, count, 3)``, float64, of the poses of nodes 0 to ``count - 1``; node 0 stays where it is."""
+    nodes, hessian, gradient = normal_blocks(factors)
     step: Tensor = _Solve.apply(hessian, gradient, nodes, count)  # type: ignore[no-untyped-call]
     return step
 
@@ -89,10 +97,8 @@ def gauss_newton_step(factors: list[Factors], count: int) -> Tensor:
 @torch.no_grad()
 def node_covariance(factors: list[Factors], count: int, node: int) -> Tensor:
     """Covariance ``(batch, 3, 3)`` of one node's pose in the map, float64, given all factors and the origin."""
-    nodes = torch.cat([f.nodes for f in factors], dim=1)
-    jacobian = torch.cat([f.jacobian for f in factors], dim=1).double()
-    information = torch.cat([f.information for f in factors], dim=1).double()
-    factor = _factorised((jacobian * information.unsqueeze(-1)).mT @ jacobian, nodes, count)
+    nodes, hessian, _ = normal_blocks(factors)
+    factor = _factorised(hessian, nodes, count)
     right = torch.zeros(factor.shape[0], factor.shape[1], 3, dtype=factor.dtype, device=factor.device)
     first = 3 * (node - 1)
     right[:, first : first + 3] = torch.eye(3, dtype=factor.dtype, device=factor.device)
@@ -132,7 +138,7 @@ def _factorised(hessian: Tensor, nodes: Tensor, count: int) -> Tensor:
     flat = rows.unsqueeze(-1) * size + rows.unsqueeze(-2)
     matrix = hessian.new_zeros(batch, size * size).scatter_add(1, flat.flatten(1), hessian.flatten(1))
     matrix = matrix.unflatten(1, (size, size))[:, 3:, 3:]
-    matrix.diagonal(dim1=-2, dim2=-1).mul_(1.0 + _RELATIVE_JITTER)
+    matrix.diagonal(dim1=-2, dim2=-1).mul_(1.0 + RELATIVE_JITTER)
     return torch.linalg.cholesky(matrix)
 
 

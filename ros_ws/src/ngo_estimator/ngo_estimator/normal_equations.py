@@ -12,10 +12,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ngo_estimator.gauss_newton import Factors
-
-_RELATIVE_JITTER = 1e-12
-"""Added to the diagonal, in units of itself: what the rounding of some hundred poses can take from it."""
+from ngo_estimator.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
 
 _SYMMETRIC = {"SymmetricMode": True}
 
@@ -65,7 +62,7 @@ class GraphStructure:
         parts = hessian.unflatten(-1, (2, 3)).unflatten(-3, (2, 3)).transpose(2, 3).reshape(-1, 9)
         summed = torch.zeros(len(self._is_diagonal) + 1, 9, dtype=torch.float64).index_add_(0, self._block, parts)
         blocks = summed[:-1].numpy()
-        blocks[self._is_diagonal, ::4] *= 1.0 + _RELATIVE_JITTER
+        blocks[self._is_diagonal, ::4] *= 1.0 + RELATIVE_JITTER
         data = np.empty(9 * len(blocks))
         data[self._place] = blocks.reshape(-1, 3, 3)
         size = 3 * (self.count - 1)
@@ -88,16 +85,11 @@ class NormalEquations:
 
     def __init__(self, factors: Sequence[Factors], structure: GraphStructure) -> None:
         """Sum the factors of a batch of one; raises ``RuntimeError`` where a pose has no factor at all."""
-        jacobian, information, residual, nodes = (
-            torch.cat([getattr(f, name)[0] for f in factors])
-            for name in ("jacobian", "information", "residual", "nodes")
-        )
-        weighted = jacobian.double() * information.double().unsqueeze(-1)
-        gradient = (weighted.mT @ residual.double().unsqueeze(-1)).squeeze(-1)
+        nodes, hessian, gradient = (blocks[0] for blocks in normal_blocks(factors))
         self._structure = structure
         self._right = torch.zeros(structure.count, 3, dtype=torch.float64)
         self._right.index_add_(0, nodes.flatten(), gradient.reshape(-1, 3))
-        matrix = structure.matrix(weighted.mT @ jacobian.double())
+        matrix = structure.matrix(hessian)
         self._factor = splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
 
     def step(self) -> Tensor:
