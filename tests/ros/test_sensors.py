@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
 from PIL import Image as Picture
-from sensor_msgs.msg import CompressedImage, LaserScan
+from sensor_msgs.msg import CompressedImage, Image, LaserScan
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint, write_untrained
@@ -28,6 +28,7 @@ FRAMES = 25
 STEP_NS = 100_000_000
 CAMERA = ImageFormat(12, 16, 1, "uint8")
 RELIABLE = {"image_reliability": "reliable", "image_depth": 1000}
+WAITING = {"wait_for_flow_control": True, "wait_for_subscribers": 1}
 
 
 @pytest.fixture
@@ -51,8 +52,9 @@ def test_the_simulators_laser_becomes_odometry(probe: Probe, tmp_path: Path) -> 
     core = LocalOdometry.load(tmp_path, "scan")
     scans, odometry = probe.collect(LaserScan, "scan"), probe.collect(Odometry, "odom")
     relative_poses = probe.collect(RelativePose, "relative_pose")
+    probe.collect(Image, "image")  # last: the simulator waits for this one
     settings = {"world": "scan", "weights": str(tmp_path), **RELIABLE}
-    maze = {"frames": FRAMES, "rate": 0.0, "flow_control_topics": ["odom"], "wait_for_flow_control": True}
+    maze = {"frames": FRAMES, "rate": 0.0, "flow_control_topics": ["odom"], **WAITING}
     with NodeProcess("ngo_estimator", "local_node", settings) as local:
         local.wait_for_log("ready: scan, LaserScan on 'scan'")
         probe.spin_until(lambda: probe.node.count_publishers("odom"), "the estimator")
@@ -127,7 +129,8 @@ def test_the_shipped_scan_model_follows_the_simulator(probe: Probe) -> None:
     frames = 160
     truth, odometry = probe.collect(Odometry, "ground_truth"), probe.collect(Odometry, "odom")
     poses = probe.collect(PoseWithCovarianceStamped, "ngo/pose")
-    maze = {"frames": frames, "rate": 0.0, "seed": 1500, "wait_for_flow_control": True}
+    probe.collect(Image, "image")  # last: the simulator waits for this one
+    maze = {"frames": frames, "rate": 0.0, "seed": 1500, **WAITING}
     with (
         NodeProcess("ngo_estimator", "local_node", {"world": "scan", **RELIABLE}) as local,
         NodeProcess("ngo_estimator", "ngo_node", {"world": "scan"}) as ngo,
