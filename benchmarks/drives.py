@@ -31,21 +31,22 @@ PERIOD_NS = 28_571_429
 
 CACHE = ROOT / "runs" / "benchmarks"
 _CHUNK = 1000
-_NAMES = ("relative", "log_std", "motion", "codes", "truth")
+_NAMES = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
 
 
 @dataclass(frozen=True)
 class Drive:
     """A drive of ``n`` steps, as ``training.featurise`` has them: arrays ``(n, ...)`` that may lie in files.
 
-    ``relative`` and ``log_std`` ``(n, 3)`` (m, m, rad), ``motion`` and ``codes``, and the true poses ``(n, 3)`` after
-    each step, seen from the first frame.
+    ``relative`` and ``log_std`` ``(n, 3)`` (m, m, rad), ``motion`` and ``codes``, the code ``(1, code_length)`` of the
+    first frame, and the true poses ``(n, 3)`` after each step, seen from it.
     """
 
     relative: np.ndarray
     log_std: np.ndarray
     motion: np.ndarray
     codes: np.ndarray
+    origin_code: np.ndarray
     truth: np.ndarray
 
     def __len__(self) -> int:
@@ -69,6 +70,7 @@ class Drive:
                 odom_xyyaw=odom,
                 motion_feature=self.motion[index].astype(np.float32),
                 place_code=self.codes[index].astype(np.float32),
+                from_place_code=None if index else self.origin_code[0].astype(np.float32),
             )
 
 
@@ -116,6 +118,9 @@ def drive_of(world_name: str, seed: int, steps: int, cache: Path = CACHE) -> Dri
             parts = features_of(world, episode, weights, (local, place))
             first_pose = first_pose if done else episode.poses_xyyaw[:1]
             parts["truth"] = seen_from_first(np.concatenate((first_pose, episode.poses_xyyaw[1:])))[1:]
+            origin_code = parts.pop("origin_code")
+            if not done:
+                np.save(unfinished / "origin_code.npy", origin_code)
             for name, part in parts.items():
                 if not done:
                     shape = (steps, *part.shape[1:])

@@ -63,12 +63,15 @@ def attention_of(
         raise ValueError("this optimizer has no attention; expected one with a network")
     steps = arrays["relative"].shape[1] // optimizer.block * optimizer.block
     for k in range(len(arrays["relative"])):
-        names = ("relative", "log_std", "motion", "codes")
-        relative, log_std, motion, codes = (
+        names = ("relative", "log_std", "motion", "codes", "origin_code")
+        relative, log_std, motion, codes, origin = (
             torch.from_numpy(np.array(arrays[name][k : k + 1, :steps], dtype=np.float32)) for name in names
         )
         with torch.inference_mode():
-            loops = optimizer.find_loops(relative, codes, pair_head) if optimizer.config.loops else None
+            loops = None
+            if optimizer.config.loops:
+                relative, log_std = optimizer.registered(relative, log_std, codes, pair_head, origin[:, 0])
+                loops = optimizer.find_loops(relative, codes, pair_head)
             attended: list[Tensor] = []
 
             def keep(_: nn.Module, inputs: tuple[Tensor], __: Tensor, kept: list[Tensor] = attended) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from ngo_estimator.images import ImageFormat
+from ngo_estimator.scan_registration import RegistrationConfig
 
 MIRRORED_ACTIONS = (0, 2, 1)
 """What the actions of ngo_msgs/DiscreteAction become in a mirror: forward stays, left and right change places."""
@@ -15,7 +16,8 @@ class Domain:
     ``actions`` is the number of discrete actions (0: networks see images alone), ``mirrored_actions`` what each of them
     becomes in a mirror, ``block_m`` the length that errors of positions are measured by (a corridor's width).
     ``place_radius_m`` and ``heading_limit_rad`` say how far two frames of one place may be apart and turned against
-    each other, ``loop_views`` between how many pairs of frames a loop is measured. ``reverses`` says that the robot may
+    each other, ``loop_views`` between how many pairs of frames a loop is measured, and ``registration`` how frames are
+    registered, where they are scans with ranges good enough for it. ``reverses`` says that the robot may
     drive backwards. With ``twist`` the networks are told the velocity of each step, which they divide by
     ``twist_scale`` (m/s, m/s, rad/s). ``mirrors`` says that a frame seen in a mirror is a frame that could be.
     """
@@ -27,6 +29,7 @@ class Domain:
     place_radius_m: float
     heading_limit_rad: float
     loop_views: int
+    registration: RegistrationConfig | None = None
     reverses: bool = False
     actions: int = 3
     mirrored_actions: tuple[int, ...] = MIRRORED_ACTIONS

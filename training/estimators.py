@@ -14,15 +14,17 @@ from torch import Tensor
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to_read
+from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import loop_factors
 from training.compass_factors import found_fixes
 from training.featurise import open_store
+from training.loop_factors import Seen
 from training.pose_graph import PoseGraphSettings, optimize, optimize_exact
 from training.rows import ROWS, Sources
-from training.tune_pose_graph import fit_calibration, load_settings
+from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
 
 Arrays = dict[str, np.ndarray]
 """Arrays of a feature store ``(trajectories, steps, ...)``; readings of a compass are of ``frames_to_read``."""
@@ -61,14 +63,17 @@ def estimators(row: str, seeds: int, sources: Sources) -> list[Estimator]:
         return [_trained(own, own.networks)]
     if kind.form is not None:
         return [_trained(sources, sources.row_folder(row, seed)) for seed in range(seeds)]
-    settings = load_settings(sources.settings_file(kind.compass))
     place, description = load_place(sources.networks, sources.world.name)
+    if row == "registered":
+        return [Estimator(lambda arrays: registered(arrays, place.pair_head), f"{row} {description['sha256']}")]
+    form = "compass" if kind.compass else "registered" if kind.registered else "loops"
+    settings = load_settings(sources.settings_file(form))
     identity = f"{row} {json.dumps(dataclasses.asdict(settings))} {description['sha256']}"
     return [Estimator(pose_graph(row, settings, place.pair_head, sources.world.block_m), identity)]
 
 
 def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
-    """What there was after so many steps."""
+    """What there was after so many steps; the first frame's place code stays."""
     read = len(frames_to_read(steps, _BLOCK))
     return {name: array[:, : read if name in COMPASS_ARRAYS else steps] for name, array in arrays.items()}
 
@@ -76,6 +81,19 @@ def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
 def local(arrays: Arrays) -> np.ndarray:
     """The odometry alone."""
     return se2.r2g(_float64(arrays["relative"])).numpy()
+
+
+def registered(arrays: Arrays, pair_head: PairHead) -> np.ndarray:
+    """The odometry as our optimizer takes it."""
+    seen = seen_in(prefix(arrays, _whole(arrays["relative"].shape[1], _BLOCK)))
+    steps, _ = loop_factors.registered_odometry(pair_head, seen, LoopSearch(registrations=REGISTRATIONS), _BLOCK)
+    return _with_tail(se2.r2g(_float64(steps)), _float64(arrays["relative"])).numpy()
+
+
+def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
+    """What loops are found in, with the odometry of the arrays, or another one."""
+    steps = arrays["relative"] if relative is None else relative
+    return Seen(steps, arrays["log_std"], arrays["codes"], arrays["origin_code"])
 
 
 def calibration_of(sources: Sources) -> dict[str, tuple[float, float, float]]:
@@ -114,8 +132,10 @@ def optimized_by(
         for first in range(0, len(arrays["relative"]), _TOGETHER):
             some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
             whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
-            odometry, config = (whole["relative"], whole["log_std"]), optimizer.config
-            loops = optimizer.find_loops(odometry[0], whole["codes"], pair_head) if config.loops else None
+            odometry, config, loops = (whole["relative"], whole["log_std"]), optimizer.config, None
+            if config.loops:
+                odometry = optimizer.registered(*odometry, whole["codes"], pair_head, whole["origin_code"][:, 0])
+                loops = optimizer.find_loops(odometry[0], whole["codes"], pair_head)
             fixes = None
             if config.compass:
                 reading, scale = (whole[name] for name in COMPASS_ARRAYS)
@@ -134,22 +154,26 @@ def pose_graph(
 
     def poses(arrays: Arrays) -> np.ndarray:
         whole = prefix(arrays, _whole(arrays["relative"].shape[1], settings.block))
-        odometry = list(zip(whole["relative"], whole["log_std"], strict=True))
-        relative, codes, truth = settings.calibrated(whole["relative"]), whole["codes"], whole["truth"]
+        truth, seen = whole["truth"], seen_in(whole, settings.calibrated(whole["relative"]))
+        steps = whole["relative"], whole["log_std"]
+        if ROWS[row].registered:
+            steps = loop_factors.registered_odometry(pair_head, seen, settings.search, settings.block)
+        odometry = list(zip(*steps, strict=True))
         if row == "oracle":
             solved = [optimize_exact(*one, true, settings) for one, true in zip(odometry, truth, strict=True)]
         else:
             if row == "true_pairs":
+                measured_revisits, of_search = loop_factors.measured_revisits, (settings.search, settings.block)
                 loops = [
-                    loop_factors.measured_revisits(pair_head, *one, settings.search, settings.block)
-                    for one in zip(relative, codes, truth, strict=True)
+                    measured_revisits(pair_head, seen.part(slice(k, k + 1)), true, *of_search)
+                    for k, true in enumerate(truth)
                 ]
             else:
-                loops = loop_factors.found_loops(pair_head, relative, codes, settings.search, settings.block)
-            fixes: Sequence[CompassFixes | None] = [None] * len(relative)
+                loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
+            fixes: Sequence[CompassFixes | None] = [None] * len(truth)
             if ROWS[row].compass:
                 reading, scale = (whole[name] for name in COMPASS_ARRAYS)
-                fixes = found_fixes(reading, scale, relative, whole["log_std"], settings.block, block_m)
+                fixes = found_fixes(reading, scale, seen.relative, whole["log_std"], settings.block, block_m)
             added = zip(odometry, loops, fixes, strict=True)
             solved = [optimize(*one, found, settings, fix) for one, found, fix in added]
         left = torch.from_numpy(settings.calibrated(arrays["relative"]))

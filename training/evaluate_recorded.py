@@ -28,7 +28,7 @@ from training.recorded_tracks import Track
 from training.streams import relative_poses
 from training.trained import learning_curve
 
-FEATURES = ("relative", "log_std", "motion", "codes")
+FEATURES = ("relative", "log_std", "motion", "codes", "origin_code")
 COLORS = {"odometry": "#2ca02c", "online": "#9467bd", "corrected": "#ff7f0e"}
 _MEAN_STEP = "mean step"
 _CURVES = {

@@ -29,6 +29,7 @@ from ngo_estimator.online_trajectory import optimize_offline
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2DConfig
 from training import runs
+from training.evaluate_recorded import FEATURES
 from training.featurise import features_of
 from training.metrics import TrajectoryError, path_length_m, trajectory_error
 from training.scans import ScannedMaze
@@ -112,7 +113,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
             lengths = []
             for episode in episodes(row, arguments.trajectories, arguments.frames):
                 features = features_of(world, episode, folder, (local, place))
-                arrays = [torch.from_numpy(features[name]) for name in ("relative", "log_std", "motion", "codes")]
+                arrays = [torch.from_numpy(features[name]) for name in FEATURES]
                 corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
                 for name, poses in (("odometry", se2.r2g(arrays[0])), ("corrected", corrected)):
                     from_origin = np.concatenate((np.zeros((1, 3)), poses.numpy()))

@@ -112,7 +112,7 @@ def features_of_track(domain: Domain, track: Track, networks: Networks, mirror: 
 def step_features(
     frames: Callable[[slice], Tensor], told_steps: Batch, poses_xyyaw: np.ndarray, networks: Networks
 ) -> dict[str, np.ndarray]:
-    """Features of ``steps`` steps, and the true poses after each of them, seen from the first frame.
+    """Features of ``steps`` steps, the place code of the first frame, and the true poses after each step, seen from it.
 
     Args:
         frames: gives images of a range of frames ``(n, height, width, channels)``.
@@ -131,6 +131,7 @@ def step_features(
         "log_std": log_std,
         "motion": motion.astype(np.float16),
         "codes": codes.astype(np.float16),
+        "origin_code": networks.place.encoder(frames(slice(0, 1))).numpy().astype(np.float16),
         "truth": seen_from_first(poses_xyyaw)[1:],
     }
 
@@ -236,7 +237,7 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
 
 def open_store(store: Path, with_compass: bool = False) -> dict[str, np.ndarray]:
     """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
-    names = ["relative", "log_std", "motion", "codes", "truth", *(_COMPASS if with_compass else ())]
+    names = ["relative", "log_std", "motion", "codes", "origin_code", "truth", *(_COMPASS if with_compass else ())]
     hint = "run `python -m training.featurise` first"
     if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
         raise runs.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")

@@ -15,6 +15,7 @@ from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch, find_loops, fused_measurements
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
+from ngo_estimator.registered_odometry import registered_steps
 
 _TOGETHER = 8  # trajectories that go through the pair head at once
 EXACT_SCALE = (1e-3, 1e-3)
@@ -37,23 +38,49 @@ class LoopFactors:
     logit: np.ndarray
 
 
-def found_loops(
-    pair_head: PairHead, relative: np.ndarray, codes: np.ndarray, search: LoopSearch, block: int = 8
-) -> list[LoopFactors]:
-    """What ``find_loops`` gives for each trajectory.
+@dataclass(frozen=True)
+class Seen:
+    """What loops are found in, arrays ``(trajectories, steps, ...)``.
 
-    Args:
-        relative: steps ``(trajectories, steps, 3)`` of the odometry; codes: place codes ``(trajectories, steps,
-            code_size)`` of the frame after each step.
-        block: steps in a meta-pose.
+    ``relative`` and ``log_std`` are the steps of the odometry and the logarithm of their deviations, ``codes`` the
+    place codes ``(trajectories, steps, code_length)`` of the frame after each step, ``origin_code`` ``(trajectories, 1,
+    code_length)`` those of the first frames.
     """
-    found: list[LoopFactors] = []
-    for first in range(0, len(relative), _TOGETHER):
-        part = slice(first, first + _TOGETHER)
+
+    relative: np.ndarray
+    log_std: np.ndarray
+    codes: np.ndarray
+    origin_code: np.ndarray
+
+    def registered(self, pair_head: PairHead, search: LoopSearch, block: int) -> tuple[Tensor, Tensor]:
+        """Steps and logarithms of deviations ``(trajectories, steps, 3)`` as our optimizer takes them."""
+        steps, codes, origin = (_float32(array) for array in (self.relative, self.codes, self.origin_code))
         with torch.inference_mode():
-            loops = find_loops(
-                pair_head, _float32(codes[part]), poses_in_blocks(_float32(relative[part]), block), search
+            return registered_steps(
+                pair_head, steps, _float32(self.log_std), codes, block, search.registrations, origin[:, 0]
             )
+
+    def part(self, which: slice) -> "Seen":
+        """Some of the trajectories."""
+        return Seen(*(array[which] for array in vars(self).values()))
+
+
+def registered_odometry(
+    pair_head: PairHead, seen: Seen, search: LoopSearch, block: int = 8
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and logarithms of deviations ``(trajectories, steps, 3)`` as our optimizer takes them."""
+    parts = [part.registered(pair_head, search, block) for part in _parts(seen)]
+    steps, log_std = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
+    return steps, log_std
+
+
+def found_loops(pair_head: PairHead, seen: Seen, search: LoopSearch, block: int = 8) -> list[LoopFactors]:
+    """What ``find_loops`` gives for each trajectory, with ``block`` steps in a meta-pose."""
+    found: list[LoopFactors] = []
+    for part in _parts(seen):
+        steps, _ = part.registered(pair_head, search, block)
+        with torch.inference_mode():
+            loops = find_loops(pair_head, _float32(part.codes), poses_in_blocks(steps, block), search)
         columns = (loops.start, loops.end, loops.measured, loops.log_scale, loops.logit)
         for number, valid in enumerate(loops.valid):
             found.append(LoopFactors(*(column[number][valid].numpy() for column in columns)))
@@ -87,21 +114,18 @@ def true_revisits(
 
 
 def measured_revisits(
-    pair_head: PairHead,
-    relative: np.ndarray,
-    codes: np.ndarray,
-    truth: np.ndarray,
-    search: LoopSearch,
-    block: int = 8,
+    pair_head: PairHead, seen: Seen, truth: np.ndarray, search: LoopSearch, block: int = 8
 ) -> LoopFactors:
-    """True revisits of one trajectory ``(steps, ...)`` measured as ``find_loops`` does."""
+    """True revisits of one trajectory, alone in ``seen``, measured as ``find_loops`` does; truth: ``(steps, 3)``."""
     frames, ends = true_revisits(truth, search, block)
-    seen, in_blocks = _float32(codes).unsqueeze(0), poses_in_blocks(_float32(relative).unsqueeze(0), block)
+    codes, in_blocks = _float32(seen.codes), poses_in_blocks(seen.registered(pair_head, search, block)[0], block)
     earlier, later = torch.from_numpy(frames), torch.from_numpy(ends * block + block - 1)
     with torch.inference_mode():
         measured, log_scale, _ = fused_measurements(
-            pair_head, seen, in_blocks, earlier.unsqueeze(0), later.unsqueeze(0), search.views
+            pair_head, codes, in_blocks, earlier.unsqueeze(0), later.unsqueeze(0), search.views
         )
+        pair = codes[:, earlier], codes[:, later]
+        measured, log_scale = pair_head.register(*pair, measured, log_scale, search.registrations)
         measured = se2.compose(in_blocks.flatten(1, 2)[:, earlier], measured)
     return LoopFactors(frames // block, ends, measured[0].numpy(), log_scale[0].numpy(), _certain(frames))
 
@@ -119,6 +143,10 @@ def exact_revisits(truth: np.ndarray, search: LoopSearch, block: int = 8) -> Loo
 def _certain(frames: np.ndarray) -> np.ndarray:
     """The belief in what is known to be the same place."""
     return np.full(len(frames), math.inf)
+
+
+def _parts(seen: Seen) -> list[Seen]:
+    return [seen.part(slice(first, first + _TOGETHER)) for first in range(0, len(seen.relative), _TOGETHER)]
 
 
 def _float32(array: np.ndarray) -> Tensor:

@@ -40,6 +40,7 @@ def steps_of(features: dict[str, np.ndarray]) -> Iterator[RelativeStep]:
             odom_xyyaw=odometry[k],
             motion_feature=features["motion"][k].astype(np.float32),
             place_code=features["codes"][k].astype(np.float32),
+            from_place_code=None if k else features["origin_code"][0].astype(np.float32),
         )
 
 

@@ -115,11 +115,12 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
 
 def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-    for compass in (False, True) if sources.has_compass else (False,):
-        changes = {**common, "form": "compass" if compass else "loops"}
+    known = {"loops": True, "registered": sources.world.registration is not None, "compass": sources.has_compass}
+    for form in (form for form in tune_pose_graph.FORMS if known[form]):
+        changes = {**common, "form": form}
         arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
-        what = f"tuning of the pose graph{' with a compass' if compass else ''}"
-        yield Step(what, sources.settings_file(compass).exists, _call(tune_pose_graph.main, arguments))
+        what = "tuning of the pose graph" + ("" if form == "loops" else f", {form}")
+        yield Step(what, sources.settings_file(form).exists, _call(tune_pose_graph.main, arguments))
 
 
 def _optimizers(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:

@@ -14,7 +14,7 @@ class Row:
 
     ``form``, ``iterations`` and ``learning_rate`` (None: the script's own) are what is trained for it, with several
     seeds. With ``compass`` it takes the readings of a compass. With ``own_networks`` all its networks are its own, and
-    so are its features.
+    so are its features. ``registered`` is what takes the odometry that was registered again, without our optimizer.
     """
 
     title: str
@@ -23,11 +23,13 @@ class Row:
     compass: bool = False
     learning_rate: float | None = None
     own_networks: bool = False
+    registered: bool = False
 
 
 ROWS = {
     "local": Row("odometry of the local network"),
     "local_calibrated": Row("the same, with a constant bias and gain fitted on validation"),
+    "registered": Row("odometry, each meta-step measured again by registering scans; no loops", registered=True),
     "paper_1": Row("the paper's optimizer, 1 iteration", "paper", 1),
     "paper_5": Row("the paper's optimizer, 5 iterations", "paper", 5),
     "ngo_1": Row("our optimizer, 1 iteration", "loops", 1),
@@ -35,6 +37,7 @@ ROWS = {
     "gauss_newton": Row("differentiable Gauss-Newton with learned gates alone", "gauss_newton", 5),
     "end_to_end": Row("`ngo_5` of seed 0, all networks fine-tuned together", own_networks=True),
     "gtsam": Row("robust pose graph (GTSAM), same odometry and loops, tuned on validation"),
+    "gtsam_registered": Row("`gtsam` on the odometry of `registered`, with settings of its own", registered=True),
     "true_pairs": Row("GTSAM with true revisits, measured by our pair head"),
     "oracle": Row("GTSAM with true revisits, measured exactly"),
     "ngo_1_compass": Row("`ngo_1` with a compass", "loops", 1, compass=True, learning_rate=1e-4),
@@ -49,7 +52,11 @@ COMPASS_WORLDS = ("maze2d",)
 
 def rows_of(world: World) -> list[str]:
     """The rows of a world's tables, in order."""
-    return [name for name, row in ROWS.items() if world.name in COMPASS_WORLDS or not row.compass]
+    return [
+        name
+        for name, row in ROWS.items()
+        if (world.name in COMPASS_WORLDS or not row.compass) and (world.registration or not row.registered)
+    ]
 
 
 def trainings_of(row: str, seeds: int) -> int:
@@ -90,9 +97,9 @@ class Sources:
         """Folder of the features of a table's mazes."""
         return self.runs / self.world.name / "features" / f"{split}_{table}"
 
-    def settings_file(self, compass: bool = False) -> Path:
-        """The pose graph's settings, tuned on validation, without or with a compass."""
-        return self.results / f"{self.world.name}.gtsam{'_compass' if compass else ''}.json"
+    def settings_file(self, form: str = "loops") -> Path:
+        """The pose graph's settings in one of its ``tune_pose_graph.FORMS``, tuned on validation."""
+        return self.results / f"{self.world.name}.gtsam{'' if form == 'loops' else f'_{form}'}.json"
 
     @property
     def speed_file(self) -> Path:

@@ -100,10 +100,15 @@ class EndToEndTraining(lightning.LightningModule):
         relative, log_std, motion = (value.float().unflatten(0, shape) for value in estimates)
         has_loops = self.optimizer.config.loops
         codes = self.place.encoder(later).float().unflatten(0, shape) if has_loops else relative
+        steps = relative, log_std
         # Sums over the whole trajectory and linear systems need all digits, and are small.
         with torch.autocast(self.device.type, enabled=False):
-            loops = self.optimizer.find_loops(relative, codes, self.place.pair_head) if has_loops else None
-            result = self.optimizer(relative, log_std, motion, loops)
+            loops = None
+            if has_loops:
+                origin = self.place.encoder(batch["images"][:, 0]).float()
+                steps = self.optimizer.registered(*steps, codes, self.place.pair_head, origin)
+                loops = self.optimizer.find_loops(steps[0], codes, self.place.pair_head)
+            result = self.optimizer(*steps, motion, loops)
         return relative, log_std, result
 
     def training_step(self, batch: Batch, _: int) -> Tensor:

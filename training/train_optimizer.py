@@ -136,7 +136,7 @@ class OptimizerTraining(lightning.LightningModule):
         return loss
 
     def validation_step(self, batch: Batch, _: int) -> None:
-        for name, poses in (("odometry", se2.r2g(batch["relative"])), ("corrected", self(batch).poses)):
+        for name, poses in (("odometry", se2.r2g(batch["odometry"])), ("corrected", self(batch).poses)):
             error = (poses - batch["truth"])[..., :2].norm(dim=-1).square().mean(dim=1).sqrt()
             heading = (poses - batch["truth"])[..., 2].square().mean(dim=1).sqrt().rad2deg()
             figures = {f"{name}_m": error.mean(), f"{name}_deg": heading.mean()}
@@ -186,7 +186,13 @@ def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, f
     changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale}
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
-    search = LoopSearch(per_pose=arguments.loops_per_pose, most=arguments.max_loops, views=domain.loop_views)
+    search = LoopSearch(
+        per_pose=arguments.loops_per_pose,
+        most=arguments.max_loops,
+        views=domain.loop_views,
+        # Every iteration also measures once more.
+        registrations=0 if domain.registration is None else arguments.iterations,
+    )
     return NeuralGraphOptimizerConfig(
         aggregation=aggregation,
         search=search,

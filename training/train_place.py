@@ -239,7 +239,12 @@ def main(arguments: Arguments) -> dict[str, float]:
 def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetworks, dict[str, str]]:
     """Fresh networks, or those of the weights to begin with, and what is to be said of them in the JSON."""
     if arguments.recordings.from_weights is None:
-        config = PlaceConfig(image=domain.image, width=arguments.width, offset_scale_m=domain.place_radius_m)
+        config = PlaceConfig(
+            image=domain.image,
+            width=arguments.width,
+            offset_scale_m=domain.place_radius_m,
+            registration=domain.registration,
+        )
         return PlaceNetworks(config), {}
     networks, description = load_place(arguments.recordings.from_weights)
     return networks.requires_grad_(True).train(), {"began_with_sha256": description["sha256"]}

@@ -15,12 +15,14 @@ from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to
 from ngo_estimator.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
+from ngo_estimator.registered_odometry import registered_steps
 from training.featurise import open_store
 from training.streams import ALL, Batch, Share
 
 _LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
 _TOGETHER = 8  # trajectories that are searched for loops at once
 _STEPWISE = ("relative", "log_std", "motion", "truth")
+_REGISTERED = ("relative", "log_std")
 _COMPASS = ("compass", "compass_log_scale")
 
 
@@ -42,8 +44,10 @@ class StoredTrajectories:
         for store in stores:
             arrays = open_store(store, with_compass)
             found = {} if search is None else found_loops(store, arrays, search, pair_head, block)
+            odometry = {"odometry": arrays["relative"]}
+            arrays = {**arrays, **{name: found.pop(name) for name in _REGISTERED if name in found}}
             compass = {name: arrays[name] for name in _COMPASS} if with_compass else {}
-            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **compass})
+            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **odometry, **compass})
         self.block, self.with_compass = block, with_compass
         self.steps = min(part["relative"].shape[1] for part in self.parts) // block * block
         self.index = [(p, row) for p, part in enumerate(self.parts) for row in range(len(part["relative"]))]
@@ -55,14 +59,16 @@ class StoredTrajectories:
         """Trajectories from step ``start`` on, both multiples of the block; ``truth`` is seen from the frame before.
 
         Holds ``relative``, ``log_std``, ``motion`` and ``truth`` ``(batch, length, ...)``, float32, and the fields of
-        ``Loops``, which ``loops_of`` puts together.
+        ``Loops``, which ``loops_of`` puts together. ``relative`` and ``log_std`` are as the optimizer takes them, where
+        it registers scans, and ``odometry`` ``(batch, length, 3)`` what they were before.
         """
         rows = [self._row(*self.index[k], start, length) for k in chosen]
         return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
 
     def _row(self, part: int, row: int, start: int, length: int) -> Batch:
         arrays = self.parts[part]
-        values = {name: torch.from_numpy(arrays[name][row, start : start + length].copy()) for name in _STEPWISE}
+        stepwise = (*_STEPWISE, "odometry")
+        values = {name: torch.from_numpy(arrays[name][row, start : start + length].copy()) for name in stepwise}
         if start:
             values["truth"] = se2.between(torch.from_numpy(arrays["truth"][row, start - 1].copy()), values["truth"])
         # The continuous heading of a whole trajectory, which the network's sums of turns are compared with.
@@ -95,18 +101,28 @@ def fixes_of(batch: Batch, block: int, block_m: float) -> CompassFixes | None:
 def found_loops(
     store: Path, arrays: dict[str, np.ndarray], search: LoopSearch, pair_head: PairHead, block: int
 ) -> dict[str, np.ndarray]:
-    """The fields of ``Loops`` for all trajectories of a store, found now or when they were first asked for."""
+    """The fields of ``Loops`` for all trajectories of a store, found now or when they were first asked for.
+
+    Where scans are registered, also ``relative`` and ``log_std`` ``(trajectories, steps, 3)`` after that.
+    """
     path = store / "loops" / ("-".join(str(value) for value in dataclasses.astuple(search)) + f"-{block}.npz")
     if not path.exists():
         path.parent.mkdir(exist_ok=True)
         whole = arrays["relative"].shape[1] // block * block
         parts: list[Loops] = []
+        odometry: list[tuple[torch.Tensor, ...]] = []
         with torch.inference_mode():
             for rows in np.array_split(np.arange(len(arrays["relative"])), -(-len(arrays["relative"]) // _TOGETHER)):
-                relative, codes = (torch.from_numpy(arrays[n][rows, :whole]).float() for n in ("relative", "codes"))
-                parts.append(find_loops(pair_head, codes, poses_in_blocks(relative, block), search))
+                names = ("relative", "log_std", "codes", "origin_code")
+                relative, log_std, codes, origin = (torch.from_numpy(arrays[n][rows, :whole]).float() for n in names)
+                steps = registered_steps(pair_head, relative, log_std, codes, block, search.registrations, origin[:, 0])
+                odometry.append(steps)
+                parts.append(find_loops(pair_head, codes, poses_in_blocks(steps[0], block), search))
         fields = [field.name for field in dataclasses.fields(Loops) if getattr(parts[0], field.name) is not None]
         values = {_LOOP + name: torch.cat([getattr(part, name) for part in parts]).numpy() for name in fields}
+        if search.registrations:
+            columns = zip(*odometry, strict=True)
+            values |= {name: torch.cat(steps).numpy() for name, steps in zip(_REGISTERED, columns, strict=True)}
         partial = path.with_name(f"{path.name}.{os.getpid()}.npz")
         np.savez(partial, **values)  # type: ignore[arg-type]
         with contextlib.suppress(FileExistsError):

@@ -27,7 +27,7 @@ from ngo_estimator.place_encoder import PairHead
 from training import runs
 from training.compass_factors import found_fixes
 from training.featurise import open_store
-from training.loop_factors import LoopFactors, found_loops
+from training.loop_factors import LoopFactors, Seen, found_loops, registered_odometry
 from training.metrics import trajectory_error
 from training.pose_graph import PoseGraphSettings, optimize
 from training.worlds import world_named
@@ -68,6 +68,10 @@ COMPASS_GRID: tuple[tuple[dict[str, Any], ...], ...] = (
 """The same for the pose graph with a compass, which begins with what is best without."""
 
 _COMPASS = ("compass", "compass_log_scale")
+FORMS = ("loops", "registered", "compass")
+REGISTRATIONS = 5
+"""Steps of each registration for the pose graph, where scans are registered: as many as for our optimizer."""
+
 _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was there first stays
 
 
@@ -79,14 +83,15 @@ class Arguments:
     """World to tune for."""
     trajectories: int = 0
     """Validation trajectories of each table of results; 0 for all."""
-    form: Literal["loops", "compass"] = "loops"
-    """The graph of odometry and loops, or that with a compass, from the settings that are best without."""
+    form: Literal["loops", "registered", "compass"] = "loops"
+    """The graph of odometry and loops; that on odometry that was registered again; or the first with a compass, from
+    the settings that are best without."""
     passes: int = 2
     """How often the search goes over all groups at most."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/place_encoder.safetensors."""
     out: Path = runs.ROOT / "training" / "results"
-    """Folder that gets WORLD.gtsam.json, with a compass WORLD.gtsam_compass.json."""
+    """Folder that gets WORLD.gtsam.json, of another form WORLD.gtsam_FORM.json."""
     runs: Path = runs.ROOT / "runs"
     """Folder of WORLD/features/."""
 
@@ -95,14 +100,20 @@ class Objective:
     """Mean position RMSE (m) of the pose graph over trajectories, as a function of its settings.
 
     Args:
-        arrays: ``relative``, ``log_std``, ``codes`` and ``truth`` of a feature store.
+        arrays: ``relative``, ``log_std``, ``codes``, ``origin_code`` and ``truth`` of a feature store.
         compass: readings for each trajectory.
+        registered: whether the graph's odometry is registered again.
     """
 
     def __init__(
-        self, arrays: dict[str, np.ndarray], pair_head: PairHead, compass: list[CompassFixes] | None = None
+        self,
+        arrays: dict[str, np.ndarray],
+        pair_head: PairHead,
+        compass: list[CompassFixes] | None = None,
+        registered: bool = False,
     ) -> None:
-        self.arrays, self._pair_head = arrays, pair_head
+        self.arrays, self._pair_head, self._registered = arrays, pair_head, registered
+        self._odometry: tuple[np.ndarray, np.ndarray] | None = None
         self._compass: Sequence[CompassFixes | None] = compass or [None] * len(arrays["relative"])
         self._loops: dict[object, list[LoopFactors]] = {}
 
@@ -110,14 +121,22 @@ class Objective:
         """The loops of each trajectory under these settings."""
         key = (settings.search, settings.block, settings.odometry_gain, settings.odometry_bias)
         if key not in self._loops:
-            relative = settings.calibrated(self.arrays["relative"])
-            self._loops[key] = found_loops(
-                self._pair_head, relative, self.arrays["codes"], settings.search, settings.block
-            )
+            self._loops[key] = found_loops(self._pair_head, self._seen(settings), settings.search, settings.block)
         return self._loops[key]
 
+    def _seen(self, settings: PoseGraphSettings) -> Seen:
+        arrays, relative = self.arrays, settings.calibrated(self.arrays["relative"])
+        return Seen(relative, arrays["log_std"], arrays["codes"], arrays["origin_code"])
+
+    def _steps(self, settings: PoseGraphSettings) -> tuple[np.ndarray, np.ndarray]:
+        if not self._registered:
+            return self.arrays["relative"], self.arrays["log_std"]
+        if self._odometry is None:  # nothing that is tuned for it changes it
+            self._odometry = registered_odometry(self._pair_head, self._seen(settings), settings.search, settings.block)
+        return self._odometry
+
     def __call__(self, settings: PoseGraphSettings) -> float:
-        odometry = zip(self.arrays["relative"], self.arrays["log_std"], strict=True)
+        odometry = zip(*self._steps(settings), strict=True)
         added = zip(self.loops(settings), self._compass, strict=True)
         return self.error(
             optimize(*steps, loops, settings, compass) for steps, (loops, compass) in zip(odometry, added, strict=True)
@@ -180,6 +199,11 @@ def tune(
     return best, least
 
 
+def _registering(change: dict[str, Any], registrations: int) -> dict[str, Any]:
+    searches = {name: replace(v, registrations=registrations) for name, v in change.items() if name == "search"}
+    return {**change, **searches}
+
+
 def load_settings(path: Path) -> PoseGraphSettings:
     """The settings in a file that this script wrote; raises ``ValueError`` naming what is wrong with it."""
     try:
@@ -199,17 +223,26 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     stores = [open_store(features / f"validation_{table}", with_compass) for table in world.tables]
     arrays = {
         name: np.concatenate([store[name][: arguments.trajectories or None] for store in stores])
-        for name in ("relative", "log_std", "codes", "truth", *(_COMPASS if with_compass else ()))
+        for name in ("relative", "log_std", "codes", "origin_code", "truth", *(_COMPASS if with_compass else ()))
     }
     path = arguments.out / f"{world.name}.gtsam.json"
-    start, grid = PoseGraphSettings(), (*GRID, (fit_calibration(arrays["relative"], arrays["truth"]),))
+    registrations = 0 if world.registration is None else REGISTRATIONS
+    start = PoseGraphSettings()
+    start = replace(start, search=replace(start.search, registrations=registrations))
+    grid = [[_registering(change, registrations) for change in group] for group in GRID]
+    if arguments.form == "registered":
+        path = arguments.out / f"{world.name}.gtsam_registered.json"
+    else:
+        grid.append([fit_calibration(arrays["relative"], arrays["truth"])])
     compass: list[CompassFixes] | None = None
     if with_compass:
-        start, grid, path = load_settings(path), COMPASS_GRID, arguments.out / f"{world.name}.gtsam_compass.json"
+        start, grid = load_settings(path), [list(group) for group in COMPASS_GRID]
+        path = arguments.out / f"{world.name}.gtsam_compass.json"
         relative = start.calibrated(arrays["relative"])
         readings, log_scale = (arrays[name] for name in _COMPASS)
         compass = found_fixes(readings, log_scale, relative, arrays["log_std"], start.block, world.block_m)
-    objective = Objective(arrays, load_place(arguments.weights / world.name, world.name)[0].pair_head, compass)
+    pair_head = load_place(arguments.weights / world.name, world.name)[0].pair_head
+    objective = Objective(arrays, pair_head, compass, arguments.form == "registered")
     started = time.monotonic()
     best, least = tune(objective, start, grid, arguments.passes)
     odometry = objective.error(se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy())

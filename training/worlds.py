@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
+from ngo_estimator.scan_registration import RegistrationConfig
 from training.domains import Domain
 
 if TYPE_CHECKING:
@@ -111,6 +112,8 @@ WORLDS = {
         place_radius_m=0.5,
         heading_limit_rad=np.pi,
         loop_views=5,
+        # Ranges are exact but for their storage as float16.
+        registration=RegistrationConfig(rays=241, field_of_view_deg=300.0, noise_m=0.001),
         tables={"perfect": MazeSize(7, 0), "cycles": MazeSize(7, 8)},
     ),
     "maze3d": World(

@@ -37,7 +37,7 @@ class Drive:
     def __init__(self, core: OnlineTrajectory, origin_ns: int, seed: int = 0, period_ns: int = STEP_NS) -> None:
         config = core._optimizer.config.aggregation
         assert core._pair_head is not None
-        self._sizes = config.motion_feature_size, core._pair_head.config.code_size
+        self._sizes = config.motion_feature_size, core._pair_head.config.code_length
         self._rng = np.random.default_rng(seed)
         self._odom = torch.zeros(3, dtype=torch.float64)
         self.origin_ns, self.period_ns = origin_ns, period_ns

@@ -59,7 +59,7 @@ def test_a_world_in_which_heading_matters_has_fewer_revisits() -> None:
 def arrays() -> Arrays:
     names = ("relative", "log_std", "motion", "codes")
     found = {name: value.numpy() for name, value in zip(names, trajectory_inputs(2, 100), strict=True)}
-    return {**found, "truth": local(found)}
+    return {**found, "origin_code": np.zeros((2, 1, 12)), "truth": local(found)}
 
 
 @pytest.mark.parametrize("form", ["loops", "paper"])

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from ngo_estimator import se2
 from ngo_estimator.compass_closure import frames_to_read
+from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import optimize_offline
 from ngo_estimator.place_encoder import PairHead
+from tests.unit.ngo_estimator.rooms import drive_in_the_room, registering_pair_head
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.estimators import Arrays, calibrated, estimators, local, optimized_by, pose_graph, prefix
+from training.estimators import Arrays, calibrated, estimators, local, optimized_by, pose_graph, prefix, registered
 from training.pose_graph import PoseGraphSettings
 from training.rows import ROWS, Sources, rows_of, trainings_of
 from training.worlds import WORLDS, world_named
@@ -22,7 +25,7 @@ def arrays(trajectories: int = 3) -> Arrays:
     names = ("relative", "log_std", "motion", "codes")
     values = trajectory_inputs(trajectories, STEPS)
     found = {name: value.numpy() for name, value in zip(names, values, strict=True)}
-    return {**found, "truth": local(found) + 0.01}
+    return {**found, "origin_code": np.zeros((trajectories, 1, 12)), "truth": local(found) + 0.01}
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +97,34 @@ def test_rows_with_a_compass_say_so() -> None:
     for name, row in ROWS.items():
         assert row.compass == ("compass" in name)
     for world in WORLDS.values():
-        assert {name for name in ROWS if not ROWS[name].compass} <= set(rows_of(world))
+        assert {name for name, row in ROWS.items() if not (row.compass or row.registered)} <= set(rows_of(world))
+
+
+def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
+    for name in ("registered", "gtsam_registered"):
+        assert ROWS[name].registered
+        assert name in rows_of(world_named("maze2d")) and name not in rows_of(world_named("maze3d"))
 
 
 def test_only_what_is_trained_has_trainings() -> None:
     assert [trainings_of(row, 3) for row in ("local", "gtsam", "ngo_5", "end_to_end")] == [0, 0, 3, 1]
+
+
+def test_what_is_registered_is_what_our_optimizer_takes() -> None:
+    steps, head = 40, registering_pair_head()
+    relative, log_std, codes, origin, truth = (value.numpy()[None] for value in drive_in_the_room(steps + 3))
+    some = {"relative": relative, "log_std": log_std, "codes": codes, "origin_code": origin, "truth": truth}
+    poses = registered(some, head)
+    assert poses.shape == (1, steps + 3, 3)
+    optimizer = small_optimizer(search=LoopSearch(2, 8, 2, 0, 3, registrations=5))
+    inputs = (torch.from_numpy(array[:, :steps]) for array in (relative, log_std, codes))
+    expected, _ = optimizer.registered(*inputs, head, torch.from_numpy(origin[:, 0]))
+    np.testing.assert_allclose(poses[:, :steps], se2.r2g(expected.double()), atol=1e-5)
+    errors = [np.linalg.norm((p - truth)[0, :steps, :2], axis=1).max() for p in (poses, local(some))]
+    assert errors[0] < 0.2 * errors[1]
+    graphs = [
+        pose_graph(row, PoseGraphSettings(search=optimizer.config.search), head, 1.0)
+        for row in ("gtsam", "gtsam_registered")
+    ]
+    without, with_registered = (np.linalg.norm((g(some) - truth)[0, :steps, :2], axis=1).max() for g in graphs)
+    assert with_registered < without

@@ -14,6 +14,7 @@ def test_an_online_pose_is_the_last_one_of_what_came_before_it() -> None:
     inputs = [values[0] for values in trajectory_inputs(1, 60, seed=3)]
     core = OnlineTrajectory(optimizer, pair_head, 64)
     features = {name: values.numpy() for name, values in zip(NAMES, inputs, strict=True)}
+    features["origin_code"] = np.zeros((1, 12))
     online = online_poses(core, features)
     assert online.shape == (61, 3) and online[0].tolist() == [0.0, 0.0, 0.0]
     for steps in (16, 32, 45, 60):

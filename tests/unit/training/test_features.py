@@ -14,7 +14,7 @@ from training.featurise import check_networks, features_of, open_store
 from training.streams import simulate
 from training.worlds import WORLDS
 
-SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "truth": 3}
+SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "origin_code": 12, "truth": 3}
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> No
     local, place = load_local(tmp_path)[0], load_place(tmp_path)[0]
     (episode,) = simulate(world, [3], 300)  # more than one chunk
     arrays = features_of(world, episode, tmp_path, (local, place))
-    assert {name: value.shape[0] for name, value in arrays.items()} == dict.fromkeys(SHAPES, 299)
+    assert {name: value.shape[0] for name, value in arrays.items()} == {**dict.fromkeys(SHAPES, 299), "origin_code": 1}
     images = torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
     for k in (0, 255, 256, 298):
         relative, log_std, motion = local(

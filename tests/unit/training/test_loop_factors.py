@@ -9,7 +9,7 @@ from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch, find_loops
 from ngo_estimator.pose_aggregation import poses_in_blocks
 from tests.unit.ngo_estimator.samples import small_pair_head
-from training.loop_factors import EXACT_SCALE, exact_revisits, found_loops, measured_revisits, true_revisits
+from training.loop_factors import EXACT_SCALE, Seen, exact_revisits, found_loops, measured_revisits, true_revisits
 
 SEARCH = LoopSearch(per_pose=3, most=1000, min_separation=6, min_apart=1)
 
@@ -27,18 +27,19 @@ def there_and_back() -> np.ndarray:
     return np.concatenate((there, there[::-1] + [0.0, 0.1, np.pi]))
 
 
-def odometry(trajectories: int, steps: int = 160) -> tuple[np.ndarray, np.ndarray]:
+def drives(trajectories: int, steps: int = 160) -> Seen:
     rng = np.random.default_rng(0)
     relative = rng.normal(0.0, 0.1, (trajectories, steps, 3)).astype(np.float32)
-    return relative, rng.normal(0.0, 1.0, (trajectories, steps, 12)).astype(np.float16)
+    codes = rng.normal(0.0, 1.0, (trajectories, steps, 12)).astype(np.float16)
+    return Seen(relative, np.full_like(relative, -4.0), codes, codes[:, :1])
 
 
 def test_found_loops_are_those_of_the_optimizer_whatever_goes_with_them() -> None:
-    relative, codes = odometry(11)
-    found = found_loops(small_pair_head(), relative, codes, SEARCH)
+    seen = drives(11)
+    found = found_loops(small_pair_head(), seen, SEARCH)
     assert len(found) == 11
     for number in (0, 7, 8, 10):
-        inputs = (torch.from_numpy(array[number : number + 1]).float() for array in (codes, relative))
+        inputs = (torch.from_numpy(array[number : number + 1]).float() for array in (seen.codes, seen.relative))
         loops = find_loops(small_pair_head(), next(inputs), poses_in_blocks(next(inputs), 8), SEARCH)
         valid = loops.valid[0]
         assert 0 < valid.sum() < len(valid)
@@ -98,29 +99,29 @@ def test_exact_revisits_lead_from_start_to_end() -> None:
 
 
 def test_measured_revisits_are_true_places_with_what_the_pair_head_says() -> None:
-    relative, codes = odometry(1, 800)
+    seen = drives(1, 800)
     truth, search = circles(), replace(SEARCH, views=1)
-    loops = measured_revisits(small_pair_head(), relative[0], codes[0], truth, search)
+    loops = measured_revisits(small_pair_head(), seen, truth, search)
     frames, ends = true_revisits(truth, search)
     np.testing.assert_array_equal(loops.start, frames // 8)
     np.testing.assert_array_equal(loops.end, ends)
     assert (loops.logit == np.inf).all()
-    seen = torch.from_numpy(codes[0]).float()
+    codes = torch.from_numpy(seen.codes[0]).float()
     with torch.no_grad():
-        measured, log_scale, _ = small_pair_head()(seen[frames[5]], seen[8 * ends[5] + 7])
-    steps = torch.from_numpy(relative[0])[frames[5] // 8 * 8 : frames[5] + 1]
+        measured, log_scale, _ = small_pair_head()(codes[frames[5]], codes[8 * ends[5] + 7])
+    steps = torch.from_numpy(seen.relative[0])[frames[5] // 8 * 8 : frames[5] + 1]
     np.testing.assert_allclose(loops.measured[5], se2.compose(se2.r2g(steps)[-1], measured), atol=1e-5)
     np.testing.assert_allclose(loops.log_scale[5], log_scale, atol=1e-5)
 
 
 def test_a_place_that_is_found_and_true_is_measured_alike() -> None:
-    relative, codes = odometry(1, 800)
+    seen = drives(1, 800)
     truth, search = circles(), LoopSearch(per_pose=12, most=5000, min_apart=0, views=5)
     with torch.no_grad():
-        blocks = poses_in_blocks(torch.from_numpy(relative), 8)
-        found = find_loops(small_pair_head(), torch.from_numpy(codes).float(), blocks, search)
+        blocks = poses_in_blocks(torch.from_numpy(seen.relative), 8)
+        found = find_loops(small_pair_head(), torch.from_numpy(seen.codes).float(), blocks, search)
     candidates = {pair: k for k, pair in enumerate(zip(found.frame[0].tolist(), found.end[0].tolist(), strict=True))}
-    loops = measured_revisits(small_pair_head(), relative[0], codes[0], truth, search)
+    loops = measured_revisits(small_pair_head(), seen, truth, search)
     pairs = [column.tolist() for column in true_revisits(truth, search)]
     both = [(k, candidates[pair]) for k, pair in enumerate(zip(*pairs, strict=True)) if pair in candidates]
     assert len(both) > 5

@@ -12,7 +12,7 @@ from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
 from training.streams import Share
 from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, loops_of
 
-SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "truth": 3}
+SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "origin_code": 12, "truth": 3}
 SEARCH = LoopSearch(per_pose=2, most=10, min_separation=1, min_apart=0)
 
 
@@ -40,7 +40,8 @@ def stored(store: Path, search: LoopSearch | None = SEARCH) -> StoredTrajectorie
 @pytest.mark.parametrize("start", [0, 8, 24])
 def test_a_stretch_is_seen_from_the_frame_before_it_with_a_continuous_heading(store: Path, start: int) -> None:
     batch = stored(store, None).batch([1, 4], start, 16)
-    expected_shapes = {name: (2, 16, size) for name, size in SHAPES.items() if name != "codes"}
+    steps = {name: size for name, size in SHAPES.items() if name not in ("codes", "origin_code")}
+    expected_shapes = {name: (2, 16, size) for name, size in {**steps, "odometry": 3}.items()}
     assert {name: value.shape for name, value in batch.items()} == expected_shapes
     assert all(value.dtype == torch.float32 for value in batch.values())
     expected = se2.r2g(torch.tensor([0.1, 0.0, 0.3]).expand(2, 16, 3))

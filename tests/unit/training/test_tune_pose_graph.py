@@ -78,7 +78,8 @@ def drive(trajectories: int = 2, steps: int = 160) -> dict[str, np.ndarray]:
     truth = se2.r2g(torch.from_numpy(true_steps)).numpy()
     relative = (true_steps * [0.9, 1.0, 1.0] + [0.0, 0.0, 0.01]).astype(np.float32)
     codes = rng.normal(0.0, 1.0, (trajectories, steps, 12)).astype(np.float16)
-    return {"relative": relative, "log_std": np.full_like(relative, -4.0), "codes": codes, "truth": truth}
+    log_std = np.full_like(relative, -4.0)
+    return {"relative": relative, "log_std": log_std, "codes": codes, "origin_code": codes[:, :1], "truth": truth}
 
 
 def test_the_calibration_undoes_gain_and_bias() -> None:
@@ -121,7 +122,9 @@ def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
     frames = frames_to_read(steps, 8)
     for seed, table in enumerate(world_named("maze2d").tables):
         arrays = drive(steps=steps)
-        arrays["codes"] = np.random.default_rng(seed).normal(0.0, 1.0, (2, steps, 128)).astype(np.float16)
+        arrays["codes"] = np.zeros((2, steps, 128 + 241), np.float16)  # scans in which nothing came back
+        arrays["codes"][..., :128] = np.random.default_rng(seed).normal(0.0, 1.0, (2, steps, 128))
+        arrays["origin_code"] = arrays["codes"][:, :1]
         arrays["compass"] = np.concatenate((np.zeros((2, 1, 3)), arrays["truth"]), axis=1)[:, frames]
         arrays["compass_log_scale"] = np.full((2, len(frames), 2), -6.0)
         store = tmp_path / "maze2d" / "features" / f"validation_{table}"
@@ -141,6 +144,10 @@ def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
     with_compass = main(replace(arguments, form="compass"))
     assert load_settings(tmp_path / "maze2d.gtsam_compass.json") == with_compass
     assert with_compass.odometry_bias == best.odometry_bias
+    registered = main(replace(arguments, form="registered"))
+    assert load_settings(tmp_path / "maze2d.gtsam_registered.json") == registered
+    assert registered.search.registrations == best.search.registrations > 0
+    assert registered.odometry_bias == (0.0, 0.0, 0.0)
 
 
 def test_settings_survive_a_file(tmp_path: Path) -> None:

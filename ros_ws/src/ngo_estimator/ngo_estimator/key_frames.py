@@ -25,7 +25,7 @@ class KeyFrame:
 
     ``node`` counts the blocks before it. ``relative`` ``(3,)`` is the next pose as seen from it, with ``variance``
     ``(3,)`` along its axes. ``embeddings`` ``(block, embedding_size)`` are of the block's frames; ``codes``
-    ``(frames, code_size)`` and ``poses`` ``(frames, 3)``, as seen from it, also of some frames before and behind.
+    ``(frames, code_length)`` and ``poses`` ``(frames, 3)``, as seen from it, also of some frames before and behind.
     """
 
     node: int

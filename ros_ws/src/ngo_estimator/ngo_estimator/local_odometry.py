@@ -96,6 +96,7 @@ class LocalOdometry:
         self._last_stamp_ns: int | None = None
         self._origin_stamp_ns = 0
         self._last_image = torch.empty(0)
+        self._origin_code: np.ndarray | None = None
         self._odom = torch.zeros(3, dtype=torch.float64)
 
     def update(
@@ -128,6 +129,8 @@ class LocalOdometry:
                 self.restarts += 1
             self._origin_stamp_ns = stamp_ns
             self._last_stamp_ns, self._last_image = stamp_ns, frame
+            with torch.inference_mode():
+                self._origin_code = self._encoder(frame)[0].numpy()
             return None
         if stamp_ns == last:
             raise DuplicateFrame(f"frame at {stamp_ns} ns came twice")
@@ -153,6 +156,7 @@ class LocalOdometry:
         variance = variance + (missed * self._network.relative_std.double()) ** 2
         self._odom = se2.compose(self._odom, relative[0].double())
         self._last_stamp_ns, self._last_image = stamp_ns, frame
+        origin_code, self._origin_code = self._origin_code, None
         return LocalEstimate(
             stamp_ns=stamp_ns,
             from_stamp_ns=last,
@@ -162,5 +166,6 @@ class LocalOdometry:
             odom_xyyaw=self._odom.numpy().copy(),
             motion_feature=feature[0].numpy(),
             place_code=code[0].numpy(),
+            from_place_code=origin_code,
             missed_frames=missed,
         )

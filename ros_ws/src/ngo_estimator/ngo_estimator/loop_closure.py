@@ -28,7 +28,8 @@ class LoopSearch:
 
     ``per_pose`` candidates for each meta-pose, at least ``min_separation`` meta-poses older and more than
     ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief. Each
-    is measured between ``views`` pairs of frames around it.
+    is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
+    place codes hold scans; so are the steps of the odometry (``registered_odometry``).
     """
 
     per_pose: int = 4
@@ -36,6 +37,7 @@ class LoopSearch:
     min_separation: int = 6
     min_apart: int = 1
     views: int = 5
+    registrations: int = 0
 
     def __post_init__(self) -> None:
         if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
@@ -45,6 +47,8 @@ class LoopSearch:
             )
         if not 1 <= self.views <= len(VIEWS):
             raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
+        if self.registrations < 0:
+            raise ValueError(f"registrations is {self.registrations}; expected 0 (none) or more")
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,7 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     The choice has no gradient, what is measured has.
 
     Args:
-        codes: place codes ``(batch, steps, code_size)`` of the frame after each step.
+        codes: place codes ``(batch, steps, code_length)`` of the frame after each step.
         in_blocks: poses within blocks ``(batch, blocks, block, 3)``.
     """
     block = in_blocks.shape[2]
@@ -121,6 +125,9 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     if search.views > 1:
         seen = (measured, log_scale)
         measured, log_scale, spread = fused_measurements(pair_head, codes, in_blocks, frame, last, search.views, seen)
+    if search.registrations:
+        pair = pick(codes, frame), pick(codes, last)
+        measured, log_scale = pair_head.register(*pair, measured, log_scale, search.registrations)
     return Loops(
         # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
         start=torch.minimum(frame // block, end),

@@ -17,6 +17,7 @@ from ngo_estimator.online_loops import Candidates, OnlineLoops
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.planar_covariance import propagate
 from ngo_estimator.pose_aggregation import block_variances, poses_in_blocks
+from ngo_estimator.registered_odometry import registered_steps
 from ngo_estimator.rows import GrowingRows, SlidingRows
 
 _CONTEXT = 2
@@ -69,6 +70,8 @@ class MetaGraph:
         self._kept = np.zeros((0, 3))  # poses of key frames when some were let go last
         self._gone = np.zeros(0, np.int64)  # nodes between these
         self._loops: OnlineLoops | None = None
+        self._registrations = optimizer.config.search.registrations if optimizer.config.loops else 0
+        self._origin_code: np.ndarray | None = None
         if optimizer.config.loops:
             assert pair_head is not None
             self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self.odometry)
@@ -98,6 +101,10 @@ class MetaGraph:
         moved = self._nodes.values[self._active, :2] - self._before[:, :2]
         return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
 
+    def begin_at(self, origin_code: np.ndarray | None) -> None:
+        """Take the place code of the first frame, where it is known, before the first step."""
+        self._origin_code = origin_code
+
     def append(self, relative: np.ndarray, log_std: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
         """Take a step ``(3,)`` with what belongs to it; returns whether it completed a block."""
         last = torch.from_numpy(self.odometry.values[-1])
@@ -118,6 +125,7 @@ class MetaGraph:
     def _complete_block(self) -> None:
         block = self.blocks
         count = (block + 1) * self._block
+        self._register(count - self._block)
         steps = torch.from_numpy(self._relative.slice(count - self._block)).unsqueeze(0)
         in_block = poses_in_blocks(steps, self._block)
         log_std = torch.from_numpy(self._log_std.slice(count - self._block)).unsqueeze(0)
@@ -137,6 +145,22 @@ class MetaGraph:
             self._slide()
         if self._keys.crowded:
             self._thin()
+
+    def _register(self, first: int) -> None:
+        """Measure the newest block again, which begins with the step of number ``first``."""
+        if self._loops is None or self._pair_head is None or self._registrations == 0:
+            return
+        before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
+        origin_code = None if before is None else torch.from_numpy(before).unsqueeze(0)
+        rows = self._relative.slice(first), self._log_std.slice(first), self._loops.codes(first)
+        steps, deviations, codes = (torch.from_numpy(values).unsqueeze(0) for values in rows)
+        relative, log_std = registered_steps(
+            self._pair_head, steps, deviations, codes, self._block, self._registrations, origin_code
+        )
+        self._relative.replace(first, relative[0].numpy())
+        self._log_std.replace(first, log_std[0].numpy())
+        odometry = torch.from_numpy(self.odometry.values)
+        odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
 
     def _aggregate(self, block: int) -> None:
         """Features of the blocks that the newest one changes, and of itself."""

@@ -28,6 +28,7 @@ from ngo_estimator.pose_aggregation import (
     frame_poses,
     poses_in_blocks,
 )
+from ngo_estimator.registered_odometry import registered_steps
 
 _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 """Deviations of a relative meta-pose, before anything is learned, in units of what its steps' deviations make it."""
@@ -221,8 +222,23 @@ class NeuralGraphOptimizer(nn.Module):
         """Steps in a meta-pose."""
         return self.config.aggregation.block
 
+    def registered(
+        self,
+        relative: Tensor,
+        log_std: Tensor,
+        place_codes: Tensor,
+        pair_head: PairHead,
+        origin_code: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The odometry ``relative`` and ``log_std`` ``(batch, steps, 3)`` as this optimizer takes it, and its loops.
+
+        Measured again by the scans in the codes, as ``registered_steps`` does, or where it registers nothing as it is.
+        """
+        registrations = self.config.search.registrations if self.config.loops else 0
+        return registered_steps(pair_head, relative, log_std, place_codes, self.block, registrations, origin_code)
+
     def find_loops(self, relative: Tensor, place_codes: Tensor, pair_head: PairHead) -> Loops:
-        """Loop candidates of trajectories; ``place_codes`` ``(batch, steps, code_size)`` are of each step's end."""
+        """Loop candidates of trajectories; ``place_codes`` ``(batch, steps, code_length)`` are of each step's end."""
         return find_loops(pair_head, place_codes, poses_in_blocks(relative, self.block), self.config.search)
 
     def aggregate(self, relative: Tensor, log_std: Tensor, motion_features: Tensor) -> MetaSteps:

@@ -85,7 +85,7 @@ class OnlineLoops:
         self._pair_head, self._search, self._block = pair_head, search, block
         self._odometry = odometry
         keep = window * block + 2 * block + MARGIN
-        self._codes = SlidingRows((pair_head.config.code_size,), np.float32, keep)
+        self._codes = SlidingRows((pair_head.config.code_length,), np.float32, keep)
         self._embeddings = SlidingRows((pair_head.config.embedding_size,), np.float32, keep)
         self._candidates = Candidates.none()
 
@@ -94,6 +94,10 @@ class OnlineLoops:
         self._codes.append(place_code)
         with torch.inference_mode():
             self._embeddings.append(self._pair_head.embed(torch.from_numpy(self._codes.slice(len(self._codes) - 1))[0]))
+
+    def codes(self, first: int) -> np.ndarray:
+        """Place codes ``(n, code_length)`` of the frames after the steps from number ``first`` on, without a copy."""
+        return self._codes.slice(first)
 
     @torch.inference_mode()
     def find(self, block: int, first: int, keys: KeyFrames) -> Candidates:
@@ -156,7 +160,7 @@ class OnlineLoops:
         at = np.clip(last + self._offsets(1), 0, last)
         odometry = self._odometry.values
         to_end = torch.from_numpy(_seen_from(odometry[at + 1], odometry[last + 1])).float()  # (views, 3)
-        codes = torch.from_numpy(np.stack([pair.codes for pair in pairs], axis=1))  # (views, n, code_size)
+        codes = torch.from_numpy(np.stack([pair.codes for pair in pairs], axis=1))  # (views, n, code_length)
         later = torch.from_numpy(self._codes.at(at)).unsqueeze(1).expand_as(codes)
         measured, log_scale, logit = self._pair_head(codes, later)
         from_frame = torch.from_numpy(np.stack([_seen_from(p.pose, p.poses) for p in pairs], axis=1)).float()
@@ -166,6 +170,10 @@ class OnlineLoops:
             fused, fused_scale, spread = fuse_views(measured, log_scale)
         else:
             fused, fused_scale = measured[0], log_scale[0]
+        # The first view is of the candidate's own frames.
+        fused, fused_scale = self._pair_head.register(
+            codes[0], later[0], fused, fused_scale, self._search.registrations
+        )
         of_frame = torch.from_numpy(np.stack([pair.pose for pair in pairs])).float()
         count = len(pairs)
         return Candidates(

@@ -99,12 +99,15 @@ class OnlineTrajectory:
             raise ValueError(f"key_frames is {key_frames}; expected at least 2")
         if optimizer.config.loops and pair_head is None:
             raise ValueError("an optimizer with loops needs a pair head")
+        registers = optimizer.config.loops and optimizer.config.search.registrations > 0
+        if registers and (pair_head is None or pair_head.config.registration is None):
+            raise ValueError("an optimizer that registers scans needs a pair head whose codes hold them")
         self._optimizer, self._pair_head = optimizer.eval(), pair_head
         self._block = block
         self._window = window_frames // block * block
         if iterations_per_step < 0:
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
-        self._code_size = None if pair_head is None else pair_head.config.code_size
+        self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
         iterations = optimizer.config.iterations
         # An optimisation must be done when the next one begins, a block later.
@@ -175,7 +178,7 @@ class OnlineTrajectory:
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
                 that is a little late. The trajectory is as it was before.
         """
-        check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_size)
+        check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_length)
         restarted, gap = False, False
         relative, variance = step.relative_xyyaw, np.diagonal(step.covariance)
         if self._count:
@@ -274,6 +277,8 @@ class OnlineTrajectory:
         self._origin_stamp_ns = step.origin_stamp_ns
         odom = torch.from_numpy(step.odom_xyyaw)
         before = se2.compose(odom, se2.inverse(torch.from_numpy(step.relative_xyyaw)))
+        if self._pair_head is not None:
+            self._graph.begin_at(step.from_place_code)
         self._stamps.append(step.from_stamp_ns)
         self._odometry.append(before.numpy())
         self._online.append(np.zeros(3))
@@ -315,11 +320,13 @@ def optimize_offline(
     log_std: Tensor,
     motion_features: Tensor,
     place_codes: Tensor,
+    origin_code: Tensor | None = None,
 ) -> OptimizedTrajectory:
     """Optimise one trajectory ``(steps, ...)`` of any number of steps; those after the last whole block follow it.
 
-    Arguments as in ``NeuralGraphOptimizer``, without the batch; ``pair_head`` with loops only.
-    ``poses`` of the result is ``(1, steps, 3)``.
+    Arguments as in ``NeuralGraphOptimizer``, without the batch; ``pair_head`` with loops only, and ``origin_code``
+    ``(1, code_length)``, the place code of the first frame, where it is known. ``poses`` of the result is ``(1, steps,
+    3)``.
     """
     steps = relative.shape[0]
     block = optimizer.config.aggregation.block
@@ -331,6 +338,8 @@ def optimize_offline(
     if optimizer.config.loops:
         if pair_head is None:
             raise ValueError("an optimizer with loops needs a pair head")
+        origin = None if origin_code is None else origin_code.float()
+        inputs[:2] = optimizer.registered(inputs[0], inputs[1], inputs[3], pair_head, origin)
         loops = optimizer.find_loops(inputs[0], inputs[3], pair_head)
     result: OptimizedTrajectory = optimizer(*inputs[:3], loops)
     if whole == steps:

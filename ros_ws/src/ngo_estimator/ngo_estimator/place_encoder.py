@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from ngo_estimator.flownet import FlowNetConvolutions
 from ngo_estimator.images import ImageFormat, to_network
+from ngo_estimator.scan_registration import RegistrationConfig, register
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,8 @@ class PlaceConfig:
     """What a place encoder is made of.
 
     ``offset_scale_m`` is the typical distance of two frames of one place: the unit of the pair head's output.
+    A code has ``code_size`` learned numbers; with ``registration`` the ranges of the frame follow (m, 0 where nothing
+    came back), so that pairs can be measured by these.
     """
 
     image: ImageFormat
@@ -27,6 +30,7 @@ class PlaceConfig:
     code_size: int = 128
     embedding_size: int = 64
     pair_hidden_size: int = 384
+    registration: RegistrationConfig | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -35,10 +39,21 @@ class PlaceConfig:
             raise ValueError(f"offset_scale_m is {self.offset_scale_m}; expected a positive distance")
         if min(self.code_size, self.embedding_size, self.pair_hidden_size) < 1:
             raise ValueError("code_size, embedding_size and pair_hidden_size must be at least 1")
+        if self.registration is not None and (self.image.height != 1 or not self.image.has_depth):
+            raise ValueError(f"registration is given for images {self.image.shape}; expected a row with depth")
+        if self.registration is not None and self.registration.rays != self.image.width:
+            raise ValueError(
+                f"registration has {self.registration.rays} rays; expected {self.image.width}, the image's"
+            )
+
+    @property
+    def code_length(self) -> int:
+        """Numbers in a code, with the ranges behind those that are learned."""
+        return self.code_size + (0 if self.registration is None else self.registration.rays)
 
 
 class PlaceEncoder(nn.Module):
-    """One frame to a place code of ``code_size`` numbers."""
+    """One frame to a place code of ``code_length`` numbers."""
 
     def __init__(self, config: PlaceConfig) -> None:
         super().__init__()
@@ -48,8 +63,12 @@ class PlaceEncoder(nn.Module):
         self.code = nn.Linear(self.convolutions.output_size, config.code_size)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Observations ``(batch, height, width, channels)`` to codes ``(batch, code_size)``."""
-        return self.code(self.convolutions(to_network(images, self.config.image))).float()
+        """Observations ``(batch, height, width, channels)`` to codes ``(batch, code_length)``."""
+        code = self.code(self.convolutions(to_network(images, self.config.image))).float()
+        if self.config.registration is None:
+            return code
+        ranges = images[:, 0, :, -1].float()
+        return torch.cat((code, torch.where(ranges.isfinite(), ranges, 0.0)), dim=-1)
 
 
 class PairHead(nn.Module):
@@ -69,19 +88,41 @@ class PairHead(nn.Module):
         )
 
     def embed(self, codes: Tensor) -> Tensor:
-        """Codes ``(..., code_size)`` to unit vectors ``(..., embedding_size)`` whose inner product is similarity."""
-        return normalize(self.embedding(codes), dim=-1)
+        """Codes ``(..., code_length)`` to unit vectors ``(..., embedding_size)`` whose inner product is similarity."""
+        return normalize(self.embedding(codes[..., : self.config.code_size]), dim=-1)
 
     def forward(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Measure pairs of codes ``(..., code_size)``.
+        """Measure pairs of codes ``(..., code_length)`` by what is learned of them.
 
         Returns:
             Pose of ``b`` in the frame of ``a`` ``(..., 3)`` (m, m, rad), the logarithm of its scales ``(..., 2)`` (of a
             Laplace distribution: position in m, heading in rad), and the logit ``(...)`` that the two are one place.
         """
+        a, b = a[..., : self.config.code_size], b[..., : self.config.code_size]
         out = self.layers(torch.cat((a, b, a * b), dim=-1))
         xy = out[..., :2] * self.config.offset_scale_m
         yaw = torch.atan2(out[..., 2], out[..., 3] + 1e-6)
         scale_offset = out.new_tensor([self.config.offset_scale_m, 1.0]).log()
         log_scale = out[..., 4:6].clamp(-6.0, 3.0) + scale_offset
         return torch.cat((xy, yaw.unsqueeze(-1)), dim=-1), log_scale, out[..., 6]
+
+    def register(self, a: Tensor, b: Tensor, start: Tensor, log_std: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Measure pairs of codes ``(..., code_length)`` by their ranges, from what is known of them already.
+
+        Args:
+            start: pose of ``b`` in the frame of ``a`` ``(..., 3)``; log_std: logarithm of its deviations ``(..., 2)``
+                (position in m, heading in rad).
+            steps: steps of the registration; 0 for what cannot be registered.
+
+        Returns:
+            Both, as ``scan_registration.register`` gives them.
+
+        Raises:
+            ValueError: codes that hold no ranges.
+        """
+        if steps == 0:
+            return start, log_std
+        config = self.config.registration
+        if config is None:
+            raise ValueError("scans are to be registered, but the place codes hold none; expected a registration")
+        return register(config, a[..., self.config.code_size :], b[..., self.config.code_size :], start, log_std, steps)

@@ -1,6 +1,6 @@
 """One step of the local odometry, as the online trajectory takes it, and what makes one unusable."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,7 +29,8 @@ class RelativeStep:
 
     ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
     ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
-    ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors.
+    ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
+    older one, which only the first step after a start has: of all others it came already.
     """
 
     stamp_ns: int
@@ -40,13 +41,14 @@ class RelativeStep:
     odom_xyyaw: np.ndarray
     motion_feature: np.ndarray
     place_code: np.ndarray
+    from_place_code: np.ndarray | None = field(default=None, kw_only=True)
 
 
-def check_step(step: RelativeStep, motion_feature_size: int, code_size: int | None) -> None:
+def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:
     """Raise ``RejectedStep`` if a step cannot be used, whatever came before it.
 
     Args:
-        motion_feature_size, code_size: lengths that are expected; None for place codes that are of no account.
+        motion_feature_size, code_length: lengths that are expected; None for place codes that are of no account.
     """
     vectors = {
         "relative_xyyaw": (step.relative_xyyaw, (3,)),
@@ -54,8 +56,10 @@ def check_step(step: RelativeStep, motion_feature_size: int, code_size: int | No
         "odom_xyyaw": (step.odom_xyyaw, (3,)),
         "motion_feature": (step.motion_feature, (motion_feature_size,)),
     }
-    if code_size is not None:
-        vectors["place_code"] = (step.place_code, (code_size,))
+    if code_length is not None:
+        vectors["place_code"] = (step.place_code, (code_length,))
+        if step.from_place_code is not None:
+            vectors["from_place_code"] = (step.from_place_code, (code_length,))
     for name, (value, shape) in vectors.items():
         if value.shape != shape:
             raise RejectedStep(f"{name} is of shape {value.shape}; expected {shape}")

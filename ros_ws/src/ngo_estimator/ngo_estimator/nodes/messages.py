@@ -67,6 +67,7 @@ def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> Relativ
         odom_yaw=odom_yaw,
         motion_feature=array("f", estimate.motion_feature.tobytes()),
         place_code=array("f", estimate.place_code.tobytes()),
+        from_place_code=array("f", b"" if estimate.from_place_code is None else estimate.from_place_code.tobytes()),
     )
 
 
@@ -83,6 +84,7 @@ def relative_step(message: RelativePose) -> "RelativeStep":
         odom_xyyaw=np.array([message.odom_x, message.odom_y, message.odom_yaw]),
         motion_feature=np.array(message.motion_feature, np.float32),
         place_code=np.array(message.place_code, np.float32),
+        from_place_code=np.array(message.from_place_code, np.float32) if message.from_place_code else None,
     )
 
 

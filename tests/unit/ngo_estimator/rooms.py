@@ -1,0 +1,70 @@
+"""A room of straight walls, and what a scanner sees in it: exact answers for the registration of scans."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ngo_estimator import se2
+from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.scan_registration import RegistrationConfig
+from tests.unit.ngo_estimator.samples import place_config
+
+RAYS = 241
+CONFIG = RegistrationConfig(RAYS, 300.0, 0.001)
+# An L-shaped room with a pillar: no two places in it look alike.
+_CORNERS = (
+    ((0.0, 0.0), (6.0, 0.0), (6.0, 2.5), (3.0, 2.5), (3.0, 5.0), (0.0, 5.0)),
+    ((1.2, 3.2), (1.5, 3.2), (1.5, 3.6), (1.2, 3.6)),
+)
+
+
+def ranges_at(poses: Tensor, rays: int = RAYS, field_of_view_deg: float = 300.0) -> Tensor:
+    """Exact ranges ``(n, rays)``, float64, of scans taken at poses ``(n, 3)`` in the room."""
+    corners = [np.array(part) for part in _CORNERS]
+    start = torch.tensor(np.concatenate(corners))
+    end = torch.tensor(np.concatenate([np.roll(part, -1, axis=0) for part in corners]))
+    half = math.radians(field_of_view_deg) / 2.0
+    angle = poses[:, 2:] + torch.linspace(half, -half, rays, dtype=torch.float64)
+    direction = torch.stack((angle.cos(), angle.sin()), dim=-1).unsqueeze(-2)
+    along, to_start = end - start, start - poses[:, None, None, :2]
+    determinant = _cross(direction, along)
+    distance, share = _cross(to_start, along) / determinant, _cross(to_start, direction) / determinant
+    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
+    return torch.where(hit, distance, math.inf).amin(-1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def round_trip(steps: int, period: int = 64) -> Tensor:
+    """Poses ``(steps + 1, 3)`` of a robot that drives round the room's corner again and again."""
+    phase = 2.0 * math.pi * torch.arange(steps + 1, dtype=torch.float64) / period
+    x, y = 2.0 + 1.0 * phase.sin(), 1.3 - 0.6 * phase.cos()
+    return torch.stack((x, y, torch.atan2(0.6 * phase.sin(), phase.cos())), dim=-1)
+
+
+def registering_pair_head() -> PairHead:
+    """A pair head for place codes of 12 numbers with the ranges behind them."""
+    torch.manual_seed(0)
+    config = place_config("maze2d", code_size=12, embedding_size=8, pair_hidden_size=16, registration=CONFIG)
+    return PairHead(config).eval().requires_grad_(False)
+
+
+def drive_in_the_room(steps: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """A noisy odometry in the room, with place codes that hold the scans.
+
+    Returns:
+        Steps and logarithms of their deviations ``(steps, 3)``, place codes ``(steps, 253)``, that of the first frame
+        ``(1, 253)``, and the true poses ``(steps, 3)`` after each step, seen from the first frame.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    poses = round_trip(steps)
+    std = torch.tensor([0.003, 0.003, 0.002])
+    relative = se2.between(poses[:-1], poses[1:]).float() + std * torch.randn(steps, 3, generator=generator)
+    # Alike at places that are near each other, as learned codes are.
+    places = torch.sin(poses @ torch.randn(3, 12, generator=generator, dtype=torch.float64))
+    codes = torch.cat((places, ranges_at(poses)), dim=-1).float()
+    return relative, std.log().expand(steps, 3).clone(), codes[1:], codes[:1], se2.between(poses[:1], poses[1:])
