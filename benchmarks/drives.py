@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -106,7 +107,10 @@ def drive_of(world_name: str, seed: int, steps: int, cache: Path = CACHE) -> Dri
     """A drive of ``steps`` steps in the maze of ``seed``; made at most once for each pair of networks."""
     world, weights = world_named(world_name), WEIGHTS / world_name
     (local, local_description), (place, place_description) = load_local(weights), load_place(weights)
-    networks = hashlib.sha256((local_description["sha256"] + place_description["sha256"]).encode()).hexdigest()[:8]
+    made_with = [
+        description[key] for description in (local_description, place_description) for key in ("sha256", "config")
+    ]
+    networks = hashlib.sha256(json.dumps(made_with).encode()).hexdigest()[:8]
     folder = cache / f"{world_name}_{seed}_{steps}_{networks}"
     if not folder.exists():
         cache.mkdir(parents=True, exist_ok=True)

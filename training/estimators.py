@@ -14,7 +14,7 @@ from torch import Tensor
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to_read
-from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.loop_closure import Loops, LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
@@ -48,8 +48,16 @@ class Estimator:
     identity: str
 
 
-def estimators(row: str, seeds: int, sources: Sources) -> list[Estimator]:
-    """The estimators of a row: one, or one for each training seed."""
+Prepared = dict[tuple[int, int, LoopSearch], tuple[tuple[Tensor, Tensor], Loops]]
+"""Odometry and loops of some trajectories, by the number of the first, their length and the search: the costly part,
+and the same for all optimizers with one pair head and one search."""
+
+
+def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None = None) -> list[Estimator]:
+    """The estimators of a row: one, or one for each training seed.
+
+    ``prepared`` keeps what the rows of one table have in common; None where nothing is to be kept.
+    """
     if row not in ROWS:
         raise ValueError(f"row is {row!r}; expected one of {', '.join(ROWS)}")
     kind = ROWS[row]
@@ -62,7 +70,7 @@ def estimators(row: str, seeds: int, sources: Sources) -> list[Estimator]:
         own = sources.of_row(row, 0)
         return [_trained(own, own.networks)]
     if kind.form is not None:
-        return [_trained(sources, sources.row_folder(row, seed)) for seed in range(seeds)]
+        return [_trained(sources, sources.row_folder(row, seed), prepared) for seed in range(seeds)]
     place, description = load_place(sources.networks, sources.world.name)
     if row == "registered":
         return [Estimator(lambda arrays: registered(arrays, place.pair_head), f"{row} {description['sha256']}")]
@@ -109,7 +117,7 @@ def calibrated(arrays: Arrays, calibration: dict[str, tuple[float, float, float]
     return {**arrays, "relative": relative}
 
 
-def _trained(sources: Sources, optimizer_folder: Path) -> Estimator:
+def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None = None) -> Estimator:
     place, description = load_place(sources.networks, sources.world.name)
     optimizer, trained = load_optimizer(optimizer_folder, sources.world.name)
     if trained.get("place_encoder_sha256") != description["sha256"]:
@@ -118,13 +126,29 @@ def _trained(sources: Sources, optimizer_folder: Path) -> Estimator:
             "it anew"
         )
     identity = f"{trained['sha256']} {description['sha256']}"
-    return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m), identity)
+    return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m, prepared), identity)
 
 
 def optimized_by(
-    optimizer: NeuralGraphOptimizer, pair_head: PairHead, block_m: float
+    optimizer: NeuralGraphOptimizer, pair_head: PairHead, block_m: float, prepared: Prepared | None = None
 ) -> Callable[[Arrays], np.ndarray]:
-    """What ``optimize_offline`` does, for many trajectories at once; ``block_m`` is the side of a compass's lattice."""
+    """What ``optimize_offline`` does, for many trajectories at once.
+
+    ``block_m`` is the side of a compass's lattice. ``prepared`` is of the same trajectories and the same pair head.
+    """
+
+    def odometry_and_loops(first: int, whole: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], Loops | None]:
+        odometry = whole["relative"], whole["log_std"]
+        if not optimizer.config.loops:
+            return odometry, None
+        key = first, odometry[0].shape[1], optimizer.config.search
+        if prepared is not None and key in prepared:
+            return prepared[key]
+        odometry = optimizer.registered(*odometry, whole["codes"], pair_head, whole["origin_code"][:, 0])
+        loops = optimizer.find_loops(odometry[0], whole["codes"], pair_head)
+        if prepared is not None:
+            prepared[key] = odometry, loops
+        return odometry, loops
 
     @torch.inference_mode()
     def poses(arrays: Arrays) -> np.ndarray:
@@ -132,12 +156,9 @@ def optimized_by(
         for first in range(0, len(arrays["relative"]), _TOGETHER):
             some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
             whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
-            odometry, config, loops = (whole["relative"], whole["log_std"]), optimizer.config, None
-            if config.loops:
-                odometry = optimizer.registered(*odometry, whole["codes"], pair_head, whole["origin_code"][:, 0])
-                loops = optimizer.find_loops(odometry[0], whole["codes"], pair_head)
+            odometry, loops = odometry_and_loops(first, whole)
             fixes = None
-            if config.compass:
+            if optimizer.config.compass:
                 reading, scale = (whole[name] for name in COMPASS_ARRAYS)
                 fixes = compass_fixes(reading, scale, *odometry, optimizer.block, block_m)
             result = optimizer(*odometry, whole["motion"], loops, fixes)

@@ -35,6 +35,8 @@ COLORS = {
     "ngo_5": CORRECTED,
     "gauss_newton": "#8c564b",
     "gtsam": "#444444",
+    "registered": "#b8860b",
+    "gtsam_registered": "#1a9988",
     "true_pairs": "#bcbd22",
     "oracle": "#9a9a9a",
     "end_to_end": "#e377c2",
@@ -42,7 +44,18 @@ COLORS = {
     "ngo_1_compass": "#f2a3a3",
     "ngo_5_compass": "#d62728",
 }
-MAIN_ROWS = ("local", "paper_5", "ngo_1", "ngo_5", "gtsam", "oracle", "gtsam_compass", "ngo_5_compass")
+MAIN_ROWS = (
+    "local",
+    "paper_5",
+    "gtsam",
+    "oracle",
+    "gtsam_compass",
+    "ngo_1",
+    "registered",
+    "gtsam_registered",
+    "ngo_5",
+    "ngo_5_compass",
+)
 CORRECTED_ROW = "ngo_5"
 
 Tables = dict[str, dict[str, list[Measured]]]
@@ -123,7 +136,7 @@ def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], measur
                 axes.plot(xy[:, 0], xy[:, 1], color=color, linewidth=width, label=label, alpha=0.9)
             axes.plot(*start[:2], "o", color="white", markeredgecolor="black", markersize=9, label="start", zorder=5)
             axes.set_title(
-                f"{table}, {what} error of {len(order)}: local {odometry[k]:.2f}, corrected {corrected[k]:.2f}\n"
+                f"{table}, {what} error of {len(order)}: local {odometry[k]:.2g}, corrected {corrected[k]:.2g}\n"
                 f"({in_sentence(metric.title)}, {metric.unit})",
                 fontsize=11,
             )

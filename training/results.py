@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from training import attention, figures, results_page, runs, tables
 from training.curves import write_at_once
-from training.estimators import Arrays, estimators
+from training.estimators import Arrays, Prepared, estimators
 from training.featurise import open_store
 from training.measured import Measured, measure
 from training.prerequisites import Scripts, Wanted, prepare
@@ -106,6 +106,7 @@ def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
     shared = table_data(arguments, sources, table)
     cache = arguments.runs / sources.world.name / "results" / f"{arguments.split}_{table}"
     result: dict[str, list[Measured]] = {}
+    prepared: Prepared = {}
     with tqdm(rows_of(sources.world), desc=f"{sources.world.name} {table}", unit="row") as bar:
         for row in bar:
             bar.set_postfix_str(row)
@@ -121,7 +122,7 @@ def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
                     sources.world,
                     cache / f"{row}-seed{seed}.npz",
                 )
-                for seed, estimator in enumerate(estimators(row, arguments.seeds, sources))
+                for seed, estimator in enumerate(estimators(row, arguments.seeds, sources, prepared))
             ]
     return result
 

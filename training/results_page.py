@@ -55,7 +55,7 @@ def number(value: float) -> str:
     magnitude = abs(value)
     digits = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2 if magnitude >= 1 else 3
     if 0 < magnitude < 0.1:
-        digits = 4
+        digits = 4 if magnitude >= 0.01 else 5
     return f"{value:.{digits}f}"
 
 

@@ -13,7 +13,17 @@ from ngo_estimator.online_trajectory import optimize_offline
 from ngo_estimator.place_encoder import PairHead
 from tests.unit.ngo_estimator.rooms import drive_in_the_room, registering_pair_head
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.estimators import Arrays, calibrated, estimators, local, optimized_by, pose_graph, prefix, registered
+from training.estimators import (
+    Arrays,
+    Prepared,
+    calibrated,
+    estimators,
+    local,
+    optimized_by,
+    pose_graph,
+    prefix,
+    registered,
+)
 from training.pose_graph import PoseGraphSettings
 from training.rows import ROWS, Sources, rows_of, trainings_of
 from training.worlds import WORLDS, world_named
@@ -38,8 +48,11 @@ def pair_head() -> PairHead:
 def test_many_trajectories_come_out_as_single_ones(form: str, steps: int, pair_head: PairHead) -> None:
     optimizer = small_optimizer(form, trained=True)
     some = prefix(arrays(), steps)
-    poses = optimized_by(optimizer, pair_head, 1.0)(some)
+    prepared: Prepared = {}
+    poses = optimized_by(optimizer, pair_head, 1.0, prepared)(some)
     assert poses.shape == (3, steps, 3) and poses.dtype == np.float64
+    assert len(prepared) == (form != "paper")
+    np.testing.assert_array_equal(optimized_by(optimizer, pair_head, 1.0, prepared)(some), poses)
     moved = np.abs(poses - local(some)).max()
     assert moved > 5e-3
     for k in range(3):
