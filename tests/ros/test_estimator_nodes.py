@@ -79,6 +79,10 @@ def test_nodes_equal_their_cores(graph: Graph) -> None:
         np.testing.assert_allclose(step.odom_xyyaw, estimate.odom_xyyaw, atol=1e-6)
         np.testing.assert_allclose(step.motion_feature, estimate.motion_feature, atol=1e-5)
         np.testing.assert_allclose(step.place_code, estimate.place_code, atol=1e-5)
+        # The first frame's place code comes with the first step, and never again.
+        assert (step.from_place_code is not None) == (message is out.relative_poses[0])
+        if step.from_place_code is not None and estimate.from_place_code is not None:
+            np.testing.assert_allclose(step.from_place_code, estimate.from_place_code, atol=1e-5)
         assert message.header.frame_id == odometry.child_frame_id == "base_link"
         assert odometry.header.frame_id == "odom"
         assert odometry.pose.pose.position.x == message.odom_x
