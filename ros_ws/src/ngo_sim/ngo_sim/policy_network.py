@@ -1,0 +1,184 @@
+"""The learned driver's network: what it looks at, and its forward pass in numpy: a simulator needs no torch."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import safetensors
+from safetensors.numpy import load
+
+FORMAT = 1
+NETWORK = "driver"
+SHIPPED = Path(__file__).with_name("weights") / "driver.safetensors"
+ACTIONS = 3
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """What the learned driver sees and how its network is built; the pictures are grey."""
+
+    height: int = 30  # of a picture, pixels
+    width: int = 40  # of a picture, pixels
+    pictures: int = 3  # of the newest decisions, the present one among them
+    hold_frames: int = 2  # for which an action is held: a decision is taken in every so many frames
+    channels: tuple[int, ...] = (16, 32, 32)  # of the convolutions
+    kernels: tuple[int, ...] = (5, 3, 3)  # sides of their kernels, pixels
+    strides: tuple[int, ...] = (2, 2, 2)  # of their kernels, pixels
+    hidden: int = 128  # units of the layer behind them
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width", "pictures", "hold_frames", "hidden"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} is {value!r}; it must be an integer of at least 1")
+        for name in ("channels", "kernels", "strides"):
+            value = getattr(self, name)
+            if not value or len(value) != len(self.channels) or any(type(one) is not int or one < 1 for one in value):
+                raise ValueError(f"{name} is {value!r}; it must have {len(self.channels)} integers of at least 1")
+        if min(self.feature_shape) < 1:
+            raise ValueError(f"pictures of {self.width} x {self.height} leave the kernels {self.kernels} nothing")
+
+    @property
+    def feature_shape(self) -> tuple[int, int, int]:
+        """Channels, height and width behind the convolutions."""
+        height, width = self.height, self.width
+        for kernel, stride in zip(self.kernels, self.strides, strict=True):
+            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
+        return self.channels[-1], height, width
+
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the weights."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        before = self.pictures
+        for index, (channels, kernel) in enumerate(zip(self.channels, self.kernels, strict=True)):
+            shapes[f"convolution_{index}.weight"] = (channels, before, kernel, kernel)
+            shapes[f"convolution_{index}.bias"] = (channels,)
+            before = channels
+        shapes["hidden.weight"] = (self.hidden, int(np.prod(self.feature_shape)) + ACTIONS)
+        shapes["hidden.bias"] = (self.hidden,)
+        shapes["action.weight"], shapes["action.bias"] = (ACTIONS, self.hidden), (ACTIONS,)
+        return shapes
+
+
+class PolicyView:
+    """What the network looks at: the pictures of the newest decisions, and the last action.
+
+    pictures: uint8 (pictures, height, width), the newest first. last_action: float32 (3,), 1 for the last action, all 0
+    before the first.
+    """
+
+    def __init__(self, config: PolicyConfig) -> None:
+        self.config = config
+        self.pictures = np.zeros((config.pictures, config.height, config.width), dtype=np.uint8)
+        self.last_action = np.zeros(ACTIONS, dtype=np.float32)
+        self._empty = True
+
+    def see(self, observation: npt.NDArray[np.uint8]) -> None:
+        """Take in what is seen at a decision; before the first, it counts as having been seen all the time."""
+        picture = grey_picture(observation, self.config.height, self.config.width)
+        if self._empty:
+            self.pictures[:], self._empty = picture, False
+        self.pictures[1:] = self.pictures[:-1].copy()
+        self.pictures[0] = picture
+
+    def did(self, action: int) -> None:
+        """Remember the action that was decided on."""
+        self.last_action[:] = 0.0
+        self.last_action[action] = 1.0
+
+
+def grey_picture(observation: npt.NDArray[np.uint8], height: int, width: int) -> npt.NDArray[np.uint8]:
+    """uint8 (height, width): the mean of colours and of whole blocks of pixels, rounded down.
+
+    Raises ValueError where observation is not uint8 (a height, b width, 3) with whole a and b.
+    """
+    if observation.ndim != 3 or observation.dtype != np.uint8 or observation.shape[2] != 3:
+        raise ValueError(
+            f"the learned driver is given {observation.dtype} {observation.shape}; it needs colour pictures, uint8 "
+            "(height, width, 3)"
+        )
+    rows, cols = observation.shape[0] // height, observation.shape[1] // width
+    if observation.shape[:2] != (rows * height, cols * width) or not rows or not cols:
+        raise ValueError(
+            f"the learned driver is given pictures of {observation.shape[1]} x {observation.shape[0]}; it needs "
+            f"multiples of {width} x {height}"
+        )
+    total = observation.reshape(height, rows, width, cols * 3).sum(axis=(1, 3), dtype=np.uint32)
+    return (total // (rows * cols * 3)).astype(np.uint8)
+
+
+class PolicyNetwork:
+    """Convolutions and a hidden layer, all with ReLU, to the logarithms of the odds of the three actions.
+
+    tensors: float arrays of the names and shapes of config.tensor_shapes(). Raises ValueError for others.
+    """
+
+    def __init__(self, config: PolicyConfig, tensors: dict[str, npt.NDArray[Any]]) -> None:
+        expected = config.tensor_shapes()
+        if tensors.keys() != expected.keys():
+            raise ValueError(f"the weights are {sorted(tensors)}; expected {sorted(expected)}")
+        for name, shape in expected.items():
+            if tensors[name].shape != shape or not np.isfinite(tensors[name]).all():
+                raise ValueError(f"{name} has shape {tensors[name].shape}; expected {shape}, all finite")
+        self.config = config
+        weights = {name: tensor.astype(np.float32) for name, tensor in tensors.items()}
+        self._convolutions = [
+            (weights[f"convolution_{index}.weight"].reshape(channels, -1), weights[f"convolution_{index}.bias"])
+            for index, channels in enumerate(config.channels)
+        ]
+        self._hidden = weights["hidden.weight"], weights["hidden.bias"]
+        self._action = weights["action.weight"], weights["action.bias"]
+
+    def logits(self, view: PolicyView) -> npt.NDArray[np.float32]:
+        """float32 (3,) of a view."""
+        values = view.pictures.astype(np.float32) / 255.0
+        for (weight, bias), kernel, stride in zip(
+            self._convolutions, self.config.kernels, self.config.strides, strict=True
+        ):
+            windows = np.lib.stride_tricks.sliding_window_view(values, (kernel, kernel), axis=(1, 2))
+            windows = windows[:, ::stride, ::stride]
+            height, width = windows.shape[1:3]
+            columns = windows.transpose(0, 3, 4, 1, 2).reshape(weight.shape[1], height * width)
+            values = np.maximum(weight @ columns + bias[:, None], 0.0).reshape(-1, height, width)
+        weight, bias = self._hidden
+        hidden = np.maximum(weight @ np.concatenate((values.ravel(), view.last_action)) + bias, 0.0)
+        weight, bias = self._action
+        return weight @ hidden + bias
+
+
+def load_policy(path: Path = SHIPPED) -> PolicyNetwork:
+    """The network in a safetensors file that the JSON beside it describes.
+
+    Raises ValueError naming the file, what is wrong with it and what was expected.
+    """
+    beside = path.with_suffix(".json")
+    try:
+        description, content = json.loads(beside.read_text()), path.read_bytes()
+        tensors = load(content)
+    except (OSError, ValueError, safetensors.SafetensorError) as error:
+        raise ValueError(f"{path}: no readable weights with a JSON description beside them ({error})") from error
+    if not isinstance(description, dict) or (description.get("format"), description.get("network")) != (
+        FORMAT,
+        NETWORK,
+    ):
+        raise ValueError(f"{beside}: is not the description of a {NETWORK} of format {FORMAT}")
+    if hashlib.sha256(content).hexdigest() != description.get("sha256"):
+        raise ValueError(f"{path}: is not the file that {beside.name} describes (sha256 differs)")
+    try:
+        return PolicyNetwork(policy_config(description.get("config")), tensors)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def policy_config(values: Any) -> PolicyConfig:
+    """The config of JSON values; unknown and missing keys raise ValueError."""
+    expected = asdict(PolicyConfig())
+    if not isinstance(values, dict) or values.keys() != expected.keys():
+        raise ValueError(f"config is {values!r}; expected an object with {', '.join(expected)}")
+    return PolicyConfig(**{key: tuple(one) if isinstance(one, list) else one for key, one in values.items()})

@@ -1,0 +1,263 @@
+"""Train the learned driver of the 3D world: a small network that drives as far as it can, by advantage actor-critic.
+
+    python -m training.train_driver
+
+The reward is the distance travelled (paper, section 4). Run again, it goes on after its last checkpoint, in mazes that
+it has not met. It ends with the weights written into the simulator's package. Progress goes to `metrics.csv` in its
+folder below `runs/`, beside `run.json`.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from safetensors.numpy import save
+from stable_baselines3 import A2C
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from torch import Tensor, nn
+
+from ngo_sim.policy_network import ACTIONS, FORMAT, NETWORK, SHIPPED, PolicyConfig
+from training import runs
+from training.curves import write_at_once
+from training.driving_task import REWARD_PER_M, DrivingTask
+from training.worlds import world_named
+
+CHECKPOINT = "last.pt"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of a training of the driver."""
+
+    decisions: int = 1_400_000
+    """Decisions to train on, of all environments together; each holds its action for two frames."""
+    environments: int = 16
+    """Mazes that are driven through side by side."""
+    steps: int = 16
+    """Decisions of each environment between two updates."""
+    episode_frames: int = 500
+    """Frames in one maze."""
+    mazes: int = 16
+    """Mazes of one size that an environment makes at a time."""
+    learning_rate: float = 7e-4
+    """At the beginning; it falls to zero along a line."""
+    discount: float = 0.98
+    """Worth of a reward one decision later."""
+    entropy: float = 0.02
+    """Weight of the entropy of the actions in the loss, at the beginning; it falls to zero as well."""
+    checkpoint_decisions: int = 50_000
+    """Decisions between two checkpoints."""
+    threads: int = 1
+    """Threads that the network is trained with."""
+    seed: int = 0
+    """Seed of the weights, the mazes and the actions."""
+    out: Path = SHIPPED
+    """File that gets the weights; its JSON lies beside it."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of checkpoints and logs."""
+
+    def __post_init__(self) -> None:
+        counts = ("decisions", "environments", "steps", "episode_frames", "mazes", "checkpoint_decisions", "threads")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+
+
+class Features(BaseFeaturesExtractor):
+    """The network of ngo_sim.policy_network up to its hidden layer; names of weights are the same."""
+
+    def __init__(self, observation_space: Any, config: PolicyConfig) -> None:
+        super().__init__(observation_space, config.hidden)
+        before, layers = config.pictures, []
+        for channels, kernel, stride in zip(config.channels, config.kernels, config.strides, strict=True):
+            layers += [nn.Conv2d(before, channels, kernel, stride), nn.ReLU()]
+            before = channels
+        self.convolutions = nn.Sequential(*layers, nn.Flatten())
+        self.hidden = nn.Linear(int(np.prod(config.feature_shape)) + ACTIONS, config.hidden)
+
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        """(batch, hidden) of pictures (batch, pictures, height, width) in [0, 1] and last_action (batch, 3)."""
+        seen = self.convolutions(observations["pictures"])
+        return torch.relu(self.hidden(torch.cat((seen, observations["last_action"]), dim=1)))
+
+
+class Progress(BaseCallback):
+    """Between two updates: lowers the entropy's weight, writes a row of metrics.csv and a checkpoint now and then."""
+
+    def __init__(self, folder: Path, arguments: Arguments, prior_s: float) -> None:
+        super().__init__()
+        self.folder, self.arguments, self.prior_s = folder, arguments, prior_s
+        self.begun_s = time.monotonic()
+
+    def _on_training_start(self) -> None:
+        self.due = self.num_timesteps + self.arguments.checkpoint_decisions
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        model: Any = self.model
+        model.ent_coef = self.arguments.entropy * (1.0 - self.num_timesteps / self.arguments.decisions)
+        if self.num_timesteps >= self.due:
+            self.due += self.arguments.checkpoint_decisions
+            self.keep()
+
+    def keep(self) -> None:
+        """Write both now."""
+        values = self.model.logger.name_to_value
+        row = {
+            "decisions": self.num_timesteps,
+            "wall_s": round(self.wall_s, 1),
+            "metres_per_1000_frames": round(self.metres_per_1000_frames, 2),
+            "entropy": round(-float(values.get("train/entropy_loss", math.nan)), 4),
+            "explained_variance": round(float(values.get("train/explained_variance", math.nan)), 4),
+        }
+        with (self.folder / "metrics.csv").open("a", newline="") as file:
+            writer = csv.DictWriter(file, row)
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow(row)
+        print(", ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+        state = {
+            "decisions": self.num_timesteps,
+            "wall_s": self.wall_s,
+            "policy": self.model.policy.state_dict(),
+            "optimizer": self.model.policy.optimizer.state_dict(),
+        }
+        partial_file = self.folder / f"{CHECKPOINT}.partial"
+        torch.save(state, partial_file)
+        os.replace(partial_file, self.folder / CHECKPOINT)
+
+    @property
+    def wall_s(self) -> float:
+        """Time that the training has taken, before it was stopped among it."""
+        return self.prior_s + time.monotonic() - self.begun_s
+
+    @property
+    def metres_per_1000_frames(self) -> float:
+        """Of the last 100 mazes; nan before the first."""
+        episodes = list(self.model.ep_info_buffer or ())
+        frames = PolicyConfig().hold_frames * sum(episode["l"] for episode in episodes)
+        return 1000 * sum(episode["r"] for episode in episodes) / REWARD_PER_M / frames if frames else math.nan
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Train to the last decision, from the last checkpoint; returns the description written beside the weights."""
+    torch.set_num_threads(arguments.threads)
+    folder = arguments.runs / "maze3d" / "driver"
+    record = runs.record("train_driver", arguments)
+    state = load_state(folder, record)
+    done = 0 if state is None else int(state["decisions"])
+    write_at_once(folder / "run.json", json.dumps({**record, "state": "running"}, indent=2) + "\n")
+
+    config, world = PolicyConfig(), world_named("maze3d")
+    # Begun again, it draws other mazes: how far into a maze it was is not kept.
+    streams = [(arguments.seed, index, done) for index in range(arguments.environments)]
+    environments = VecMonitor(
+        DummyVecEnv(
+            [
+                partial(DrivingTask, world, config, stream, arguments.episode_frames, arguments.mazes)
+                for stream in streams
+            ]
+        )
+    )
+    model = make_model(arguments, config, environments)
+    if state is not None:
+        model.policy.load_state_dict(state["policy"])
+        model.policy.optimizer.load_state_dict(state["optimizer"])
+        model.num_timesteps = done
+    progress = Progress(folder, arguments, 0.0 if state is None else float(state["wall_s"]))
+    try:
+        if done < arguments.decisions:
+            model.learn(arguments.decisions - done, progress, log_interval=10**9, reset_num_timesteps=False)
+            progress.keep()
+    finally:
+        environments.close()
+    figures = {"decisions": model.num_timesteps, "wall_s": round(progress.wall_s)}
+    description = export(arguments.out, model.policy.state_dict(), config, {"training": {**record, **figures}})
+    write_at_once(folder / "run.json", json.dumps({**record, **figures, "state": "complete"}, indent=2) + "\n")
+    return description
+
+
+def make_model(arguments: Arguments, config: PolicyConfig, environments: VecMonitor) -> A2C:
+    """The actor and the critic, which share all but their last layers."""
+    return A2C(
+        "MultiInputPolicy",
+        environments,
+        learning_rate=lambda remaining: arguments.learning_rate * remaining,
+        n_steps=arguments.steps,
+        gamma=arguments.discount,
+        gae_lambda=0.95,
+        ent_coef=arguments.entropy,
+        vf_coef=0.5,
+        normalize_advantage=True,
+        policy_kwargs={
+            "features_extractor_class": Features,
+            "features_extractor_kwargs": {"config": config},
+            "net_arch": [],
+        },
+        seed=arguments.seed,
+        device="cpu",
+    )
+
+
+def load_state(folder: Path, record: dict[str, Any]) -> dict[str, Any] | None:
+    """The last checkpoint of a folder, None where there is none; RunError where its run had other arguments."""
+    if not (folder / CHECKPOINT).exists():
+        return None
+    then = json.loads((folder / "run.json").read_text())["arguments"]
+    now = json.loads(json.dumps(record["arguments"]))
+    if differing := sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name)):
+        given = ", ".join(f"{name} {now.get(name)}" for name in differing)
+        expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
+        raise runs.RunError(
+            f"{folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, or the "
+            "folder removed to begin anew"
+        )
+    state: dict[str, Any] = torch.load(folder / CHECKPOINT, weights_only=True)
+    return state
+
+
+def export(path: Path, state: dict[str, Tensor], config: PolicyConfig, details: dict[str, Any]) -> dict[str, Any]:
+    """Write the actor as safetensors with its description beside it; returns the description."""
+    names = {"features_extractor.hidden": "hidden", "action_net": "action"}
+    names |= {f"features_extractor.convolutions.{2 * i}": f"convolution_{i}" for i in range(len(config.channels))}
+    tensors = {
+        f"{name}.{part}": np.ascontiguousarray(state[f"{layer}.{part}"].detach().numpy())
+        for layer, name in names.items()
+        for part in ("weight", "bias")
+    }
+    weights = save(tensors)
+    description = {
+        "format": FORMAT,
+        "network": NETWORK,
+        "world": "maze3d",
+        "sha256": hashlib.sha256(weights).hexdigest(),
+        "config": dataclasses.asdict(config),
+        **details,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial_file = path.with_name(path.name + ".partial")
+    partial_file.write_bytes(weights)
+    os.replace(partial_file, path)
+    write_at_once(path.with_suffix(".json"), json.dumps(description, indent=2) + "\n")
+    return description
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
