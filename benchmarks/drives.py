@@ -17,7 +17,7 @@ import torch
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_place
 from ngo_estimator.relative_step import RelativeStep
-from ngo_sim.drivers import driver_generator, make_driver
+from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.episodes import Episode
 from training.featurise import features_of
 from training.metrics import seen_from_first
@@ -94,7 +94,7 @@ def episodes(world_name: str, seed: int, steps: int, chunk: int = _CHUNK) -> Ite
             # Images are copied at once: an environment may hand out its own buffer.
             images, poses, actions = [np.array(observation)], [info["pose_xyyaw"]], []
             for _ in range(count):
-                actions.append(int(driver.action(info["pose_xyyaw"])))
+                actions.append(int(driver.action(info["pose_xyyaw"], observation)))
                 observation, _, _, _, info = env.step(actions[-1])
                 images.append(np.array(observation))
                 poses.append(info["pose_xyyaw"])

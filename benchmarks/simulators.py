@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ngo_sim.drivers import DRIVER_NAMES, driver_generator, make_driver
+from ngo_sim.driver_choice import DRIVER_NAMES, driver_generator, make_driver
 
 BARS_STEPS_PER_S = {"maze2d": 10_000, "maze3d": 2_500}
 
@@ -102,14 +102,14 @@ def measure(world_name: str, args: Arguments) -> Measurement:
     walls_s, resets_s, cpu_total_s, driver_s, metres = [], [], 0.0, 0.0, 0.0
     try:
         for seed in seeds:
-            reset_s, (_, info) = timed(partial(world.reset, seed=seed))
+            reset_s, (observation, info) = timed(partial(world.reset, seed=seed))
             driver = make_driver(args.driver, world.maze, driver_generator(seed))
-            poses, travelled = [], 0.0
+            frames, travelled = [], 0.0
             cpu_begin, begin = cpu_s(), time.perf_counter()
             for _ in range(args.steps):
                 pose = info["pose_xyyaw"]
-                poses.append(pose)
-                _, reward, _, _, info = world.step(int(driver.action(pose)))
+                frames.append((pose, observation))
+                observation, reward, _, _, info = world.step(int(driver.action(pose, observation)))
                 travelled += reward
             wall_s, used_s = time.perf_counter() - begin, cpu_s() - cpu_begin
             if seed == seeds[0]:
@@ -120,8 +120,8 @@ def measure(world_name: str, args: Arguments) -> Measurement:
             metres += travelled
             alone = make_driver(args.driver, world.maze, driver_generator(seed))
             begin = time.process_time()
-            for pose in poses:
-                alone.action(pose)
+            for pose, observation in frames:
+                alone.action(pose, observation)
             driver_s += time.process_time() - begin
     finally:
         world.close()

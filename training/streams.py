@@ -192,8 +192,10 @@ class PlaceStream(_Stream):
         pairs = [(episode, revisits(episode.poses_xyyaw, self.world, self.MIN_STEPS_APART)) for episode in episodes]
         usable = [(episode, found) for episode, found in pairs if len(found)]
         if not usable:
+            plan = episodes[0].maze
+            assert plan is not None  # worlds are mazes
             raise ValueError(
-                f"in none of {len(episodes)} mazes of {episodes[0].maze.walls.shape} blocks is a place seen twice in "
+                f"in none of {len(episodes)} mazes of {plan.walls.shape} blocks is a place seen twice in "
                 f"{self.frames} frames, {self.MIN_STEPS_APART} or more apart; expected longer episodes or smaller mazes"
             )
         images = [images_of(self.world, episode) for episode, _ in usable]

@@ -63,7 +63,7 @@ class World(Domain):
 
     def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size, by default the simulator's own size."""
-        changes = {} if rows is None else {"rows": rows, "cols": rows}
+        changes: dict[str, Any] = {} if rows is None else {"rows": rows, "cols": rows}
         if extra_openings is not None:
             changes["extra_openings"] = extra_openings
         if self.name == "maze2d":

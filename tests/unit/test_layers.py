@@ -22,7 +22,7 @@ ROS = ("rclpy", "builtin_interfaces", "ament_index_python", "rosidl_runtime_py",
 # A module may import, directly or through others, none of a later layer of its package.
 LAYERS = {
     "ngo_recordings": [{"errors"}, {"definitions", "images", "poses"}, {"recording", "writer"}, {"topics"}, {"frames"}],
-    "ngo_sim": [{"mazes"}, {"drivers", "maze2d", "maze3d"}, {"episodes"}],
+    "ngo_sim": [{"mazes"}, {"drivers", "maze2d", "maze3d"}, {"driver_choice"}, {"episodes"}],
     "ngo_estimator": [
         {"se2"},
         {"local_pose_network", "place_encoder", "pose_aggregation", "neural_graph_optimizer"},
@@ -87,8 +87,8 @@ def crossings(imports: Mapping[str, set[str]]) -> Iterator[str]:
                     yield f"{module} imports {name}: the packages meet in training, in tests, or through messages"
                 if target in OUTSIDE:
                     yield f"{module} imports {name}: a package imports nothing that is not installed with it"
-            if target == "vizdoom" and module != "ngo_sim.maze3d" and top != "tests":
-                yield f"{module} imports {name}: only ngo_sim.maze3d does"
+            if target == "vizdoom" and module != "ngo_sim.doom_engine" and top != "tests":
+                yield f"{module} imports {name}: only ngo_sim.doom_engine does"
             for package in PACKAGES:
                 own = is_below(module, f"{package}.nodes")
                 own |= top == "benchmarks" and any(is_below(name, part) for part in PARTS_OF_NODES)
@@ -126,8 +126,8 @@ def test_no_import_crosses_a_layer() -> None:
     [
         ("ngo_sim.mazes", "import rclpy", "only nodes know of ROS"),
         ("ngo_sim.mazes", "def late():\n    from nav_msgs.msg import Path", "only nodes know of ROS"),
-        ("ngo_sim.maze2d", "import vizdoom as vzd", "only ngo_sim.maze3d does"),
-        ("training.data", "import vizdoom", "only ngo_sim.maze3d does"),
+        ("ngo_sim.maze3d", "import vizdoom as vzd", "only ngo_sim.doom_engine does"),
+        ("training.data", "import vizdoom", "only ngo_sim.doom_engine does"),
         ("ngo_sim.nodes.maze2d_node", "from ngo_estimator import se2", "the packages meet"),
         ("ngo_estimator.se2", "import importlib\nimportlib.import_module('ngo_sim.mazes')", "the packages meet"),
         ("ngo_estimator.se2", "from training import losses", "not installed with it"),
@@ -160,7 +160,7 @@ def test_a_crossing_through_other_modules_is_caught() -> None:
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("ngo_sim.maze3d", "import vizdoom"),
+        ("ngo_sim.doom_engine", "import vizdoom"),
         ("ngo_sim.nodes.maze2d_node", "import rclpy\nfrom ngo_sim.maze2d import Maze2D\nfrom . import parameters"),
         ("training.data", "from ngo_sim import episodes\nfrom ngo_estimator import se2"),
         ("benchmarks.online", "from ngo_estimator.nodes.path_message import PathWriter"),

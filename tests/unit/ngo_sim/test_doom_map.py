@@ -16,11 +16,12 @@ from ngo_sim.doom_map import (
     WALL_HEIGHT_UNITS,
     WALL_TEXTURES,
     MapStyle,
+    map_lumps,
     random_style,
     textmap,
     wall_faces,
-    write_pwad,
 )
+from ngo_sim.doom_wad import write_lumps
 from ngo_sim.mazes import Maze, kruskal_maze
 
 Lump = tuple[str, bytes]
@@ -122,17 +123,16 @@ def test_mistakes_in_a_map_are_told() -> None:
 
 def test_a_pwad_holds_the_maps_in_order(tmp_path: Path) -> None:
     path = tmp_path / "maps.wad"
-    write_pwad(path, [("M0", "first"), ("M1", "second one")])
+    write_lumps(path, map_lumps([("M0", "first"), ("M1", "second one")]))
     assert read_wad(path) == ("PWAD", [
         ("M0", b""), ("TEXTMAP", b"first"), ("ENDMAP", b""),
         ("M1", b""), ("TEXTMAP", b"second one"), ("ENDMAP", b"")])  # fmt: skip
 
 
 @pytest.mark.parametrize("names", [("M0", "M0"), ("TOOLONGNAME",), ("",), ("lower",)])
-def test_names_that_are_no_lump_names_or_repeated_are_refused(tmp_path: Path, names: tuple[str, ...]) -> None:
+def test_names_that_are_no_lump_names_or_repeated_are_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match=f"map name is '{names[-1]}'; it must be"):
-        write_pwad(tmp_path / "maps.wad", [(name, "") for name in names])
-    assert not list(tmp_path.iterdir())
+        map_lumps((name, "") for name in names)
 
 
 def vizdoom_folder() -> Path:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ngo_sim.drivers import driver_generator, make_driver
+from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.episodes import record_episode
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 
@@ -17,7 +17,7 @@ def test_an_episode_has_the_worlds_shapes_and_types() -> None:
     np.testing.assert_array_equal(episode.maze.walls, env.maze.walls)
 
 
-@pytest.mark.parametrize("driver", ["corners", "random_goals", "random"])
+@pytest.mark.parametrize("driver", ["corners", "random_goals", "explorer", "random"])
 def test_action_k_leads_from_frame_k_to_frame_k_plus_1(driver: str) -> None:
     episode = record_episode(Maze2D(), driver, 200, seed=1)
     env = Maze2D()

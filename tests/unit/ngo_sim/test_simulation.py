@@ -23,6 +23,15 @@ def test_is_what_an_episode_records() -> None:
             simulation.advance(action)
 
 
+def test_auto_is_the_driver_that_the_world_names() -> None:
+    runs = [Simulation(Maze2D(), seed=3, driver=driver) for driver in ("auto", "corners")]
+    for _ in range(50):
+        actions = [run.choose_action(0.0, 0.5, hold=True) for run in runs]
+        assert actions[0] is not None and actions[0] == actions[1]
+        for run in runs:
+            run.advance(actions[0])
+
+
 def test_without_a_driver_it_waits_for_actions() -> None:
     simulation = Simulation(Maze2D(), seed=3, driver="none")
     assert not simulation.ready(0.0, 0.5, hold=False)

@@ -1,4 +1,4 @@
-"""Mazes as Doom maps: UDMF text, many maps in one PWAD file.
+"""Mazes as Doom maps: UDMF text, a few lumps of a WAD file.
 
 The engine builds the nodes of a UDMF map when it loads it, so that a map is text alone. Its axes are the
 maze's (x right, y up, angles counter-clockwise from x), scaled by UNITS_PER_M.
@@ -7,14 +7,13 @@ maze's (x right, y up, angles counter-clockwise from x), scaled by UNITS_PER_M.
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ngo_sim.doom_wad import Lump
 from ngo_sim.mazes import Maze
 
 UNITS_PER_M = 32.0
@@ -144,22 +143,17 @@ def textmap(maze: Maze, style: MapStyle, start_xy: tuple[float, float], start_he
     return "".join(parts)
 
 
-def write_pwad(path: Path, maps: Iterable[tuple[str, str]]) -> None:
-    """Write (map name, UDMF text) pairs as one PWAD.
+def map_lumps(maps: Iterable[tuple[str, str]]) -> list[Lump]:
+    """The lumps of (map name, UDMF text) pairs.
 
     Raises:
         ValueError: If a name is no lump name (1 to 8 of ``A-Z 0-9 _ - [ ] \\``) or occurs twice.
     """
-    lumps: list[tuple[str, bytes]] = []
+    lumps: list[Lump] = []
     names: set[str] = set()
     for name, text in maps:
         if not _LUMP_NAME.fullmatch(name) or name in names:
             raise ValueError(f"map name is {name!r}; it must be 1 to 8 of A-Z 0-9 _ - [ ] \\, each name once")
         names.add(name)
         lumps += [(name, b""), ("TEXTMAP", text.encode("ascii")), ("ENDMAP", b"")]
-    body, directory, offset = [], [], 12
-    for name, data in lumps:
-        directory.append(struct.pack("<ii8s", offset, len(data), name.encode("ascii")))
-        body.append(data)
-        offset += len(data)
-    path.write_bytes(b"".join([struct.pack("<4sii", b"PWAD", len(lumps), offset), *body, *directory]))
+    return lumps

@@ -1,13 +1,17 @@
-"""Drivers: what the robot does next, given its true pose. They make the data; no estimate enters."""
+"""Drivers with a plan of the maze, and one by chance: what the robot does next, given its true pose.
+
+They make the data; no estimate enters.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from ngo_sim.mazes import Maze
 
@@ -20,9 +24,6 @@ class Action(IntEnum):
     TURN_RIGHT = 2
 
 
-DRIVER_NAMES = ("corners", "random_goals", "random")
-"""What make_driver knows."""
-
 _ACTIONS = tuple(Action)
 _PATIENCE_STEPS = 40  # a half turn on the spot takes about 25
 
@@ -30,8 +31,11 @@ _PATIENCE_STEPS = 40  # a half turn on the spot takes about 25
 class Driver(Protocol):
     """Chooses an action for every frame."""
 
-    def action(self, pose_xyyaw: np.ndarray) -> Action:
-        """The action to take at pose_xyyaw (3,) in the maze's frame; call it once a frame, in order."""
+    def action(self, pose_xyyaw: np.ndarray, observation: npt.NDArray[Any] | None = None) -> Action:
+        """The action to take at pose_xyyaw (3,) in the maze's frame; call it once a frame, in order.
+
+        observation: what is seen there, of the world's shape and type; a driver that does not look needs none.
+        """
         ...
 
 
@@ -41,8 +45,8 @@ class RandomDriver:
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
-    def action(self, pose_xyyaw: np.ndarray) -> Action:
-        """A random action; pose_xyyaw (3,) is not looked at."""
+    def action(self, pose_xyyaw: np.ndarray, observation: npt.NDArray[Any] | None = None) -> Action:
+        """A random action; pose_xyyaw (3,) and observation are not looked at."""
         return _ACTIONS[int(self._rng.integers(3))]
 
 
@@ -97,8 +101,11 @@ class PathDriver:
         self._steps_without_progress = 0
         self._returning = False
 
-    def action(self, pose_xyyaw: np.ndarray) -> Action:
-        """The action to take at pose_xyyaw (3,) in the maze's frame; call it once a frame, in order."""
+    def action(self, pose_xyyaw: np.ndarray, observation: npt.NDArray[Any] | None = None) -> Action:
+        """The action to take at pose_xyyaw (3,) in the maze's frame; call it once a frame, in order.
+
+        observation is not looked at.
+        """
         x, y, yaw = pose_xyyaw.tolist()
         last_x, last_y, last_yaw = self._last_pose or (x, y, yaw)
         self._last_pose = (x, y, yaw)
@@ -183,22 +190,6 @@ class PathDriver:
         blocks = [(int(row), int(col)) for row, col in self.maze.free_blocks()]
         while True:
             yield blocks[int(self._rng.integers(len(blocks)))]
-
-
-def driver_generator(seed: int) -> np.random.Generator:
-    """The random generator of the driver in the episode of this seed, independent of those of the world."""
-    return np.random.default_rng((seed, 3))
-
-
-def make_driver(name: str, maze: Maze, rng: np.random.Generator) -> Driver:
-    """The driver called name: "corners" and "random_goals" follow paths, "random" acts at random."""
-    if name == "corners":
-        return PathDriver(maze, rng, goals="corners")
-    if name == "random_goals":
-        return PathDriver(maze, rng, goals="random")
-    if name == "random":
-        return RandomDriver(rng)
-    raise ValueError(f"driver is {name!r}; it must be one of {', '.join(DRIVER_NAMES)}")
 
 
 def _wrap(angle: float) -> float:

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from ngo_sim.drivers import driver_generator, make_driver
+from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.mazes import Maze
 
 
@@ -19,18 +19,21 @@ class Episode:
 
     observations: (frames, ...) of the world's shape and type. actions: uint8 (frames - 1,).
     poses_xyyaw: float64 (frames, 3) in the maze's frame, m, m, rad. period_s: time between two frames.
-    maze: where it was recorded.
+    maze: where it was recorded, None on a Doom map.
     """
 
     observations: npt.NDArray[Any]
     actions: npt.NDArray[np.uint8]
     poses_xyyaw: npt.NDArray[np.float64]
     period_s: float
-    maze: Maze
+    maze: Maze | None
 
 
 def record_episode(env: gymnasium.Env[Any, Any], driver_name: str, frames: int, seed: int) -> Episode:
-    """Record `frames` (at least 1) of a Maze2D or Maze3D; world, noise and driver are functions of seed."""
+    """Record `frames` (at least 1) of a Maze2D or Maze3D; world, noise and driver are functions of seed.
+
+    driver_name is one of driver_choice.DRIVER_NAMES; ValueError where the world does not suit it.
+    """
     if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 1:
         raise ValueError(f"frames is {frames!r}; it must be an integer of at least 1")
     world: Any = env.unwrapped
@@ -41,7 +44,7 @@ def record_episode(env: gymnasium.Env[Any, Any], driver_name: str, frames: int, 
     poses_xyyaw = np.empty((frames, 3))
     observations[0], poses_xyyaw[0] = observation, info["pose_xyyaw"]
     for frame in range(frames - 1):
-        action = driver.action(info["pose_xyyaw"])
+        action = driver.action(info["pose_xyyaw"], observation)
         observation, _, _, _, info = env.step(action)
         actions[frame] = action
         observations[frame + 1], poses_xyyaw[frame + 1] = observation, info["pose_xyyaw"]

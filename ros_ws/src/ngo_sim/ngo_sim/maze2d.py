@@ -96,6 +96,11 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         self._turn_rate_rad = 0.0  # a step
         self._frame = 0
 
+    @property
+    def default_driver(self) -> str:
+        """Who drives where nobody is named."""
+        return "corners"
+
     def reset(self, *, seed: int | None = None,
               options: dict[str, Any] | None = None) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Draw a maze, colours and a start, standing still; see the class for the options."""

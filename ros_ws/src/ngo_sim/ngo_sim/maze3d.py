@@ -1,46 +1,31 @@
-"""The 3D world: a walker in a maze of textured walls, seen by ViZDoom in first-person pictures."""
+"""The 3D world: a walker in a maze of textured walls, or in any Doom map, seen by ViZDoom in first-person pictures."""
 
 from __future__ import annotations
 
 import math
-import os
-import shlex
-import shutil
-import tempfile
-import threading
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-import vizdoom
 from numpy.typing import NDArray
-from vizdoom import Button, GameVariable, ScreenResolution
 
-from ngo_sim.doom_map import PLAYER_RADIUS_UNITS, UNITS_PER_M, random_style, textmap, wall_faces, write_pwad
+from ngo_sim.doom_engine import RESOLUTIONS, DoomEngine
+from ngo_sim.doom_level import DoomLevel, load_level
+from ngo_sim.doom_map import PLAYER_RADIUS_UNITS, UNITS_PER_M, map_lumps, random_style, textmap, wall_faces
 from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_maze_size, kruskal_maze
 
 TICS_PER_S = 35
 """Doom's fixed rate of simulation."""
 
-# Of the fixed list of sizes that ViZDoom renders those of 4:3, to which alone the camera model below applies.
-_RESOLUTIONS = {
-    (80, 60): ScreenResolution.RES_160X120,
-    (160, 120): ScreenResolution.RES_320X240,
-    (200, 150): ScreenResolution.RES_400X300,
-    (256, 192): ScreenResolution.RES_512X384,
-    (320, 240): ScreenResolution.RES_640X480,
-}
 # Doom's pixels are 1.2 times as high as wide (320 x 200 of them filled a screen of 4:3), at any size.
 _PIXEL_STRETCH = 1.2
-# A new map ignores input for 7 tics, and its field of view changes by 7 degrees a tic at most.
-_SETTLING_TICS = 20
-_ENGINE_SEED = 1
-_WORKING_DIRECTORY_LOCK = threading.Lock()
+# Who walks against something tries to open it, and again after longer than a door takes to rise: a press while it
+# rises would close it.
+_STANDING_M, _STEPS_A_PRESS = 0.02, 24
 _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TURN_RIGHT: -1.0}
 
 
@@ -61,14 +46,16 @@ class Maze3DConfig:
     turn_deg: float = 2.2  # gain of turn rate by one turn action, degrees a step [0 to 90]
     turn_decay: float = 0.75  # share of the turn rate that a step leaves [0 to 0.99]
     light_level: int = 208  # of the whole maze, 0 is black [0 to 255]
+    wad: str = ""  # Doom map to walk in instead of a maze: its file [a WAD file, or the name of one that ViZDoom ships]
+    map: str = ""  # name of the map in that file, as MAP01 [a map of the wad; empty without one]
 
     def __post_init__(self) -> None:
         check_maze_size(self.rows, self.cols, self.extra_openings)
         # Doom's coordinates end at 32767 units, its player is a square of 1 m.
         _check_number("block_m", self.block_m, 4 * PLAYER_RADIUS_UNITS / UNITS_PER_M, 5.0)
         _check_number("actuation_noise", self.actuation_noise, 0.0, 1.0)
-        if (self.width, self.height) not in _RESOLUTIONS:
-            allowed = ", ".join(f"{width} x {height}" for width, height in _RESOLUTIONS)
+        if (self.width, self.height) not in RESOLUTIONS:
+            allowed = ", ".join(f"{width} x {height}" for width, height in RESOLUTIONS)
             raise ValueError(f"width x height is {self.width} x {self.height}; it must be one of {allowed}")
         _check_integer("field_of_view_deg", self.field_of_view_deg, 30, 150)
         _check_integer("frame_skip", self.frame_skip, 1, TICS_PER_S)
@@ -76,6 +63,8 @@ class Maze3DConfig:
         _check_number("turn_deg", self.turn_deg, 0.0, 90.0)
         _check_number("turn_decay", self.turn_decay, 0.0, 0.99)
         _check_integer("light_level", self.light_level, 0, 255)
+        if bool(self.wad) != bool(self.map):
+            raise ValueError(f"wad is {self.wad!r} and map is {self.map!r}; they must be given both, or neither")
 
     @property
     def period_s(self) -> float:
@@ -98,7 +87,7 @@ class DoomWorld:
 
 
 class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
-    """Drive through a Kruskal maze in ViZDoom.
+    """Drive through a Kruskal maze in ViZDoom, or through the Doom map of the config.
 
     Observations are uint8 (height, width, 3) RGB, the exact mean of 2 x 2 rendered pixels. Actions are
     `ngo_sim.drivers.Action`. The reward is the distance travelled in the step in m; episodes never end by
@@ -106,7 +95,10 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     counter-clockwise) at the very tic that the picture shows, and "time_s" since the reset.
 
     reset(seed=s) makes maze, textures, start and noise functions of s and the config, to the byte, preloaded
-    or not. The engine is a process with files of its own, which end with close(), with the environment or
+    or not. A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
+    door opens to who walks against it. Raises ValueError for a map that is not there.
+
+    The engine is a process with files of its own, which end with close(), with the environment or
     with the interpreter, whichever comes first.
     """
 
@@ -118,24 +110,35 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         self.config = config if config is not None else Maze3DConfig()
         self.render_mode = render_mode
         self.period_s = self.config.period_s
-        self.maze: Maze
+        self._level: DoomLevel | None = load_level(self.config.wad, self.config.map) if self.config.wad else None
+        self.maze: Maze | None = None
         self.action_space = gymnasium.spaces.Discrete(len(Action))
         shape = (self.config.height, self.config.width, 3)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
-        self._engine = _Engine(self.config)
+        size = self.config.width, self.config.height
+        self._engine = DoomEngine(*size, self.config.field_of_view_deg, self.config.frame_skip)
         weakref.finalize(self, self._engine.close)
         self._preloaded: dict[int, DoomWorld] = {}
         self._loaded: dict[int, DoomWorld] = {}
         self._picture: NDArray[np.uint8] | None = None
         self._pose_xyyaw = np.zeros(3)
         self._turn_rate_deg = 0.0  # a step
+        self._steps_walled_in = 0
         self._frame = 0
+
+    @property
+    def default_driver(self) -> str:
+        """Who drives where nobody is named."""
+        return "random_goals" if self._level is None else "explorer"
 
     def preload(self, seeds: Iterable[int]) -> None:
         """Write the maps of these seeds, instead of those preloaded before, into one WAD.
 
-        A reset to one of them then costs milliseconds, to any other seed a restart of the engine (0.2 s).
+        A reset to one of them then costs milliseconds, to any other seed a restart of the engine (0.2 s). A Doom map
+        is the same for every seed, so that nothing is to be done.
         """
+        if self._level is not None:
+            return
         preloaded = {int(seed): self._build_world(int(seed)) for seed in seeds}
         if not preloaded:
             raise ValueError("seeds is empty; it must have at least one seed")
@@ -151,13 +154,19 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
             raise ValueError(f"options has {sorted(options)}; this world has none")
         if seed is None:
             seed = int(self.np_random.integers(2**31))
-        if not self._engine.running or seed not in self._loaded:
-            wanted = {} if seed in self._preloaded else {seed: self._build_world(seed)}
-            self._load({**self._preloaded, **wanted})
-        self.maze = self._loaded[seed].maze
+        if self._level is not None:
+            if not self._engine.running:
+                self._engine.start(self._level.lumps, self._level.name, self._level.game_wad, harmless=True)
+            map_name = self._level.name
+        else:
+            if not self._engine.running or seed not in self._loaded:
+                wanted = {} if seed in self._preloaded else {seed: self._build_world(seed)}
+                self._load({**self._preloaded, **wanted})
+            self.maze = self._loaded[seed].maze
+            map_name = _map_name(list(self._loaded).index(seed))
         self._noise_rng = _generator(seed, stream=2)
-        self._turn_rate_deg, self._frame = 0.0, 0
-        self._picture, self._pose_xyyaw = self._engine.enter(list(self._loaded).index(seed))
+        self._turn_rate_deg, self._steps_walled_in, self._frame = 0.0, 0, 0
+        self._picture, self._pose_xyyaw = self._engine.enter(map_name)
         return mean_2x2(self._picture), self._info()
 
     def step(self, action: np.int64 | int) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
@@ -174,11 +183,15 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         turn = _TURN[int(action)] * config.turn_deg * strength
         self._turn_rate_deg = config.turn_decay * self._turn_rate_deg + turn
         thrust = round(config.thrust * strength) if action == Action.FORWARD else 0
+        use = self._steps_walled_in % _STEPS_A_PRESS == 2
         last_pose_xyyaw = self._pose_xyyaw
-        self._picture, self._pose_xyyaw = self._engine.advance(thrust, self._turn_rate_deg)
+        self._picture, self._pose_xyyaw = self._engine.advance(thrust, self._turn_rate_deg, use)
         self._frame += 1
         moved = self._pose_xyyaw - last_pose_xyyaw
-        return mean_2x2(self._picture), math.hypot(moved[0], moved[1]), False, False, self._info()
+        travelled = math.hypot(moved[0], moved[1])
+        walled_in = self._level is not None and action == Action.FORWARD and travelled < _STANDING_M
+        self._steps_walled_in = self._steps_walled_in + 1 if walled_in else 0
+        return mean_2x2(self._picture), travelled, False, False, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture as rendered, uint8 (2 height, 2 width, 3); None without a mode or before a reset."""
@@ -198,117 +211,12 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         return DoomWorld(maze, textmap(maze, style, (float(start_x), float(start_y)), start_heading_deg))
 
     def _load(self, worlds: dict[int, DoomWorld]) -> None:
-        self._engine.start([world.text for world in worlds.values()])
+        texts = [world.text for world in worlds.values()]
+        self._engine.start(map_lumps((_map_name(index), text) for index, text in enumerate(texts)), _map_name(0))
         self._loaded = worlds
 
     def _info(self) -> dict[str, Any]:
         return {"pose_xyyaw": self._pose_xyyaw.copy(), "time_s": self._frame * self.period_s}
-
-
-class _Engine:
-    """ViZDoom's process and the files that it reads and writes."""
-
-    def __init__(self, config: Maze3DConfig) -> None:
-        self._config = config
-        self._game: vizdoom.DoomGame | None = None
-        self._folder: Path | None = None
-
-    @property
-    def running(self) -> bool:
-        return self._game is not None
-
-    def start(self, texts: Sequence[str]) -> None:
-        """Start the process anew with these UDMF maps, which are known by their index from then on."""
-        self.close()
-        folder = self._folder = Path(tempfile.mkdtemp(prefix="ngo_maze3d_"))
-        write_pwad(folder / "maps.wad", [(_map_name(index), text) for index, text in enumerate(texts)])
-        game = vizdoom.DoomGame()
-        game.set_vizdoom_path(str(_launcher(folder)))
-        game.set_doom_game_path(str(Path(vizdoom.__file__).parent / "freedoom2.wad"))
-        game.set_doom_scenario_path(str(folder / "maps.wad"))
-        game.set_doom_config_path(str(folder / "engine.ini"))
-        game.set_doom_map(_map_name(0))
-        game.set_screen_resolution(_RESOLUTIONS[self._config.width, self._config.height])
-        game.set_screen_format(vizdoom.ScreenFormat.RGB24)
-        for part in ("hud", "minimal_hud", "crosshair", "weapon", "decals", "particles", "effects_sprites",
-                     "messages", "corpses", "screen_flashes"):  # fmt: skip
-            getattr(game, f"set_render_{part}")(False)
-        game.set_window_visible(False)
-        game.set_sound_enabled(False)
-        game.set_console_enabled(False)
-        game.set_mode(vizdoom.Mode.PLAYER)
-        game.set_episode_timeout(0)
-        game.set_seed(_ENGINE_SEED)
-        game.set_available_buttons([Button.MOVE_FORWARD_BACKWARD_DELTA, Button.TURN_LEFT_RIGHT_DELTA])
-        game.set_available_game_variables(
-            [GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE]
-        )
-        # The camera of a walking player goes up and down by default.
-        game.set_game_args("+movebob 0 +stillbob 0")
-        with _WORKING_DIRECTORY_LOCK:
-            # The process makes a folder in its working directory, which it can only inherit.
-            caller = os.open(".", os.O_RDONLY)
-            try:
-                os.chdir(folder)
-                game.init()
-            finally:
-                os.fchdir(caller)
-                os.close(caller)
-        self._game = game
-
-    def enter(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        """Begin the map of this index; return the first picture and pose, as advance() does."""
-        assert self._game is not None
-        self._game.set_doom_map(_map_name(index))
-        self._game.new_episode()
-        # Each map begins with the default field of view: the argument `+fov` holds for the first one alone.
-        self._game.send_game_command(f"fov {self._config.field_of_view_deg}")
-        observed = self._act([0, 0], _SETTLING_TICS)
-        wanted, given = self._config.field_of_view_deg, self._game.get_game_variable(GameVariable.CAMERA_FOV)
-        if given != wanted:
-            raise RuntimeError(f"the engine's field of view is {given}, not {wanted} degrees")
-        return observed
-
-    def advance(self, thrust: int, turn_deg: float) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        """Let a step pass; return the picture (2 height, 2 width, 3) and the pose (3,) at its end."""
-        # The engine turns clockwise for a positive number, and by that number in each tic.
-        return self._act([thrust, -turn_deg / self._config.frame_skip], self._config.frame_skip)
-
-    def _act(self, buttons: list[float], tics: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        assert self._game is not None
-        try:
-            self._game.make_action(buttons, tics)
-        except (vizdoom.ViZDoomErrorException, vizdoom.ViZDoomUnexpectedExitException) as error:
-            self.close()
-            raise RuntimeError(f"the engine has ended: {error}") from error
-        state = self._game.get_state()
-        assert state.game_variables is not None
-        x, y, angle_deg = state.game_variables
-        yaw = math.remainder(math.radians(angle_deg), math.tau)
-        return state.screen_buffer, np.array([x / UNITS_PER_M, y / UNITS_PER_M, yaw])
-
-    def close(self) -> None:
-        """End the process, then delete its files, among them some that it writes at its end."""
-        game, self._game = self._game, None
-        if game is not None:
-            game.close()
-        folder, self._folder = self._folder, None
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _launcher(folder: Path) -> Path:
-    """What starts the engine: a script in the folder by which the engine ends with this process, even a killed one.
-
-    Without util-linux's setpriv (not on Linux) it is the engine itself.
-    """
-    engine, setpriv = Path(vizdoom.__file__).parent / "vizdoom", shutil.which("setpriv")
-    if setpriv is None:
-        return engine
-    script = folder / "engine.sh"
-    script.write_text(f"#!/bin/sh\nexec {shlex.quote(setpriv)} --pdeathsig KILL -- {shlex.quote(str(engine))} \"$@\"\n")
-    script.chmod(0o700)
-    return script
 
 
 def mean_2x2(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

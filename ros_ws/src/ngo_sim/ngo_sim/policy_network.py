@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,11 @@ FORMAT = 1
 NETWORK = "driver"
 SHIPPED = Path(__file__).with_name("weights") / "driver.safetensors"
 ACTIONS = 3
+SENSES = ACTIONS + 3
+MIRRORED_SENSES = (0, 2, 1, 3, 4, 5)
+"""Where each of the senses is found for a robot in a mirror: left and right actions exchanged."""
+MIRRORED_SIGNS = (1.0, 1.0, 1.0, 1.0, -1.0, -1.0)
+"""What they are multiplied by then: motion to the left and turning have the other sign."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,7 @@ class PolicyConfig:
     height: int = 30  # of a picture, pixels
     width: int = 40  # of a picture, pixels
     pictures: int = 3  # of the newest decisions, the present one among them
-    hold_frames: int = 2  # for which an action is held: a decision is taken in every so many frames
+    hold_frames: int = 3  # for which an action is held: a decision is taken in every so many frames
     channels: tuple[int, ...] = (16, 32, 32)  # of the convolutions
     kernels: tuple[int, ...] = (5, 3, 3)  # sides of their kernels, pixels
     strides: tuple[int, ...] = (2, 2, 2)  # of their kernels, pixels
@@ -60,37 +66,46 @@ class PolicyConfig:
             shapes[f"convolution_{index}.weight"] = (channels, before, kernel, kernel)
             shapes[f"convolution_{index}.bias"] = (channels,)
             before = channels
-        shapes["hidden.weight"] = (self.hidden, int(np.prod(self.feature_shape)) + ACTIONS)
+        shapes["hidden.weight"] = (self.hidden, int(np.prod(self.feature_shape)) + SENSES)
         shapes["hidden.bias"] = (self.hidden,)
-        shapes["action.weight"], shapes["action.bias"] = (ACTIONS, self.hidden), (ACTIONS,)
+        shapes["common.weight"], shapes["common.bias"] = (2, self.hidden), (2,)
+        shapes["turn.weight"] = (1, self.hidden)
         return shapes
 
 
 class PolicyView:
-    """What the network looks at: the pictures of the newest decisions, and the last action.
+    """What the network looks at: the pictures of the newest decisions, and how it moved since the last one.
 
-    pictures: uint8 (pictures, height, width), the newest first. last_action: float32 (3,), 1 for the last action, all 0
-    before the first.
+    pictures: uint8 (pictures, height, width), the newest first. senses: float32 (6,), 1 for the last of the three
+    actions, then the motion since it was decided on: m forward, m to the left, rad counter-clockwise; at the first
+    decision all 0.
     """
 
     def __init__(self, config: PolicyConfig) -> None:
         self.config = config
         self.pictures = np.zeros((config.pictures, config.height, config.width), dtype=np.uint8)
-        self.last_action = np.zeros(ACTIONS, dtype=np.float32)
-        self._empty = True
+        self.senses = np.zeros(SENSES, dtype=np.float32)
+        self._last_pose: tuple[float, float, float] | None = None
 
-    def see(self, observation: npt.NDArray[np.uint8]) -> None:
-        """Take in what is seen at a decision; before the first, it counts as having been seen all the time."""
+    def see(self, observation: npt.NDArray[np.uint8], pose_xyyaw: npt.NDArray[np.float64]) -> None:
+        """Take in what is seen at a decision, and where; the first picture counts as having been seen all the time."""
         picture = grey_picture(observation, self.config.height, self.config.width)
-        if self._empty:
-            self.pictures[:], self._empty = picture, False
+        x, y, yaw = pose_xyyaw.tolist()
+        if self._last_pose is None:
+            self.pictures[:] = picture
+        else:
+            last_x, last_y, last_yaw = self._last_pose
+            dx, dy, cos, sin = x - last_x, y - last_y, math.cos(last_yaw), math.sin(last_yaw)
+            turned = math.remainder(yaw - last_yaw, math.tau)
+            self.senses[ACTIONS:] = cos * dx + sin * dy, cos * dy - sin * dx, turned
+        self._last_pose = x, y, yaw
         self.pictures[1:] = self.pictures[:-1].copy()
         self.pictures[0] = picture
 
     def did(self, action: int) -> None:
         """Remember the action that was decided on."""
-        self.last_action[:] = 0.0
-        self.last_action[action] = 1.0
+        self.senses[:ACTIONS] = 0.0
+        self.senses[action] = 1.0
 
 
 def grey_picture(observation: npt.NDArray[np.uint8], height: int, width: int) -> npt.NDArray[np.uint8]:
@@ -114,7 +129,10 @@ def grey_picture(observation: npt.NDArray[np.uint8], height: int, width: int) ->
 
 
 class PolicyNetwork:
-    """Convolutions and a hidden layer, all with ReLU, to the logarithms of the odds of the three actions.
+    """Convolutions and a hidden layer, all with ReLU, of a view and of its mirror image, to the odds of the actions.
+
+    The sum of the two hidden layers gives the odds of going forward and of turning at all, their difference those of
+    left against right: what the network does in a mirror is the mirror image of what it does, whatever its weights.
 
     tensors: float arrays of the names and shapes of config.tensor_shapes(). Raises ValueError for others.
     """
@@ -133,11 +151,23 @@ class PolicyNetwork:
             for index, channels in enumerate(config.channels)
         ]
         self._hidden = weights["hidden.weight"], weights["hidden.bias"]
-        self._action = weights["action.weight"], weights["action.bias"]
+        self._common = weights["common.weight"], weights["common.bias"]
+        self._turn = weights["turn.weight"]
 
     def logits(self, view: PolicyView) -> npt.NDArray[np.float32]:
-        """float32 (3,) of a view."""
-        values = view.pictures.astype(np.float32) / 255.0
+        """float32 (3,) of a view: the logarithms of the odds of the three actions, but for a common summand."""
+        pictures = view.pictures.astype(np.float32) / 255.0
+        seen = self._hidden_layer(pictures, view.senses)
+        signs = np.array(MIRRORED_SIGNS, dtype=np.float32)
+        mirrored = self._hidden_layer(pictures[:, :, ::-1], view.senses[list(MIRRORED_SENSES)] * signs)
+        weight, bias = self._common
+        forward, turn = weight @ (seen + mirrored) + bias
+        (left,) = self._turn @ (seen - mirrored)
+        return np.array((forward, turn + left, turn - left), dtype=np.float32)
+
+    def _hidden_layer(
+        self, values: npt.NDArray[np.float32], senses: npt.NDArray[np.float32]
+    ) -> npt.NDArray[np.float32]:
         for (weight, bias), kernel, stride in zip(
             self._convolutions, self.config.kernels, self.config.strides, strict=True
         ):
@@ -147,9 +177,8 @@ class PolicyNetwork:
             columns = windows.transpose(0, 3, 4, 1, 2).reshape(weight.shape[1], height * width)
             values = np.maximum(weight @ columns + bias[:, None], 0.0).reshape(-1, height, width)
         weight, bias = self._hidden
-        hidden = np.maximum(weight @ np.concatenate((values.ravel(), view.last_action)) + bias, 0.0)
-        weight, bias = self._action
-        return weight @ hidden + bias
+        hidden: npt.NDArray[np.float32] = np.maximum(weight @ np.concatenate((values.ravel(), senses)) + bias, 0.0)
+        return hidden
 
 
 def load_policy(path: Path = SHIPPED) -> PolicyNetwork:
@@ -181,4 +210,5 @@ def policy_config(values: Any) -> PolicyConfig:
     expected = asdict(PolicyConfig())
     if not isinstance(values, dict) or values.keys() != expected.keys():
         raise ValueError(f"config is {values!r}; expected an object with {', '.join(expected)}")
-    return PolicyConfig(**{key: tuple(one) if isinstance(one, list) else one for key, one in values.items()})
+    arguments: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in values.items()}
+    return PolicyConfig(**arguments)

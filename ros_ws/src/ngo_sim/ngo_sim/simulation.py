@@ -9,7 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ngo_sim.drivers import Action, Driver, driver_generator, make_driver
+from ngo_sim.driver_choice import driver_generator, make_driver
+from ngo_sim.drivers import Action, Driver
 from ngo_sim.external_actions import ExternalActions
 from ngo_sim.mazes import Maze
 
@@ -17,8 +18,17 @@ from ngo_sim.mazes import Maze
 class World(Protocol):
     """What Maze2D and Maze3D have in common."""
 
-    maze: Maze
     period_s: float
+
+    @property
+    def maze(self) -> Maze | None:
+        """The plan, None where there is none."""
+        ...
+
+    @property
+    def default_driver(self) -> str:
+        """Who drives where nobody is named."""
+        ...
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin anew."""
@@ -49,14 +59,18 @@ class Frame:
 
 
 class Simulation:
-    """Frame after frame of one seed; driver is a name for make_driver, or "none": only actions from outside move it."""
+    """Frame after frame of one seed.
+
+    driver: a name for make_driver, "auto": the world's own choice, or "none": only actions from outside move it.
+    """
 
     def __init__(self, world: World, seed: int, driver: str) -> None:
         self.world = world
         self.external = ExternalActions()
         observation, info = world.reset(seed=seed)
+        name = world.default_driver if driver == "auto" else driver
         self._driver: Driver | None = (
-            None if driver == "none" else make_driver(driver, world.maze, driver_generator(seed))
+            None if name == "none" else make_driver(name, world.maze, driver_generator(seed))
         )
         self.frame = Frame(0, observation, info["pose_xyyaw"], np.zeros(3))
 
@@ -66,7 +80,8 @@ class Simulation:
         See ExternalActions for now_s (any steady clock), timeout_s and hold.
         """
         # The driver sees every frame, also those it does not decide: it keeps track of where it is on its path.
-        own = None if self._driver is None else self._driver.action(self.frame.pose_xyyaw)
+        frame, driver = self.frame, self._driver
+        own = None if driver is None else driver.action(frame.pose_xyyaw, frame.observation)
         return self.external.next_action(hold) if self.external.in_charge(now_s, timeout_s, hold) else own
 
     def ready(self, now_s: float, timeout_s: float, hold: bool) -> bool:

@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Any
 
-from ngo_sim.drivers import DRIVER_NAMES
+from ngo_sim.driver_choice import DRIVER_NAMES
 
 _LIMITS = re.compile(r" \[(.+)\]$")  # at the end of a comment behind a field
 
@@ -21,12 +21,14 @@ def _setting(
     *,
     changeable: bool = False,
     choices: tuple[str, ...] = (),
+    alias: str = "",
 ) -> Any:
-    """A field with its description and what is allowed, for the validation below and for ROS parameter descriptors."""
-    return field(
-        default=default,
-        metadata={"description": text, "low": low, "high": high, "changeable": changeable, "choices": choices},
-    )
+    """A field with its description and what is allowed, for the validation below and for ROS parameter descriptors.
+
+    alias: another name under which it may be given.
+    """
+    metadata = {"description": text, "low": low, "high": high, "changeable": changeable, "choices": choices}
+    return field(default=default, metadata={**metadata, "alias": alias})
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,12 @@ class SimulatorConfig:
         changeable=True,
     )
     driver: str = _setting(
-        "corners",
-        "Who chooses the actions: paths to the corners, paths to random goals, chance, or nobody but action_command.",
-        choices=(*DRIVER_NAMES, "none"),
+        "auto",
+        "Who chooses the actions: paths to the corners, paths to random goals, a network trained to travel far, an "
+        "explorer without a plan, chance, or nobody but action_command; auto: corners in 2D, random_goals in 3D, "
+        "explorer on a Doom map. It may also be given as policy.",
+        choices=("auto", *DRIVER_NAMES, "none"),
+        alias="policy",
     )
     frames: int = _setting(0, "Frames to publish before the node ends with exit code 0; 0: endless.", 0, 2**31 - 1)
     wait_for_subscribers: int = _setting(0, "Subscribers that the image must have before frame 0 is published.", 0, 100)

@@ -1,4 +1,4 @@
-"""Node `maze3d`: the 3D world as colour pictures of a pinhole camera."""
+"""Node `maze3d`: the 3D world, a maze or a Doom map, as colour pictures of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Maze3DNode(SimulatorNode):
     """
 
     world_config_type = Maze3DConfig
-    defaults = {"rate": 17.5, "driver": "random_goals", "camera_frame": "camera_optical_frame"}
+    defaults = {"rate": 17.5, "camera_frame": "camera_optical_frame"}
 
     def __init__(self, name: str) -> None:
         super().__init__(name)

@@ -31,21 +31,22 @@ class ConfigParameters:
         # What was given in arguments and files, declared or not: rclpy shows this nowhere else.
         given = {name: parameter.value for name, parameter in node.handle.get_parameters(Parameter).items()}
         self._given = {name: value for name, value in given.items() if name not in _OWN_TO_ROS}
-        self._known: list[str] = []
+        self._known: set[str] = set()
 
     def declare(self, config_type: type[Config], **defaults: Any) -> Config:
         """Declare a parameter for each field, and return the config of the values given, else of the defaults.
 
-        defaults: values that replace those of the fields. Raises BadParameter.
+        defaults: values that replace those of the fields. A field may be given by the alias in its metadata instead of
+        its name, not by both. Raises BadParameter.
         """
         descriptions, limits = field_descriptions(config_type), field_limits(config_type)
         values = {}
         fields = dataclasses.fields(config_type)  # type: ignore[arg-type]
         for field in fields:
             default = defaults.get(field.name, field.default)
-            given = self._given.get(field.name, default)
-            values[field.name] = _converted(field.name, given, default)
-        self._known += values
+            name = self._name_given(field)
+            values[field.name] = _converted(name, self._given.get(name, default), default)
+            self._known |= {field.name, name}
         try:
             config = config_type(**values)
         except ValueError as error:
@@ -60,6 +61,18 @@ class ConfigParameters:
                 ignore_override=True,
             )
         return config
+
+    def _name_given(self, field: dataclasses.Field[Any]) -> str:
+        """The name under which a field was given, its own where it was not."""
+        alias = field.metadata.get("alias", "")
+        if alias not in self._given:
+            return field.name
+        if field.name in self._given:
+            raise BadParameter(
+                f"{alias} is {self._given[alias]!r} and {field.name} is {self._given[field.name]!r}; allowed: one of "
+                "them, for both are names of the same"
+            )
+        return str(alias)
 
     def finish(self) -> None:
         """Raise BadParameter for a parameter that was given and never declared."""

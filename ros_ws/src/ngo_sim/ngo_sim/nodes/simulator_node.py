@@ -58,7 +58,10 @@ class SimulatorNode(Node):
         self._action = self.outputs.create(DiscreteAction, "action")
         self._clock_out = self.outputs.create(Clock, "/clock") if self.config.publish_clock else None
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
-        self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
+        try:
+            self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
+        except ValueError as error:  # what only the files or the world can say
+            raise BadParameter(str(error)) from None
         self._pacer = Pacer()
         self._published = 0
         self._looked_s = 0.0

@@ -1,0 +1,166 @@
+"""ViZDoom's process: the one place that starts, steps and ends it."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+import shutil
+import tempfile
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import vizdoom
+from numpy.typing import NDArray
+from vizdoom import Button, GameVariable, ScreenResolution
+
+from ngo_sim.doom_map import UNITS_PER_M
+from ngo_sim.doom_wad import Lump, write_lumps
+
+SHIPPED = Path(vizdoom.__file__).parent
+"""Where ViZDoom keeps the two games of freedoom, and below it its scenarios."""
+
+MAZE_GAME = SHIPPED / "freedoom2.wad"
+"""The game that the mazes take their textures from."""
+
+# Of the fixed list of sizes that ViZDoom renders those of 4:3, to which alone the camera model applies.
+RESOLUTIONS = {
+    (80, 60): ScreenResolution.RES_160X120,
+    (160, 120): ScreenResolution.RES_320X240,
+    (200, 150): ScreenResolution.RES_400X300,
+    (256, 192): ScreenResolution.RES_512X384,
+    (320, 240): ScreenResolution.RES_640X480,
+}
+"""What is rendered for an observation of this width and height: twice as many pixels each way."""
+
+# A new map ignores input for 7 tics, and its field of view changes by 7 degrees a tic at most.
+_SETTLING_TICS = 20
+_ENGINE_SEED = 1
+_WORKING_DIRECTORY_LOCK = threading.Lock()
+
+
+class DoomEngine:
+    """ViZDoom's process and the files that it reads and writes.
+
+    width, height: of an observation, one of RESOLUTIONS; what is rendered is twice as large. tics: in a step.
+    """
+
+    def __init__(self, width: int, height: int, field_of_view_deg: int, tics: int) -> None:
+        self._resolution = RESOLUTIONS[width, height]
+        self._field_of_view_deg, self._tics = field_of_view_deg, tics
+        self._game: vizdoom.DoomGame | None = None
+        self._folder: Path | None = None
+        self._harmless = False
+
+    @property
+    def running(self) -> bool:
+        return self._game is not None
+
+    def start(self, lumps: Sequence[Lump], first_map: str, game_wad: Path = MAZE_GAME, harmless: bool = False) -> None:
+        """Start the process anew with the maps in these lumps; `game_wad` has the textures.
+
+        harmless: no monsters, no harm to the player, and doors open to the player that stands still before them.
+        """
+        self.close()
+        self._harmless = harmless
+        folder = self._folder = Path(tempfile.mkdtemp(prefix="ngo_maze3d_"))
+        write_lumps(folder / "maps.wad", lumps)
+        game = vizdoom.DoomGame()
+        game.set_vizdoom_path(str(_launcher(folder)))
+        game.set_doom_game_path(str(game_wad))
+        game.set_doom_scenario_path(str(folder / "maps.wad"))
+        game.set_doom_config_path(str(folder / "engine.ini"))
+        game.set_doom_map(first_map)
+        game.set_screen_resolution(self._resolution)
+        game.set_screen_format(vizdoom.ScreenFormat.RGB24)
+        for part in ("hud", "minimal_hud", "crosshair", "weapon", "decals", "particles", "effects_sprites",
+                     "messages", "corpses", "screen_flashes"):  # fmt: skip
+            getattr(game, f"set_render_{part}")(False)
+        game.set_window_visible(False)
+        game.set_sound_enabled(False)
+        game.set_console_enabled(False)
+        game.set_mode(vizdoom.Mode.PLAYER)
+        game.set_episode_timeout(0)
+        game.set_seed(_ENGINE_SEED)
+        game.set_available_buttons([Button.MOVE_FORWARD_BACKWARD_DELTA, Button.TURN_LEFT_RIGHT_DELTA, Button.USE])
+        game.set_available_game_variables(
+            [GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE]
+        )
+        # The camera of a walking player goes up and down by default.
+        game.set_game_args("+movebob 0 +stillbob 0" + (" -nomonsters" if harmless else ""))
+        with _WORKING_DIRECTORY_LOCK:
+            # The process makes a folder in its working directory, which it can only inherit.
+            caller = os.open(".", os.O_RDONLY)
+            try:
+                os.chdir(folder)
+                game.init()
+            finally:
+                os.fchdir(caller)
+                os.close(caller)
+        self._game = game
+
+    def enter(self, map_name: str) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Begin a map; return the first picture and pose, as advance() does."""
+        assert self._game is not None
+        self._game.set_doom_map(map_name)
+        self._game.new_episode()
+        # Each map begins with the default field of view: the argument `+fov` holds for the first one alone.
+        self._game.send_game_command(f"fov {self._field_of_view_deg}")
+        if self._harmless:  # every episode begins without
+            self._game.send_game_command("god")
+        observed = self._act([0, 0, 0], _SETTLING_TICS)
+        wanted, given = self._field_of_view_deg, self._game.get_game_variable(GameVariable.CAMERA_FOV)
+        if given != wanted:
+            raise RuntimeError(f"the engine's field of view is {given}, not {wanted} degrees")
+        return observed
+
+    def advance(
+        self, thrust: int, turn_deg: float, use: bool = False
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Let a step pass; return the picture (2 height, 2 width, 3) and the pose (3,) at its end.
+
+        use: open the door ahead; counts where the step before was without.
+        """
+        # The engine turns clockwise for a positive number, and by that number in each tic.
+        return self._act([thrust, -turn_deg / self._tics, use], self._tics)
+
+    def _act(self, buttons: list[float], tics: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        assert self._game is not None
+        try:
+            self._game.make_action(buttons, tics)
+        except (vizdoom.ViZDoomErrorException, vizdoom.ViZDoomUnexpectedExitException) as error:
+            self.close()
+            raise RuntimeError(f"the engine has ended: {error}") from error
+        if self._game.is_episode_finished():
+            self.close()
+            raise RuntimeError("the map has ended the episode by itself")
+        state = self._game.get_state()
+        assert state.game_variables is not None
+        x, y, angle_deg = state.game_variables
+        yaw = math.remainder(math.radians(angle_deg), math.tau)
+        return state.screen_buffer, np.array([x / UNITS_PER_M, y / UNITS_PER_M, yaw])
+
+    def close(self) -> None:
+        """End the process, then delete its files, among them some that it writes at its end."""
+        game, self._game = self._game, None
+        if game is not None:
+            game.close()
+        folder, self._folder = self._folder, None
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _launcher(folder: Path) -> Path:
+    """What starts the engine: a script in the folder by which the engine ends with this process, even a killed one.
+
+    Without util-linux's setpriv (not on Linux) it is the engine itself.
+    """
+    engine, setpriv = SHIPPED / "vizdoom", shutil.which("setpriv")
+    if setpriv is None:
+        return engine
+    script = folder / "engine.sh"
+    script.write_text(f"#!/bin/sh\nexec {shlex.quote(setpriv)} --pdeathsig KILL -- {shlex.quote(str(engine))} \"$@\"\n")
+    script.chmod(0o700)
+    return script

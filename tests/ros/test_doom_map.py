@@ -1,0 +1,72 @@
+"""Simulator and both estimators on a Doom map that is no maze, as real processes over DDS."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Image
+
+from .processes import NodeProcess, Probe
+
+pytestmark = pytest.mark.processes
+
+FRAMES = 120
+SCENARIO = {"wad": "my_way_home.wad", "map": "map01"}
+
+
+@pytest.fixture
+def probe() -> Iterator[Probe]:
+    probe = Probe()
+    yield probe
+    probe.close()
+
+
+def stamps(messages: list[Image] | list[Odometry] | list[PoseWithCovarianceStamped]) -> list[int]:
+    return [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in messages]
+
+
+def test_the_estimators_run_unchanged_on_a_scenario_that_vizdoom_ships(probe: Probe) -> None:
+    """Every frame gets a corrected pose, and the corrected motion is about as long as the true one."""
+    with NodeProcess("ngo_estimator", "local_node") as local, NodeProcess("ngo_estimator", "ngo_node") as ngo:
+        local.wait_for_log("ready: ")
+        ngo.wait_for_log("ready: ")
+        truth = probe.collect(Odometry, "ground_truth")
+        odometry = probe.collect(Odometry, "odom")
+        corrected = probe.collect(PoseWithCovarianceStamped, "ngo/pose")
+        probe.spin_until(
+            lambda: all(probe.node.count_publishers(topic) for topic in ("/odom", "/ngo/pose")), "both estimators"
+        )
+        images = probe.collect(Image, "image")  # last: the simulator waits for it, and for local_node
+        run = {"seed": 1001, "frames": FRAMES, "rate": 0.0, "wait_for_subscribers": 2, "wait_for_flow_control": True}
+        with NodeProcess("ngo_sim", "maze3d", {**run, **SCENARIO}) as simulator:
+            probe.spin_until(lambda: not simulator.running, "the simulator's end")
+            assert simulator.wait() == 0, simulator.log
+        probe.spin_until(lambda: len(images) == len(truth) == FRAMES, "all frames")
+        probe.spin_until(lambda: bool(corrected) and stamps(corrected)[-1] == stamps(images)[-1], "the last pose")
+    # A relative pose leads to each frame but the first.
+    assert stamps(corrected) == stamps(images)[1:] and stamps(odometry)[-1] == stamps(images)[-1]
+    true = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in truth])
+    found = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in corrected])
+    true_m, found_m = (float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in (true, found))
+    assert true_m > 5.0, "the explorer drove"
+    assert np.isfinite(found).all() and math.isclose(found_m, true_m, rel_tol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ({"wad": "nowhere.wad", "map": "map01"}, "wad is 'nowhere.wad'; it must be a WAD file, or the name of one of "),
+        ({"wad": "my_way_home.wad", "map": "map07"}, "map is 'map07'; my_way_home.wad has MAP01"),
+        ({"wad": "my_way_home.wad"}, "wad is 'my_way_home.wad' and map is ''; they must be given both, or neither"),
+        ({**SCENARIO, "driver": "corners"}, "driver is 'corners', which needs a maze's plan; on a Doom map "),
+        ({**SCENARIO, "policy": "learned", "driver": "random"}, "policy is 'learned' and driver is 'random'; allo"),
+    ],
+)
+def test_what_does_not_fit_is_one_line_and_exit_code_2(parameters: dict[str, str], expected: str) -> None:
+    with NodeProcess("ngo_sim", "maze3d", parameters) as node:
+        assert node.wait() == 2, node.log
+        assert len(node.lines) == 1, node.log
+        assert node.lines[0].startswith("maze3d: bad parameter: " + expected)

@@ -1,0 +1,168 @@
+import dataclasses
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from ngo_sim.drivers import Action
+from ngo_sim.learned_driver import LearnedDriver
+from ngo_sim.policy_network import PolicyConfig, PolicyNetwork, PolicyView, grey_picture, load_policy
+
+SMALL = PolicyConfig(height=6, width=8, pictures=2, channels=(3,), kernels=(3,), strides=(2,), hidden=5)
+
+
+def weights(config: PolicyConfig, seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: rng.normal(0.0, 0.3, shape).astype(np.float32) for name, shape in config.tensor_shapes().items()}
+
+
+def pictures(count: int, config: PolicyConfig = SMALL, seed: int = 1) -> np.ndarray:
+    shape = (count, 2 * config.height, 2 * config.width, 3)
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def view_of(
+    frames: np.ndarray, poses: list[tuple[float, float, float]], actions: list[int], mirrored: bool
+) -> PolicyView:
+    """What is seen on a drive, or on its mirror image at the axis x."""
+    view = PolicyView(SMALL)
+    for frame, (x, y, yaw), action in zip(frames, poses, [*actions, None], strict=True):
+        sign = -1.0 if mirrored else 1.0
+        view.see(frame[:, ::-1] if mirrored else frame, np.array((x, sign * y, sign * yaw)))
+        if action is not None:
+            view.did((0, 2, 1)[action] if mirrored else action)
+    return view
+
+
+def test_a_grey_picture_is_the_mean_of_blocks_and_colours() -> None:
+    picture = pictures(1)[0]
+    expected = picture.reshape(6, 2, 8, 2, 3).astype(float).mean(axis=(1, 3, 4))
+    np.testing.assert_array_equal(grey_picture(picture, 6, 8), np.floor(expected + 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("observation", "expected"),
+    [
+        (np.zeros((241, 4), np.float32), "is given float32 (241, 4); it needs colour pictures"),
+        (np.zeros((192, 256, 3), np.uint8), "is given pictures of 256 x 192; it needs multiples of 40 x 30"),
+        (np.zeros((15, 20, 3), np.uint8), "is given pictures of 20 x 15; it needs multiples of 40 x 30"),
+    ],
+)
+def test_other_pictures_are_refused(observation: np.ndarray, expected: str) -> None:
+    with pytest.raises(ValueError, match="learned driver") as error:
+        grey_picture(observation, 30, 40)
+    assert expected in str(error.value)
+
+
+def test_a_view_holds_the_newest_pictures_and_the_motion_between_decisions() -> None:
+    frames, view = pictures(3), PolicyView(SMALL)
+    grey = [grey_picture(frame, 6, 8) for frame in frames]
+    view.see(frames[0], np.array((1.0, 2.0, math.pi / 2)))
+    np.testing.assert_array_equal(view.pictures, [grey[0], grey[0]])
+    assert view.senses.tolist() == [0.0] * 6
+    view.did(Action.TURN_LEFT)
+    view.see(frames[1], np.array((0.75, 2.5, -math.pi + 0.25)))
+    np.testing.assert_array_equal(view.pictures, [grey[1], grey[0]])
+    np.testing.assert_allclose(view.senses, [0, 1, 0, 0.5, 0.25, math.pi / 2 + 0.25], atol=1e-6)
+    view.did(Action.FORWARD)
+    view.see(frames[2], np.array((0.75, 2.5, -math.pi + 0.25)))
+    np.testing.assert_array_equal(view.pictures, [grey[2], grey[1]])
+    assert view.senses.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_the_forward_pass_is_that_of_the_definition() -> None:
+    tensors, view = weights(SMALL), view_of(pictures(2), [(0, 0, 0), (0.4, 0.1, 0.2)], [2], mirrored=False)
+
+    def hidden(images: np.ndarray, senses: np.ndarray) -> np.ndarray:
+        kernel, bias = tensors["convolution_0.weight"], tensors["convolution_0.bias"]
+        values = [
+            max(0.0, float((images[:, row : row + 3, col : col + 3] * kernel[channel]).sum() + bias[channel]))
+            for channel in range(3)
+            for row in (0, 2)
+            for col in (0, 2, 4)
+        ]
+        return np.maximum(tensors["hidden.weight"] @ np.array([*values, *senses]) + tensors["hidden.bias"], 0.0)
+
+    images = view.pictures / 255.0
+    a, b, c, forward, left, turned = view.senses
+    own, other = hidden(images, view.senses), hidden(images[:, :, ::-1], np.array((a, c, b, forward, -left, -turned)))
+    ahead, turn = tensors["common.weight"] @ (own + other) + tensors["common.bias"]
+    (side,) = tensors["turn.weight"] @ (own - other)
+    expected = (ahead, turn + side, turn - side)
+    np.testing.assert_allclose(PolicyNetwork(SMALL, tensors).logits(view), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_in_a_mirror_it_does_the_mirror_image() -> None:
+    network = PolicyNetwork(SMALL, weights(SMALL))
+    drive = (pictures(3), [(0, 0, 0.1), (0.4, 0.1, 0.2), (0.7, 0.3, 0.0)], [1, 2])
+    own, mirrored = (network.logits(view_of(*drive, mirrored=mirrored)) for mirrored in (False, True))
+    np.testing.assert_allclose(mirrored, own[[0, 2, 1]], rtol=1e-4, atol=1e-5)
+    assert abs(own[1] - own[2]) > 1e-3
+
+
+def test_a_decision_is_drawn_from_the_odds_and_held() -> None:
+    tensors = {name: np.zeros_like(tensor) for name, tensor in weights(SMALL).items()}
+    tensors["common.bias"][:] = math.log(4.0), 0.0  # forward in 4 of 6 cases
+    driver = LearnedDriver(np.random.default_rng(0), PolicyNetwork(SMALL, tensors))
+    frame = pictures(1)[0]
+    actions = np.array([driver.action(np.zeros(3), frame) for _ in range(6000)]).reshape(-1, SMALL.hold_frames)
+    assert SMALL.hold_frames == 3 and (actions == actions[:, :1]).all()
+    np.testing.assert_allclose(np.bincount(actions[:, 0], minlength=3) / len(actions), (4 / 6, 1 / 6, 1 / 6), atol=0.03)
+    with pytest.raises(ValueError, match="observation is None; the learned driver has to see"):
+        driver.action(np.zeros(3))
+
+
+def write(path: Path, tensors: dict[str, np.ndarray], **changes: Any) -> None:
+    content = save(tensors)
+    path.write_bytes(content)
+    description = {
+        "format": 1,
+        "network": "driver",
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "config": dataclasses.asdict(SMALL),
+    }
+    path.with_suffix(".json").write_text(json.dumps({**description, **changes}))
+
+
+def test_weights_come_back_from_their_file(tmp_path: Path) -> None:
+    path, tensors = tmp_path / "driver.safetensors", weights(SMALL)
+    write(path, tensors)
+    view = view_of(pictures(2), [(0, 0, 0), (0.4, 0.1, 0.2)], [2], mirrored=False)
+    network = load_policy(path)
+    assert network.config == SMALL
+    np.testing.assert_array_equal(network.logits(view), PolicyNetwork(SMALL, tensors).logits(view))
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    path, tensors = tmp_path / "driver.safetensors", weights(SMALL)
+    with pytest.raises(ValueError, match=r"driver\.safetensors: no readable weights with a JSON description"):
+        load_policy(path)
+    config = dataclasses.asdict(SMALL)
+    infinite = {**tensors, "hidden.bias": np.full(5, np.inf, np.float32)}
+    cases: list[tuple[dict[str, np.ndarray], dict[str, Any], str]] = [
+        (tensors, {"network": "optimizer"}, "is not the description of a driver of format 1"),
+        (tensors, {"sha256": "0"}, "is not the file that driver.json describes"),
+        (tensors, {"config": {**config, "size": 3}}, "expected an object with height, width, pictures"),
+        (tensors, {"config": {**config, "hidden": 6}}, "hidden.weight has shape (5, 24); expected (6, 24)"),
+        (infinite, {}, "hidden.bias has shape (5,); expected (5,), all finite"),
+    ]
+    for given, changes, expected in cases:
+        write(path, given, **changes)
+        with pytest.raises(ValueError, match=r"driver\.") as error:
+            load_policy(path)
+        assert expected in str(error.value)
+
+
+def test_configs_that_cannot_be_are_refused() -> None:
+    for changes, expected in (
+        ({"hidden": 0}, "hidden is 0; it must be an integer of at least 1"),
+        ({"strides": (2, 2)}, r"strides is \(2, 2\); it must have 3 integers"),
+        ({"height": 8}, "leave the kernels"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            PolicyConfig(**changes)
