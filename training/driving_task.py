@@ -1,28 +1,31 @@
-"""Driving as a task for reinforcement learning: look, hold an action for a few frames, be paid for the way covered."""
+"""Driving as a task for reinforcement learning: look, decide for the next few frames, be paid for the way covered."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from ngo_sim.policy_network import ACTIONS, PolicyConfig, PolicyView
+from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from ngo_sim.policy_network import ACTIONS, SENSES, PolicyConfig, PolicyView
 from training.worlds import TRAIN_SEEDS, World
 
 Look = dict[str, Any]
 
-REWARD_PER_M = 0.1
+REWARD_PER_M = 0.3
 """Keeps the discounted sum of rewards near 1, the size that a value network learns fast."""
 
 
 class DrivingTask(gymnasium.Env[Look, np.int64]):
     """Mazes of the training split of a world, each driven through once for ``frames`` frames.
 
-    Observations are what PolicyView holds, as a dict: ``pictures`` uint8 (pictures, height, width) and ``last_action``
-    float32 (3,). A step is a decision: its action is held for config.hold_frames frames, its reward is the distance
-    travelled in m times REWARD_PER_M. ``mazes`` of one size are made at a time. Which mazes come is a function of
-    ``stream``, any sequence of whole numbers.
+    Observations are what PolicyView holds, as a dict: ``pictures`` uint8 (pictures, height, width) and ``senses``
+    float32 (6,). A step is a decision: config.hold_frames frames of the simulator, taken at once. Its reward is the
+    distance travelled in m times REWARD_PER_M. ``mazes`` of one size are made at a time. Which mazes come is a function
+    of ``stream``, any sequence of whole numbers.
     """
 
     def __init__(self, world: World, config: PolicyConfig, stream: tuple[int, ...], frames: int, mazes: int) -> None:
@@ -36,7 +39,7 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
         self.observation_space = gymnasium.spaces.Dict(
             {
                 "pictures": gymnasium.spaces.Box(0, 255, pictures, np.uint8),
-                "last_action": gymnasium.spaces.Box(0.0, 1.0, (ACTIONS,), np.float32),
+                "senses": gymnasium.spaces.Box(-100.0, 100.0, (SENSES,), np.float32),
             }
         )
 
@@ -44,22 +47,23 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
         """Stand at the start of the next maze; seed and options change nothing, the stream decides."""
         if not self._seeds:
             self.close()
-            self._env = self._world.make_random(self._rng)
+            rows, most_rows = self._world.rows
+            openings, most_openings = self._world.extra_openings
+            size = int(self._rng.integers(rows, most_rows + 1))
+            extra = int(self._rng.integers(openings, most_openings + 1))
+            self._env = Maze3D(held(Maze3DConfig(size, size, extra), self._config.hold_frames))
             self._seeds = self._rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop, self._mazes).tolist()
             self._env.preload(self._seeds)
         observation, info = self._env.reset(seed=self._seeds.pop())
         self._view, self._decisions = PolicyView(self._config), 0
-        self._view.see(observation)
+        self._view.see(observation, info["pose_xyyaw"])
         return self._look(), info
 
     def step(self, action: np.int64 | int) -> tuple[Look, float, bool, bool, dict[str, Any]]:
-        """Hold an action; an episode is cut off after its frames."""
-        travelled = 0.0
-        for _ in range(self._config.hold_frames):
-            observation, reward, _, _, info = self._env.step(int(action))
-            travelled += reward
+        """Take a decision; an episode is cut off after its frames."""
+        observation, travelled, _, _, info = self._env.step(int(action))
         self._view.did(int(action))
-        self._view.see(observation)
+        self._view.see(observation, info["pose_xyyaw"])
         self._decisions += 1
         over = self._decisions * self._config.hold_frames >= self._frames
         return self._look(), REWARD_PER_M * travelled, False, over, info
@@ -71,4 +75,21 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
             self._env = None
 
     def _look(self) -> Look:
-        return {"pictures": self._view.pictures.copy(), "last_action": self._view.last_action.copy()}
+        return {"pictures": self._view.pictures.copy(), "senses": self._view.senses.copy()}
+
+
+def held(config: Maze3DConfig, frames: int) -> Maze3DConfig:
+    """The world in which one step is about what ``frames`` steps with the same action are in that of ``config``.
+
+    It is rendered once in these frames, which makes training several times as fast. A turn action turns the robot by as
+    much until it rests again, and its rate falls as fast; only within a decision the course differs a little.
+    """
+    decay = config.turn_decay**frames
+    resting_deg = config.turn_deg / (1.0 - config.turn_decay)
+    return dataclasses.replace(
+        config,
+        frame_skip=frames * config.frame_skip,
+        turn_decay=decay,
+        turn_deg=frames * resting_deg * (1.0 - decay),
+        actuation_noise=config.actuation_noise / math.sqrt(frames),
+    )

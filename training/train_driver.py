@@ -27,11 +27,12 @@ import tyro
 from safetensors.numpy import save
 from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from torch import Tensor, nn
 
-from ngo_sim.policy_network import ACTIONS, FORMAT, NETWORK, SHIPPED, PolicyConfig
+from ngo_sim.policy_network import FORMAT, MIRRORED_SENSES, MIRRORED_SIGNS, NETWORK, SENSES, SHIPPED, PolicyConfig
 from training import runs
 from training.curves import write_at_once
 from training.driving_task import REWARD_PER_M, DrivingTask
@@ -44,21 +45,21 @@ CHECKPOINT = "last.pt"
 class Arguments:
     """Settings of a training of the driver."""
 
-    decisions: int = 1_400_000
-    """Decisions to train on, of all environments together; each holds its action for two frames."""
+    decisions: int = 1_000_000
+    """Decisions to train on, of all environments together; each holds its action for three frames."""
     environments: int = 16
     """Mazes that are driven through side by side."""
-    steps: int = 16
+    steps: int = 20
     """Decisions of each environment between two updates."""
-    episode_frames: int = 500
+    episode_frames: int = 600
     """Frames in one maze."""
     mazes: int = 16
     """Mazes of one size that an environment makes at a time."""
     learning_rate: float = 7e-4
     """At the beginning; it falls to zero along a line."""
-    discount: float = 0.98
+    discount: float = 0.97
     """Worth of a reward one decision later."""
-    entropy: float = 0.02
+    entropy: float = 0.04
     """Weight of the entropy of the actions in the loss, at the beginning; it falls to zero as well."""
     checkpoint_decisions: int = 50_000
     """Decisions between two checkpoints."""
@@ -79,21 +80,64 @@ class Arguments:
 
 
 class Features(BaseFeaturesExtractor):
-    """The network of ngo_sim.policy_network up to its hidden layer; names of weights are the same."""
+    """The network of ngo_sim.policy_network up to the sum and the difference of its two hidden layers."""
 
     def __init__(self, observation_space: Any, config: PolicyConfig) -> None:
-        super().__init__(observation_space, config.hidden)
+        super().__init__(observation_space, 2 * config.hidden)
         before, layers = config.pictures, []
         for channels, kernel, stride in zip(config.channels, config.kernels, config.strides, strict=True):
             layers += [nn.Conv2d(before, channels, kernel, stride), nn.ReLU()]
             before = channels
         self.convolutions = nn.Sequential(*layers, nn.Flatten())
-        self.hidden = nn.Linear(int(np.prod(config.feature_shape)) + ACTIONS, config.hidden)
+        self.hidden = nn.Linear(int(np.prod(config.feature_shape)) + SENSES, config.hidden)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """(batch, hidden) of pictures (batch, pictures, height, width) in [0, 1] and last_action (batch, 3)."""
-        seen = self.convolutions(observations["pictures"])
-        return torch.relu(self.hidden(torch.cat((seen, observations["last_action"]), dim=1)))
+        """(batch, 2 hidden) of pictures (batch, pictures, height, width) in [0, 1] and senses (batch, 6)."""
+        pictures, senses = observations["pictures"], observations["senses"]
+        mirrored_senses = senses[:, list(MIRRORED_SENSES)] * senses.new_tensor(MIRRORED_SIGNS)
+        seen = self.convolutions(torch.cat((pictures, pictures.flip(-1))))
+        both = torch.relu(self.hidden(torch.cat((seen, torch.cat((senses, mirrored_senses))), dim=1)))
+        own, mirrored = both.chunk(2)
+        return torch.cat((own + mirrored, own - mirrored), dim=1)
+
+
+class Odds(nn.Module):
+    """The last layer of ngo_sim.policy_network: (batch, 2 hidden) to the logarithms of the odds, (batch, 3)."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.common, self.turn = nn.Linear(hidden, 2), nn.Linear(hidden, 1, bias=False)
+        for layer in (self.common, self.turn):
+            nn.init.orthogonal_(layer.weight, gain=0.01)
+        nn.init.zeros_(self.common.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        even, odd = features.chunk(2, dim=1)
+        forward, turn = self.common(even).unbind(1)
+        left = self.turn(odd).squeeze(1)
+        return torch.stack((forward, turn + left, turn - left), dim=1)
+
+
+class Worth(nn.Module):
+    """The critic's last layer: (batch, 2 hidden) to (batch, 1), the same in a mirror."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(hidden, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        even, _ = features.chunk(2, dim=1)
+        return self.linear(even)
+
+
+class MirroredPolicy(MultiInputActorCriticPolicy):
+    """Actor and critic that share all but their last layers."""
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        hidden = self.features_dim // 2
+        self.action_net, self.value_net = Odds(hidden), Worth(hidden)  # type: ignore[assignment]
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
 
 class Progress(BaseCallback):
@@ -195,9 +239,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
 
 def make_model(arguments: Arguments, config: PolicyConfig, environments: VecMonitor) -> A2C:
-    """The actor and the critic, which share all but their last layers."""
+    """The training, its networks fresh."""
     return A2C(
-        "MultiInputPolicy",
+        MirroredPolicy,
         environments,
         learning_rate=lambda remaining: arguments.learning_rate * remaining,
         n_steps=arguments.steps,
@@ -235,13 +279,12 @@ def load_state(folder: Path, record: dict[str, Any]) -> dict[str, Any] | None:
 
 def export(path: Path, state: dict[str, Tensor], config: PolicyConfig, details: dict[str, Any]) -> dict[str, Any]:
     """Write the actor as safetensors with its description beside it; returns the description."""
-    names = {"features_extractor.hidden": "hidden", "action_net": "action"}
-    names |= {f"features_extractor.convolutions.{2 * i}": f"convolution_{i}" for i in range(len(config.channels))}
-    tensors = {
-        f"{name}.{part}": np.ascontiguousarray(state[f"{layer}.{part}"].detach().numpy())
-        for layer, name in names.items()
-        for part in ("weight", "bias")
-    }
+    layers = {"hidden": "features_extractor.hidden", "common": "action_net.common", "turn": "action_net.turn"}
+    layers |= {f"convolution_{i}": f"features_extractor.convolutions.{2 * i}" for i in range(len(config.channels))}
+    tensors = {}
+    for name in config.tensor_shapes():
+        layer, _, part = name.partition(".")
+        tensors[name] = np.ascontiguousarray(state[f"{layers[layer]}.{part}"].detach().numpy())
     weights = save(tensors)
     description = {
         "format": FORMAT,
