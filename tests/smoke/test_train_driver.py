@@ -1,0 +1,134 @@
+"""The training of the learned driver, in seconds: from nothing to weights that the simulator loads."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_sim.learned_driver import LearnedDriver
+from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from ngo_sim.policy_network import PolicyConfig, PolicyView, load_policy
+from training.driving_task import REWARD_PER_M, DrivingTask, held
+from training.runs import RunError
+from training.train_driver import Arguments, Features, main
+from training.worlds import TRAIN_SEEDS, world_named
+
+
+def arguments(folder: Path, decisions: int = 16, **changes: int) -> Arguments:
+    return Arguments(
+        decisions=decisions,
+        environments=2,
+        steps=4,
+        episode_frames=12,
+        mazes=2,
+        checkpoint_decisions=8,
+        out=folder / "driver.safetensors",
+        runs=folder / "runs",
+        **changes,
+    )
+
+
+def test_a_training_ends_with_weights_that_drive(tmp_path: Path) -> None:
+    description = main(arguments(tmp_path))
+    assert json.loads(json.dumps(description)) == json.loads((tmp_path / "driver.json").read_text())
+    training = description["training"]
+    assert training["decisions"] == 16 and training["arguments"]["seed"] == 0
+    assert training["command"].startswith("python -m training.train_driver --decisions 16") and training["revision"]
+    assert (tmp_path / "driver.safetensors").stat().st_size < 300_000
+    folder = tmp_path / "runs" / "maze3d" / "driver"
+    rows = (folder / "metrics.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["decisions", "8", "16"]
+    assert json.loads((folder / "run.json").read_text())["state"] == "complete"
+
+    env = Maze3D()
+    driver = LearnedDriver(np.random.default_rng(0), load_policy(tmp_path / "driver.safetensors"))
+    observation, info = env.reset(seed=TRAIN_SEEDS[0])
+    for _ in range(20):
+        observation, *_, info = env.step(driver.action(info["pose_xyyaw"], observation))
+    env.close()
+
+
+def test_the_simulators_forward_pass_is_that_of_the_training(tmp_path: Path) -> None:
+    main(arguments(tmp_path))
+    network, config = load_policy(tmp_path / "driver.safetensors"), PolicyConfig()
+    state = torch.load(tmp_path / "runs" / "maze3d" / "driver" / "last.pt", weights_only=True)["policy"]
+    task = DrivingTask(world_named("maze3d"), config, (3,), frames=30, mazes=1)
+    features = Features(task.observation_space, config)
+    features.load_state_dict({k[19:]: v for k, v in state.items() if k.startswith("features_extractor.")})
+    look, _ = task.reset()
+    for action in (0, 1, 2, 0):
+        look = task.step(action)[0]
+        view = PolicyView(config)
+        view.pictures, view.senses = look["pictures"], look["senses"]
+        batch = {name: torch.from_numpy(values)[None] for name, values in look.items()}
+        batch["pictures"] = batch["pictures"] / 255.0
+        with torch.no_grad():
+            even, odd = features(batch).chunk(2, dim=1)
+            forward, turn = (even @ state["action_net.common.weight"].T + state["action_net.common.bias"])[0]
+            left = (odd @ state["action_net.turn.weight"].T)[0, 0]
+        expected = torch.stack((forward, turn + left, turn - left)).numpy()
+        np.testing.assert_allclose(network.logits(view), expected, rtol=1e-3, atol=1e-4)
+    task.close()
+
+
+def test_it_goes_on_where_it_was_stopped_and_not_with_other_arguments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stopped(Exception):
+        pass
+
+    def stop(*_: object) -> None:
+        raise Stopped
+
+    monkeypatch.setattr("training.train_driver.export", stop)
+    with pytest.raises(Stopped):
+        main(arguments(tmp_path))
+    monkeypatch.undo()
+    checkpoint = tmp_path / "runs" / "maze3d" / "driver" / "last.pt"
+    state = torch.load(checkpoint, weights_only=True)
+    torch.save({**state, "decisions": 8}, checkpoint)
+    with pytest.raises(RunError, match="given seed 1; expected seed 0 to go on with it"):
+        main(arguments(tmp_path, seed=1))
+    main(arguments(tmp_path))
+    assert torch.load(checkpoint, weights_only=True)["decisions"] == 16
+
+
+def test_the_task_pays_the_way_and_is_a_function_of_its_stream() -> None:
+    def drive(stream: tuple[int, ...]) -> tuple[list[np.ndarray], float, bool]:
+        task = DrivingTask(world_named("maze3d"), PolicyConfig(), stream, frames=30, mazes=2)
+        look, info = task.reset()
+        begin, seen, paid, over = info["pose_xyyaw"], [look["pictures"]], 0.0, False
+        for action in (0, 0, 0, 1, 0, 0, 2, 0, 0, 0):
+            assert not over
+            look, reward, _, over, info = task.step(action)
+            seen.append(look["pictures"])
+            paid += reward
+        task.close()
+        assert paid / REWARD_PER_M >= np.linalg.norm(info["pose_xyyaw"][:2] - begin[:2]) - 1e-9
+        return seen, paid, over
+
+    seen, paid, over = drive((1, 2))
+    again, _, _ = drive((1, 2))
+    other, _, _ = drive((1, 3))
+    assert over and paid > 0.0
+    np.testing.assert_array_equal(seen, again)
+    assert not np.array_equal(seen, other)
+
+
+def test_a_held_step_is_about_as_many_steps_with_one_action() -> None:
+    quiet = Maze3DConfig(actuation_noise=0.0)
+    ends = []
+    for config, repeat in ((quiet, 3), (held(quiet, 3), 1)):
+        env = Maze3D(config)
+        _, info = env.reset(seed=TRAIN_SEEDS[0])
+        yaws = [info["pose_xyyaw"][2]]
+        for action in (1, 1, 2, 0, 0, 0, 0):
+            for _ in range(repeat):
+                *_, info = env.step(action)
+            yaws.append(info["pose_xyyaw"][2])
+        ends.append(np.degrees(np.unwrap(yaws) - yaws[0]))
+        env.close()
+    np.testing.assert_allclose(ends[0][-1], ends[1][-1], atol=1.0)
+    np.testing.assert_allclose(ends[0], ends[1], atol=8.0)
