@@ -137,7 +137,8 @@ class MirroredPolicy(MultiInputActorCriticPolicy):
         super()._build(lr_schedule)
         hidden = self.features_dim // 2
         self.action_net, self.value_net = Odds(hidden), Worth(hidden)  # type: ignore[assignment]
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        optimizer_class: Any = self.optimizer_class
+        self.optimizer = optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
 
 class Progress(BaseCallback):
