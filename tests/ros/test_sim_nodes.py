@@ -25,6 +25,7 @@ from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.maze3d import Maze3D
 from ngo_sim.nodes.parameters import BadParameter, ConfigParameters
+from ngo_sim.policy_network import SHIPPED
 from ngo_sim.simulator_config import SimulatorConfig
 
 from .processes import NodeProcess, Probe, wait_until
@@ -137,6 +138,15 @@ def test_maze3d_publishes_what_the_core_records(probe: Probe) -> None:
     assert forward == (1.0, 0.0, 0.0), "the optical axis z is forward in base_link"
     right = (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y))
     assert right == (0.0, -1.0, 0.0), "x of the picture is right"
+
+
+@pytest.mark.skipif(not SHIPPED.exists(), reason="no weights of the learned driver are shipped")
+def test_the_learned_driver_drives_as_without_ros(probe: Probe) -> None:
+    run = Run(probe, "maze3d", CameraInfo, "camera_info", policy="learned")
+    env = Maze3D()
+    episode = record_episode(env, "learned", FRAMES, SEED)
+    env.close()
+    run.check(episode, 2 / 35)
 
 
 def test_none_is_lost_by_a_slow_subscriber(probe: Probe) -> None:

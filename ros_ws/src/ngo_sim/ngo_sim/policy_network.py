@@ -190,8 +190,12 @@ def load_policy(path: Path = SHIPPED) -> PolicyNetwork:
     try:
         description, content = json.loads(beside.read_text()), path.read_bytes()
         tensors = load(content)
-    except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise ValueError(f"{path}: no readable weights with a JSON description beside them ({error})") from error
+    except OSError as error:
+        raise ValueError(
+            f"{error.filename}: cannot be read ({error.strerror}); expected weights of a driver, or the JSON beside them"
+        ) from error
+    except (ValueError, safetensors.SafetensorError) as error:
+        raise ValueError(f"{path}: it or the JSON beside it is damaged ({error})") from error
     if not isinstance(description, dict) or (description.get("format"), description.get("network")) != (
         FORMAT,
         NETWORK,
