@@ -192,7 +192,7 @@ def load_policy(path: Path = SHIPPED) -> PolicyNetwork:
         tensors = load(content)
     except OSError as error:
         raise ValueError(
-            f"{error.filename}: cannot be read ({error.strerror}); expected weights of a driver, or the JSON beside them"
+            f"{error.filename}: cannot be read ({error.strerror}); expected a driver's weights, or the JSON beside them"
         ) from error
     except (ValueError, safetensors.SafetensorError) as error:
         raise ValueError(f"{path}: it or the JSON beside it is damaged ({error})") from error
