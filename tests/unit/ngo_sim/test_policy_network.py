@@ -140,7 +140,7 @@ def test_weights_come_back_from_their_file(tmp_path: Path) -> None:
 
 def test_broken_files_are_named(tmp_path: Path) -> None:
     path, tensors = tmp_path / "driver.safetensors", weights(SMALL)
-    with pytest.raises(ValueError, match=r"driver\.json: cannot be read \(No such file or directory\); expected we"):
+    with pytest.raises(ValueError, match=r"driver\.json: cannot be read \(No such file or directory\); expected a"):
         load_policy(path)
     write(path, tensors)
     path.write_bytes(path.read_bytes()[:20])
