@@ -46,6 +46,8 @@ class Arguments(runs.TrainerArguments):
     """World to train for."""
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
     """Recordings to train on instead."""
+    without_action: bool = False
+    """Whether the network of a world is to do without the actions, from the images alone."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8
@@ -69,6 +71,8 @@ class Arguments(runs.TrainerArguments):
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
+        if self.without_action and self.world is None:
+            raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
 
 
 class LocalTraining(lightning.LightningModule):
@@ -242,13 +246,16 @@ def main(arguments: Arguments) -> dict[str, float]:
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     steps: Steps
     if recorded is None:
-        domain: Domain = world_named(str(arguments.world))
-        steps = SimulatedSteps(arguments, world_named(str(arguments.world)))
+        world = world_named(str(arguments.world))
+        if arguments.without_action:
+            world = dataclasses.replace(world, actions=0, mirrored_actions=())
+        domain: Domain = world
+        steps = SimulatedSteps(arguments, world)
     else:
         domain = recorded.domain
         steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
     run = runs.Run(
-        arguments.runs / domain.name / "local",
+        arguments.runs / domain.name / ("local-no_action" if arguments.without_action else "local"),
         "train_local",
         arguments,
         arguments.epochs,

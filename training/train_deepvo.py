@@ -1,0 +1,216 @@
+"""Train DeepVO, the baseline of the results, on the mazes and frames that the local network learns from.
+
+    python -m training.train_deepvo --world maze3d
+
+It sees stretches of trajectories where the local network sees single pairs, with the same number of frame pairs, the
+same schedule and loss, mirror images and calibration; as in the original it is not told the actions. Run again, it goes
+on where it was stopped.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import lightning
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import save_checkpoint
+from training import runs, streams
+from training.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
+from training.metrics import seen_from_first
+from training.streams import ALL, Batch, PairStream, Share, images_of, loader, mirrored, relative_poses, simulate
+from training.train_local import episode_pairs, step_losses, step_metrics
+from training.tune_pose_graph import fit_calibration
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+
+if TYPE_CHECKING:
+    from ngo_sim.episodes import Episode
+
+
+@dataclass(frozen=True)
+class Arguments(runs.TrainerArguments):
+    """Settings of a training of DeepVO."""
+
+    world: Literal["maze3d"]
+    """World to train for."""
+    width: float = 0.25
+    """Channels of the convolutions and units of the LSTM layers, as a fraction of DeepVO's."""
+    epochs: int = 8
+    """Passes of new data."""
+    datapoints: int = 200_000
+    """Frame pairs in an epoch, of all processes."""
+    steps: int = 40
+    """Steps of a stretch."""
+    batch_size: int = 8
+    """Stretches in a step of the optimiser, in each process."""
+    learning_rate: float = 2e-3
+    """Highest learning rate of the one-cycle schedule."""
+    validation_mazes: int = 8
+    """Mazes of the validation split that each epoch is measured on."""
+    calibration_mazes: int = 64
+    """Mazes that no network has seen, on which the output is calibrated."""
+    workers: int = 1
+    """Processes that simulate for each one that trains."""
+    seed: int = 0
+    """Seed of the initial weights."""
+    out: Path = runs.ROOT / "runs"
+    """Folder that gets WORLD/deepvo.safetensors."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of checkpoints and logs."""
+
+
+class StretchStream(PairStream):
+    """Batches of stretches of consecutive frames, of the mazes and frames of ``PairStream``; every second is mirrored.
+
+    A batch holds ``images`` ``(batch, steps + 1, height, width, channels)`` and ``relative`` ``(batch, steps, 3)``.
+    """
+
+    def __init__(
+        self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int, steps: int, share: Share = ALL
+    ) -> None:
+        if not 1 <= steps < self.FRAMES:
+            raise ValueError(f"steps is {steps}; expected 1 to {self.FRAMES - 1}, the steps in a maze")
+        super().__init__(world, seeds, epoch, datapoints, batch_size, share)
+        self.steps, self.stretches_a_maze = steps, (self.FRAMES - 1) // steps
+
+    @property
+    def batches_a_group(self) -> int:
+        return streams._GROUP * self.stretches_a_maze // self.batch_size
+
+    def batches(self, episodes: list["Episode"], rng: np.random.Generator) -> Iterator[Batch]:
+        images = [images_of(self.world, episode) for episode in episodes]
+        relative = [relative_poses(episode.poses_xyyaw) for episode in episodes]
+        order = rng.permutation(len(episodes) * self.stretches_a_maze)
+        for count in range(self.batches_a_group):
+            chosen = order[count * self.batch_size : (count + 1) * self.batch_size]
+            cuts = [(k // self.stretches_a_maze, k % self.stretches_a_maze * self.steps) for k in chosen.tolist()]
+            batch = {
+                "images": torch.stack([images[maze][first : first + self.steps + 1] for maze, first in cuts]),
+                "relative": torch.stack([relative[maze][first : first + self.steps] for maze, first in cuts]),
+            }
+            yield mirrored(batch) if count % 2 else batch
+
+
+class DeepVOTraining(lightning.LightningModule):
+    """The local network's loss of single steps, over stretches; on the validation split, errors of whole episodes."""
+
+    def __init__(self, arguments: Arguments, network: DeepVO) -> None:
+        super().__init__()
+        self.arguments, self.network = arguments, network
+        self.validation: list[tuple[Tensor, Tensor]] = []
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        relative, _state = self.network(batch["images"])
+        std = self.network.relative_std
+        loss, _likelihood = step_losses(relative, std.log().expand_as(relative), batch["relative"], std)
+        self.log("pose_loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
+        return loss
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        with torch.autocast(self.device.type, enabled=False):
+            self.validation.append((trajectory_steps(self.network, batch["images"]), batch["relative"]))
+
+    def on_validation_epoch_end(self) -> None:
+        relative, truth = (torch.cat(parts) for parts in zip(*self.validation, strict=True))
+        self.validation.clear()
+        metrics = {f"validation_{name}": value for name, value in _metrics(relative, truth).items()}
+        self.log_dict(metrics, prog_bar=True, sync_dist=True)
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-4)
+        return runs.one_cycle(optimizer, self.trainer)
+
+
+class _Data(lightning.LightningDataModule):
+    def __init__(self, arguments: Arguments, world: World) -> None:
+        super().__init__()
+        self.arguments, self.world = arguments, world
+        self.fixed: list[Batch] = []
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        assert self.trainer is not None
+        a = self.arguments
+        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
+        stream = StretchStream(self.world, TRAIN_SEEDS, epoch, a.datapoints, a.batch_size, a.steps, share)
+        return loader(stream, a.workers)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
+
+    def validation(self) -> list[Batch]:
+        """Whole episodes of the validation split, made when they are first needed."""
+        if not self.fixed:
+            for episode in simulate(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]), 1000):
+                images, relative = images_of(self.world, episode), relative_poses(episode.poses_xyyaw)
+                self.fixed.append({"images": images, "relative": relative})
+        return self.fixed
+
+
+def _metrics(relative: Tensor, truth: Tensor) -> dict[str, float]:
+    found = step_metrics(relative, torch.zeros_like(relative), truth)
+    return {name: found[name] for name in ("rmse_m", "rmse_deg", "bias_forward_m", "bias_deg")}
+
+
+def calibrated(network: DeepVO, world: World, seeds: list[int]) -> DeepVOConfig:
+    """The configuration with the bias and gain of each component that fit whole episodes of ``seeds`` best."""
+    episodes = [
+        (trajectory_steps(network, images_of(world, episode)).numpy(), seen_from_first(episode.poses_xyyaw)[1:])
+        for episode in simulate(world, seeds, 1000)
+    ]
+    relative, truth = (np.stack(part) for part in zip(*episodes, strict=True))
+    fit = fit_calibration(relative, truth)
+    mean, std = network.config.relative_mean, network.config.relative_std
+    # What was not learned at all may fit best mirrored; a deviation stays positive.
+    gain = [max(one, 0.01) for one in fit["odometry_gain"]]
+    bias = (se2.g2r(torch.from_numpy(truth)).numpy() - gain * relative).mean(axis=(0, 1))
+    x, y, yaw = (float(g * m + b) for g, m, b in zip(gain, mean, bias, strict=True))
+    std_x, std_y, std_yaw = (g * s for g, s in zip(gain, std, strict=True))
+    return dataclasses.replace(network.config, relative_mean=(x, y, yaw), relative_std=(std_x, std_y, std_yaw))
+
+
+def main(arguments: Arguments) -> dict[str, float]:
+    """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
+    world = world_named(arguments.world)
+    folder = arguments.runs / world.name / DEEPVO
+    run = runs.Run(
+        folder,
+        "train_deepvo",
+        arguments,
+        arguments.epochs,
+        arguments.seed,
+        datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
+    )
+    some = torch.cat([pairs["relative"] for pairs in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
+    config = DeepVOConfig(
+        world.image,
+        arguments.width,
+        relative_mean=(float(some[:, 0].mean()), 0.0, 0.0),
+        relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
+        symmetric=world.mirrors,
+    )
+    training = DeepVOTraining(arguments, DeepVO(config))
+    data = _Data(arguments, world)
+    run.fit(training, data)
+    if not run.is_first:
+        return {}
+    network = training.cpu().network.eval()
+    unseen = list(OPTIMIZER_TRAIN_SEEDS[-arguments.calibration_mazes :])
+    final = DeepVO(calibrated(network, world, unseen)).eval()
+    final.load_state_dict(network.state_dict())
+    parts = [(trajectory_steps(final, batch["images"]), batch["relative"]) for batch in data.validation()]
+    metrics = _metrics(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
+    save_checkpoint(arguments.out / world.name / f"{DEEPVO}.safetensors", final, DEEPVO, world.name, details)
+    print("validation", {name: round(value, 5) for name, value in metrics.items()})
+    return metrics
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))
