@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from ngo_estimator.images import ImageFormat
+from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.scan_registration import RegistrationConfig
 
 MIRRORED_ACTIONS = (0, 2, 1)
@@ -20,6 +21,10 @@ class Domain:
     registered, where they are scans with ranges good enough for it. ``reverses`` says that the robot may
     drive backwards. With ``twist`` the networks are told the velocity of each step, which they divide by
     ``twist_scale`` (m/s, m/s, rad/s). ``mirrors`` says that a frame seen in a mirror is a frame that could be.
+
+    What an optimizer here begins with: ``robust`` says whether the loops' gates start from a robust kernel or from
+    nothing, ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart`` meta-poses from each other and
+    ``max_loops`` of a trajectory, and it is trained for ``optimizer_epochs``.
     """
 
     name: str
@@ -36,6 +41,11 @@ class Domain:
     twist: bool = False
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     mirrors: bool = True
+    robust: bool = True
+    loops_per_pose: int = LoopSearch.per_pose
+    max_loops: int = LoopSearch.most
+    loops_apart: int = LoopSearch.min_apart
+    optimizer_epochs: int = 6
 
     @property
     def validation_stores(self) -> tuple[str, ...]:

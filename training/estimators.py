@@ -106,7 +106,7 @@ def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
 
 def calibration_of(sources: Sources) -> dict[str, tuple[float, float, float]]:
     """Constant gain and bias of each component of a step, least squares over the validation mazes of all tables."""
-    stores = [open_store(sources.store_folder("validation", table)) for table in sources.world.tables]
+    stores = [open_store(sources.store_folder("validation", table)) for table in sources.world.unseen_tables]
     relative, truth = (np.concatenate([store[name] for store in stores]) for name in ("relative", "truth"))
     return fit_calibration(relative, truth)
 

@@ -36,7 +36,7 @@ from training.metrics import seen_from_first
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import known_to, told, windows
 from training.recorded_tracks import Part, Track
-from training.streams import Batch, images_of, mirrored, simulate
+from training.streams import Batch, episodes_in, images_of, mirrored
 from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, MazeSize, World, WorldName, world_named
 
 if TYPE_CHECKING:
@@ -144,10 +144,40 @@ def readings_of(world: World, compass: Compass, episode: Episode) -> dict[str, n
     return {"compass": readings.numpy(), "compass_log_scale": log_scale.numpy()}
 
 
-def _groups(seeds: list[int], part: int, parts: int) -> Iterator[tuple[int, list[int]]]:
-    for number, first in enumerate(range(0, len(seeds), _GROUP)):
-        if number % parts == part:
-            yield first, seeds[first : first + _GROUP]
+class Driven(NamedTuple):
+    """Trajectories of a feature store: the seed of each one's maze and that of its episode, and how they are driven."""
+
+    mazes: list[int]
+    seeds: list[int]
+    size: MazeSize
+    driver: str
+
+    def episodes(self, world: World, first: int) -> Iterator[Episode]:
+        """Those of the group that begins with ``first``, of the world's number of steps."""
+        group = slice(first, first + _GROUP)
+        frames = world.episode_frames + 1
+        return episodes_in(world, self.mazes[group], self.seeds[group], frames, self.size, self.driver)
+
+
+def driven_in_table(world: World, table: str, split: str, count: int) -> Driven:
+    """The first ``count`` trajectories of a table of results."""
+    mazes, seeds = (list(of(table, split)[:count]) for of in (world.table_mazes, world.table_seeds))
+    return Driven(mazes, seeds, world.tables[table].size, world.table_driver(table))
+
+
+def driven_in(arguments: Arguments, world: World) -> dict[str, Driven]:
+    """The trajectories of each store that is to be made."""
+    seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
+    found = {"train": Driven(seeds, seeds, DRAWN, world.driver)}
+    for split, count in (("validation", arguments.validation_trajectories), ("test", arguments.test_trajectories)):
+        for table in world.tables:
+            found[f"{split}_{table}"] = driven_in_table(world, table, split, count)
+    return found
+
+
+def _groups(count: int, part: int, parts: int) -> list[int]:
+    """The first trajectory of each group that falls to this process."""
+    return list(range(0, count, _GROUP))[part::parts]
 
 
 def main(arguments: Arguments) -> None:
@@ -163,22 +193,18 @@ def main(arguments: Arguments) -> None:
     folder = arguments.weights / world.name
     local, local_description = load_local(folder, world.name)
     place, place_description = load_place(folder, world.name)
-    splits = {"train": (list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories]), DRAWN)}
-    for split, count in (("validation", arguments.validation_trajectories), ("test", arguments.test_trajectories)):
-        for table, size in world.tables.items():
-            splits[f"{split}_{table}"] = (list(world.table_seeds(table, split)[:count]), size)
-    for split, (seeds, size) in splits.items():
-        if not seeds:
+    for split, driven in driven_in(arguments, world).items():
+        if not driven.seeds:
             continue
         store = arguments.out / world.name / "features" / split
         store.mkdir(parents=True, exist_ok=True)
         check_networks(store, local_description, place_description)
         (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
         part = (arguments.part, arguments.parts)
-        _fill(store, "done", world, seeds, size, part, lambda e: features_of(world, e, folder, (local, place)))
+        _fill(store, "done", world, driven, part, lambda e: features_of(world, e, folder, (local, place)))
         if arguments.compass is not None:
             compass, _ = load_compass(arguments.compass / world.name, world.name)
-            _fill(store, "compass_done", world, seeds, size, part, partial(readings_of, world, compass))
+            _fill(store, "compass_done", world, driven, part, partial(readings_of, world, compass))
 
 
 def _main_recorded(arguments: Arguments) -> None:
@@ -208,8 +234,7 @@ def _fill(
     store: Path,
     name: str,
     world: World,
-    seeds: list[int],
-    size: MazeSize,
+    driven: Driven,
     part: tuple[int, int],
     arrays_of: Callable[[Episode], dict[str, np.ndarray]],
 ) -> None:
@@ -217,13 +242,12 @@ def _fill(
     progress = store / f"{name}.{part[0]}of{part[1]}.json"
     mine = set(json.loads(progress.read_text())) if progress.exists() else set()
     done = mine | _done(store, name)
-    groups = list(_groups(seeds, *part))
-    for first, group in tqdm(groups, desc=f"{world.name} {store.name}"):
+    for first in tqdm(_groups(len(driven.seeds), *part), desc=f"{world.name} {store.name}"):
         if first in done:
             continue
-        for offset, episode in enumerate(simulate(world, group, world.episode_frames + 1, size)):
+        for offset, episode in enumerate(driven.episodes(world, first)):
             for key, value in arrays_of(episode).items():
-                _array(store / f"{key}.npy", (len(seeds), *value.shape), value.dtype)[first + offset] = value
+                _array(store / f"{key}.npy", (len(driven.seeds), *value.shape), value.dtype)[first + offset] = value
         mine.add(first)
         progress.write_text(json.dumps(sorted(mine)))
 

@@ -11,11 +11,12 @@ from training.worlds import World
 
 def maze_and_start(world: World, table: str, split: str, index: int) -> tuple[Maze, np.ndarray]:
     """The maze of a trajectory of a table's feature store, and its first pose ``(3,)`` in the maze."""
-    seeds = world.table_seeds(table, split)
-    first = seeds[index // featurise._GROUP * featurise._GROUP]
-    env = world.make_random(np.random.default_rng(first), world.tables[table])
+    mazes, seeds = world.table_mazes(table, split), world.table_seeds(table, split)
+    first = mazes[index // featurise._GROUP * featurise._GROUP]
+    env = world.make_random(np.random.default_rng(first), world.tables[table].size)
+    options = {} if mazes[index] == seeds[index] else {"maze_seed": mazes[index]}
     try:
-        _, info = env.reset(seed=seeds[index])
+        _, info = env.reset(seed=seeds[index], options=options)
         unwrapped: object = env.unwrapped
         return unwrapped.maze, np.array(info["pose_xyyaw"])  # type: ignore[attr-defined]
     finally:

@@ -6,7 +6,7 @@ the data that an unbroken one would have met.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,14 +30,24 @@ _GROUP = 8
 
 def simulate(world: World, seeds: list[int], frames: int, size: MazeSize = DRAWN) -> Iterator[Episode]:
     """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one size; what is drawn depends on the first."""
+    return episodes_in(world, seeds, seeds, frames, size, world.driver)
+
+
+def episodes_in(
+    world: World, mazes: Sequence[int], seeds: Sequence[int], frames: int, size: MazeSize, driver: str
+) -> Iterator[Episode]:
+    """Episodes of ``frames`` frames, in the maze of each of ``mazes`` with start, noise and driver of one of ``seeds``.
+
+    All mazes are of one size, and what is drawn of it depends on the first.
+    """
     from ngo_sim.episodes import record_episode  # training on recordings does without the simulators
 
-    env = world.make_random(np.random.default_rng(seeds[0]), size)
+    env = world.make_random(np.random.default_rng(mazes[0]), size)
     try:
         if hasattr(env, "preload"):
-            env.preload(seeds)
-        for seed in seeds:
-            yield record_episode(env, world.driver, frames, seed)
+            env.preload(seeds, mazes)
+        for maze, seed in zip(mazes, seeds, strict=True):
+            yield record_episode(env, driver, frames, seed, {} if maze == seed else {"maze_seed": maze})
     finally:
         env.close()
 

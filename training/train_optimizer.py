@@ -8,9 +8,9 @@ of the validation part is replaced by one that closes no loops and leaves the od
 weights written into the estimator's package.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import lightning
 import numpy as np
@@ -52,18 +52,18 @@ class Arguments(runs.TrainerArguments):
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
     iterations: int = 5
     """Attend-optimise iterations."""
-    robust: bool = True
-    """Whether the loops' gates start from a robust kernel, or from nothing."""
+    robust: bool | None = None
+    """Whether the loops' gates start from a robust kernel, or from nothing; by default as suits the world."""
     compass: bool = False
     """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
     width: int = 64
     """Channels of aggregation and optimizer."""
-    loops_per_pose: int = LoopSearch.per_pose
-    """Loop candidates of a meta-pose."""
-    max_loops: int = LoopSearch.most
-    """Loop candidates of a trajectory."""
-    epochs: int = 6
-    """Epochs; the learning rate falls to zero over all of them."""
+    loops_per_pose: int | None = None
+    """Loop candidates of a meta-pose; by default as suits the world."""
+    max_loops: int | None = None
+    """Loop candidates of a trajectory; by default as suits the world."""
+    epochs: int | None = None
+    """Epochs; the learning rate falls to zero over all of them. By default as many as suit the world."""
     steps: int = 40
     """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
     batch_size: int = 8
@@ -177,6 +177,26 @@ class _Data(lightning.LightningDataModule):
         return DataLoader(self.fixed, batch_size=None)  # type: ignore[arg-type]
 
 
+class Choices(NamedTuple):
+    """The arguments that are the domain's unless they are given."""
+
+    robust: bool
+    loops_per_pose: int
+    max_loops: int
+    epochs: int
+
+
+def choices(arguments: Arguments, domain: Domain) -> Choices:
+    """What is trained for how long: the domain's choices, but for those that are given."""
+    given = arguments
+    return Choices(
+        domain.robust if given.robust is None else given.robust,
+        domain.loops_per_pose if given.loops_per_pose is None else given.loops_per_pose,
+        domain.max_loops if given.max_loops is None else given.max_loops,
+        domain.optimizer_epochs if given.epochs is None else given.epochs,
+    )
+
+
 def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, float]) -> NeuralGraphOptimizerConfig:
     """What the optimizer is made of; ``scale`` is the typical error of the odometry over a meta-pose."""
     local, _ = load_local(arguments.weights / domain.name, domain.name)
@@ -186,9 +206,11 @@ def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, f
     changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale}
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
+    chosen = choices(arguments, domain)
     search = LoopSearch(
-        per_pose=arguments.loops_per_pose,
-        most=arguments.max_loops,
+        per_pose=chosen.loops_per_pose,
+        most=chosen.max_loops,
+        min_apart=domain.loops_apart,
         views=domain.loop_views,
         # Every iteration also measures once more.
         registrations=0 if domain.registration is None else arguments.iterations,
@@ -197,7 +219,7 @@ def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, f
         aggregation=aggregation,
         search=search,
         network=arguments.form == "loops",
-        robust=arguments.robust,
+        robust=chosen.robust,
         compass=arguments.compass,
         **changes,
     )
@@ -207,6 +229,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
+    chosen = choices(arguments, domain)
+    arguments = replace(arguments, **chosen._asdict())  # a run's record says what was trained
     folder = arguments.weights / domain.name
     _, local_description = load_local(folder, domain.name)
     place, place_description = load_place(folder, domain.name)
@@ -231,7 +255,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.runs / domain.name / f"optimizer-{form}-{arguments.iterations}-seed{arguments.seed}",
         "train_optimizer",
         arguments,
-        arguments.epochs,
+        chosen.epochs,
         arguments.seed,
         best=None if recorded is None else "corrected_m",
         data=None if recorded is None else recorded.sha256,

@@ -220,7 +220,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     torch.set_num_threads(1)
     world = world_named(arguments.world)
     features, with_compass = arguments.runs / world.name / "features", arguments.form == "compass"
-    stores = [open_store(features / f"validation_{table}", with_compass) for table in world.tables]
+    stores = [open_store(features / f"validation_{table}", with_compass) for table in world.unseen_tables]
     arrays = {
         name: np.concatenate([store[name][: arguments.trajectories or None] for store in stores])
         for name in ("relative", "log_std", "codes", "origin_code", "truth", *(_COMPASS if with_compass else ()))

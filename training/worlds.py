@@ -29,6 +29,7 @@ OPTIMIZER_TRAIN_SEEDS = range(2_000_000_000, 2**32)
 
 _SPLIT_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 _TABLE_SEEDS = 200
+_STRETCHES = 2  # of so many seeds in the second half of a split
 
 
 @dataclass(frozen=True)
@@ -42,24 +43,51 @@ class MazeSize:
 DRAWN = MazeSize()
 
 
+@dataclass(frozen=True)
+class Table:
+    """Which trajectories a table of results is about.
+
+    ``stretch`` counts the stretches of 200 seeds in the split: tables of one stretch have the same mazes and starts.
+    With ``seen`` the mazes and their looks are those that the local network was trained in, and only starts, noise and
+    what the driver does are of the split. ``driver`` None is the world's.
+    """
+
+    size: MazeSize = DRAWN
+    stretch: int = 0
+    seen: bool = False
+    driver: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.stretch < _STRETCHES:
+            raise ValueError(f"stretch is {self.stretch}; expected 0 to {_STRETCHES - 1}")
+        if self.seen and self.size != DRAWN:
+            raise ValueError(f"size is {self.size} of mazes that were seen; expected none, as they were drawn")
+
+
 @dataclass(frozen=True, kw_only=True)
 class World(Domain):
     """A simulated world.
 
     ``block_m`` is the corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and
     ``extra_openings`` the ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of
-    mazes that results are given for. No driver here drives backwards, whether the world ``reverses`` or not.
+    trajectories that results are given for; those of the first stretch of seeds with the world's driver are in mazes
+    that nothing was trained in. No driver here drives backwards, whether the world ``reverses`` or not.
     """
 
     driver: str
     episode_frames: int
     rows: tuple[int, int]
     extra_openings: tuple[int, int]
-    tables: dict[str, MazeSize]
+    tables: dict[str, Table]
+
+    @property
+    def unseen_tables(self) -> tuple[str, ...]:
+        """The tables with the world's driver in mazes that nothing was trained in: designs are chosen on these."""
+        return tuple(name for name, table in self.tables.items() if not table.seen and table.driver is None)
 
     @property
     def validation_stores(self) -> tuple[str, ...]:
-        return tuple(f"validation_{table}" for table in self.tables)
+        return tuple(f"validation_{table}" for table in self.unseen_tables)
 
     def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size, by default the simulator's own size."""
@@ -79,15 +107,30 @@ class World(Domain):
         return Maze3D(Maze3DConfig(**changes))
 
     def table_seeds(self, table: str, split: str) -> range:
-        """Maze seeds of a table in the ``validation`` or ``test`` split: a stretch of its own for each table."""
+        """Seeds of a table's episodes in the ``validation`` or ``test`` split."""
         if table not in self.tables or split not in _SPLIT_SEEDS:
             raise ValueError(
                 f"table, split are {table!r}, {split!r}; expected one of {', '.join(self.tables)} and one of "
                 f"{', '.join(_SPLIT_SEEDS)}"
             )
         seeds = _SPLIT_SEEDS[split]
-        first = len(seeds) // 2 + _TABLE_SEEDS * list(self.tables).index(table)
+        first = len(seeds) // 2 + _TABLE_SEEDS * self.tables[table].stretch
         return seeds[first : first + _TABLE_SEEDS]
+
+    def table_mazes(self, table: str, split: str) -> range:
+        """Maze seeds of a table, one for each of its ``table_seeds`` and the same where its mazes were not seen.
+
+        Mazes that were seen are the first ones of the local network's first epoch, other ones for each split.
+        """
+        seeds = self.table_seeds(table, split)
+        if not self.tables[table].seen:
+            return seeds
+        first = len(seeds) * list(_SPLIT_SEEDS).index(split)
+        return TRAIN_SEEDS[first : first + len(seeds)]
+
+    def table_driver(self, table: str) -> str:
+        """The name of the driver of a table's trajectories."""
+        return self.tables[table].driver or self.driver
 
     def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of ``size``, a random size and number of openings where that has None."""
@@ -114,7 +157,7 @@ WORLDS = {
         loop_views=5,
         # Ranges are exact but for their storage as float16.
         registration=RegistrationConfig(rays=241, field_of_view_deg=300.0, noise_m=0.001),
-        tables={"perfect": MazeSize(7, 0), "cycles": MazeSize(7, 8)},
+        tables={"perfect": Table(MazeSize(7, 0)), "cycles": Table(MazeSize(7, 8), stretch=1)},
     ),
     "maze3d": World(
         name="maze3d",
@@ -129,7 +172,16 @@ WORLDS = {
         heading_limit_rad=np.radians(35.0),
         # Four frames on, at 0.24 m a frame, most pairs are out of the range that the pair head knows.
         loop_views=1,
-        tables={"unseen": MazeSize()},
+        # With the kernel of the 2D world, which allows for drift at first, loops close worse here (docs/results.md).
+        robust=False,
+        loops_per_pose=2,
+        max_loops=96,
+        loops_apart=0,
+        optimizer_epochs=20,
+        tables={
+            "seen": Table(stretch=1, seen=True),
+            "unseen": Table(),
+        },
     ),
     # The 2D world as any 2D lidar sees it; corridors and paces are drawn, so lengths here are those of the middle.
     "scan": World(
@@ -144,7 +196,7 @@ WORLDS = {
         place_radius_m=0.7,
         heading_limit_rad=np.pi,
         loop_views=5,
-        tables={"unseen": MazeSize()},
+        tables={"unseen": Table()},
         reverses=True,
         actions=0,
         mirrored_actions=(),

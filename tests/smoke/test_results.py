@@ -27,7 +27,7 @@ from training import (
 from training.featurise import open_store
 from training.metrics import trajectory_error
 from training.rows import ROWS, Sources, rows_of
-from training.worlds import MazeSize, world_named
+from training.worlds import MazeSize, Table, world_named
 
 STEPS = 160
 PREFIXES = (40, 77, STEPS)
@@ -72,7 +72,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
         patch.setattr(train_compass.CompassStream, "FRAMES", 97)
         for grid in ("GRID", "COMPASS_GRID"):  # one group each, as the unit tests try the rest
             patch.setattr(tune_pose_graph, grid, getattr(tune_pose_graph, grid)[3:4])
-        tables = {"perfect": MazeSize(2, 0), "cycles": MazeSize(2, 1)}
+        tables = {"perfect": Table(MazeSize(2, 0)), "cycles": Table(MazeSize(2, 1), stretch=1)}
         world = dataclasses.replace(worlds.WORLDS["maze2d"], tables=tables)
         patch.setitem(worlds.WORLDS, "maze2d", world)
         yield folder, results.main(arguments(folder), scripts(folder))

@@ -45,7 +45,7 @@ class Room(Maze3D):
     start: tuple[float, float, int] = (12.0, 13.5, 90)
     styles: tuple[MapStyle, ...] = ()
 
-    def _build_world(self, seed: int) -> DoomWorld:
+    def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
         textures = ["MARBGRAY"] * len(FACES)
         if seed < len(FACES):
             textures[seed] = "PANBLUE"
@@ -323,7 +323,7 @@ def test_the_camera_stays_at_its_height_while_walking() -> None:
 
 
 def test_textures_vary_from_face_to_face(shared: Maze3D) -> None:
-    texts = [shared._build_world(seed).text for seed in range(3)]
+    texts = [shared._build_world(seed, seed).text for seed in range(3)]
     for text in texts:
         used = set(re.findall(r'texturemiddle="([^"]+)"', text))
         assert len(used) > 0.7 * len(WALL_TEXTURES)
@@ -412,6 +412,31 @@ def test_preloaded_seeds_need_no_restart() -> None:
     # The preloaded ones are still there.
     env.reset(seed=5), env.reset(seed=7)
     assert env._engine._game is game
+    env.close()
+
+
+@pytest.mark.parametrize("preloaded", [False, True])
+def test_a_maze_of_another_seed_has_its_walls_and_look_and_a_start_of_its_own(preloaded: bool) -> None:
+    env = Maze3D()
+    if preloaded:
+        env.preload([5, 6], [9, 9])
+    starts, noises = [], []
+    _, info = env.reset(seed=9)
+    walls, text = env.maze.walls, env._loaded[9, 9].text
+    starts.append(info["pose_xyyaw"])
+    game = env._engine._game
+    for seed in (5, 6):
+        _, info = env.reset(seed=seed, options={"maze_seed": 9})
+        np.testing.assert_array_equal(env.maze.walls, walls)
+        # The player, who comes before the sector, stands elsewhere; all else is the same.
+        found = env._loaded[seed, 9].text
+        assert found != text and found[found.index("sector") :] == text[text.index("sector") :]
+        starts.append(info["pose_xyyaw"])
+        noises.append(env.step(FORWARD)[1])
+        assert (env._engine._game is game) == preloaded
+    assert len({tuple(start) for start in starts}) == 3
+    _, again = env.reset(seed=5, options={"maze_seed": 9})
+    np.testing.assert_array_equal(again["pose_xyyaw"], starts[1])
     env.close()
 
 
@@ -508,6 +533,8 @@ def test_bad_calls_are_told(shared: Maze3D) -> None:
         Maze3D(render_mode="human")
     with pytest.raises(ValueError, match="seeds is empty"):
         shared.preload([])
+    with pytest.raises(ValueError, match="maze_seeds has 1 seeds; it must have 2"):
+        shared.preload([1, 2], [3])
     with pytest.raises(RuntimeError, match="before reset"):
         Maze3D().step(FORWARD)
 

@@ -136,7 +136,7 @@ def test_joined_words() -> None:
 def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
     seeds = WORLD.table_seeds("cycles", "validation")
     first = index // _GROUP * _GROUP
-    episodes = list(simulate(WORLD, list(seeds[first : index + 1]), 60, WORLD.tables["cycles"]))
+    episodes = list(simulate(WORLD, list(seeds[first : index + 1]), 60, WORLD.tables["cycles"].size))
     episode = episodes[index - first]
     maze, start = maze_and_start(WORLD, "cycles", "validation", index)
     np.testing.assert_array_equal(maze.walls, episode.maze.walls)

@@ -1,11 +1,15 @@
 """The worlds as data: seed ranges that never meet, and environments that look like what the networks take."""
 
+import dataclasses
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 
+from training.featurise import _GROUP, driven_in_table
 from training.streams import PairStream, PlaceStream, simulate
+from training.train_local import Arguments
 from training.worlds import (
     DEMO_SEEDS,
     OPTIMIZER_TRAIN_SEEDS,
@@ -13,6 +17,8 @@ from training.worlds import (
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
     WORLDS,
+    MazeSize,
+    Table,
     World,
     world_named,
 )
@@ -69,25 +75,62 @@ def test_make_without_a_size_is_the_simulators_own() -> None:
     assert WORLDS["maze2d"].make(4, 1).unwrapped.config == Maze2DConfig(rows=4, cols=4, extra_openings=1)  # type: ignore[attr-defined]
 
 
+SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+
+
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
-def test_each_table_has_mazes_of_its_own_in_its_split(world: World) -> None:
-    stretches = [world.table_seeds(table, split) for split in ("validation", "test") for table in world.tables]
-    assert all(len(seeds) >= 100 for seeds in stretches)
-    for a, b in itertools.combinations(stretches, 2):
-        assert not set(a) & set(b)
-    for table in world.tables:
-        assert set(world.table_seeds(table, "test")) <= set(TEST_SEEDS)
-        assert set(world.table_seeds(table, "validation")) <= set(VALIDATION_SEEDS)
-    # The first mazes of the validation split are those that the networks are measured on while they train.
-    assert min(min(seeds) for seeds in stretches[: len(world.tables)]) >= VALIDATION_SEEDS[0] + 100
+def test_each_table_has_episodes_and_mazes_of_its_own_in_its_split(world: World) -> None:
+    own = [table for table in world.tables if world.tables[table].driver is None]
+    for of in (world.table_seeds, world.table_mazes):
+        stretches = [of(table, split) for split in SPLITS for table in own]
+        assert all(len(seeds) >= 100 for seeds in stretches)
+        for a, b in itertools.combinations(stretches, 2):
+            assert not set(a) & set(b)
+    for (split, seeds), table in itertools.product(SPLITS.items(), world.tables):
+        assert set(world.table_seeds(table, split)) <= set(seeds)
+        # The first mazes of a split are those that the networks are measured on while they train.
+        assert min(world.table_seeds(table, split)) >= seeds[0] + 100
     with pytest.raises(ValueError, match=r"'nowhere'.*expected one of"):
         world.table_seeds("nowhere", "test")
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_seen_mazes_are_those_of_the_local_network_and_unseen_ones_of_no_training(split: str) -> None:
+    world, local = WORLDS["maze3d"], Arguments(world="maze3d")
+    trained = PairStream(world, TRAIN_SEEDS, 0, local.datapoints, local.batch_size)
+    in_training = {seed for group in trained.groups for seed in group}
+    seen, unseen = world.table_mazes("seen", split), world.table_mazes("unseen", split)
+    assert set(seen) <= in_training
+    # Groups of mazes are of one size, which the first of them decides: here as there.
+    assert list(seen[:_GROUP]) in trained.groups
+    assert not set(unseen) & {*TRAIN_SEEDS[:100_000]} and max(unseen) < TRAIN_SEEDS[0]
+    assert not set(world.table_seeds("seen", split)) & set(world.table_seeds("unseen", split))
+
+
+def test_an_episode_in_a_seen_maze_has_the_walls_of_training_and_another_start_and_drive() -> None:
+    world = WORLDS["maze3d"]
+    driven = driven_in_table(world, "seen", "validation", 2)
+    seen = list(driven.episodes(dataclasses.replace(world, episode_frames=30), 0))
+    trained = list(simulate(world, driven.mazes, 31))
+    for now, then in zip(seen, trained, strict=True):
+        np.testing.assert_array_equal(now.maze.walls, then.maze.walls)
+        assert not np.array_equal(now.poses_xyyaw[0], then.poses_xyyaw[0])
+        assert not np.array_equal(now.actions, then.actions)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"stretch": 2}, "stretch is 2; expected 0 to 1"), ({"size": MazeSize(4), "seen": True}, "as they were drawn")],
+)
+def test_a_table_that_cannot_be_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Table(**change)
 
 
 def test_tables_say_what_their_mazes_are() -> None:
     world = WORLDS["maze2d"]
     for table, openings in (("perfect", 0), ("cycles", 8)):
-        env = world.make_random(np.random.default_rng(0), world.tables[table])
+        env = world.make_random(np.random.default_rng(0), world.tables[table].size)
         config = env.unwrapped.config  # type: ignore[attr-defined]
         assert (config.rows, config.cols, config.extra_openings) == (7, 7, openings)
         env.close()

@@ -29,15 +29,18 @@ class Episode:
     maze: Maze | None
 
 
-def record_episode(env: gymnasium.Env[Any, Any], driver_name: str, frames: int, seed: int) -> Episode:
+def record_episode(
+    env: gymnasium.Env[Any, Any], driver_name: str, frames: int, seed: int, options: dict[str, Any] | None = None
+) -> Episode:
     """Record `frames` (at least 1) of a Maze2D or Maze3D; world, noise and driver are functions of seed.
 
-    driver_name is one of driver_choice.DRIVER_NAMES; ValueError where the world does not suit it.
+    driver_name is one of driver_choice.DRIVER_NAMES; ValueError where the world does not suit it. options are those of
+    the environment's reset.
     """
     if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 1:
         raise ValueError(f"frames is {frames!r}; it must be an integer of at least 1")
     world: Any = env.unwrapped
-    observation, info = env.reset(seed=seed)
+    observation, info = env.reset(seed=seed, options=options or None)
     driver = make_driver(driver_name, world.maze, driver_generator(seed))
     observations = np.empty((frames, *observation.shape), dtype=observation.dtype)
     actions = np.empty(frames - 1, dtype=np.uint8)

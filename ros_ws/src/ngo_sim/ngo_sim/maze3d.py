@@ -78,6 +78,9 @@ class Maze3DConfig:
         return horizontal, horizontal * _PIXEL_STRETCH
 
 
+_Seeds = tuple[int, int]  # of the episode and of its maze
+
+
 @dataclass(frozen=True, eq=False)
 class DoomWorld:
     """A maze and its UDMF text, which adds textures and the start."""
@@ -95,7 +98,8 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     counter-clockwise) at the very tic that the picture shows, and "time_s" since the reset.
 
     reset(seed=s) makes maze, textures, start and noise functions of s and the config, to the byte, preloaded
-    or not. A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
+    or not. Option "maze_seed" of reset takes maze and textures of another seed; start and noise remain those of
+    s. A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
     door opens to who walks against it. Raises ValueError for a map that is not there.
 
     The engine is a process with files of its own, which end with close(), with the environment or
@@ -118,8 +122,8 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         size = self.config.width, self.config.height
         self._engine = DoomEngine(*size, self.config.field_of_view_deg, self.config.frame_skip)
         weakref.finalize(self, self._engine.close)
-        self._preloaded: dict[int, DoomWorld] = {}
-        self._loaded: dict[int, DoomWorld] = {}
+        self._preloaded: dict[_Seeds, DoomWorld] = {}
+        self._loaded: dict[_Seeds, DoomWorld] = {}
         self._picture: NDArray[np.uint8] | None = None
         self._pose_xyyaw = np.zeros(3)
         self._turn_rate_deg = 0.0  # a step
@@ -131,15 +135,20 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         """Who drives where nobody is named."""
         return "random_goals" if self._level is None else "explorer"
 
-    def preload(self, seeds: Iterable[int]) -> None:
+    def preload(self, seeds: Iterable[int], maze_seeds: Iterable[int] | None = None) -> None:
         """Write the maps of these seeds, instead of those preloaded before, into one WAD.
 
-        A reset to one of them then costs milliseconds, to any other seed a restart of the engine (0.2 s). A Doom map
-        is the same for every seed, so that nothing is to be done.
+        A reset to one of them then costs milliseconds, to any other seed a restart of the engine (0.2 s).
+        maze_seeds: the option "maze_seed" of each of these resets, where it is given. A Doom map is the same for
+        every seed, so that nothing is to be done.
         """
         if self._level is not None:
             return
-        preloaded = {int(seed): self._build_world(int(seed)) for seed in seeds}
+        seeds = [int(seed) for seed in seeds]
+        mazes = seeds if maze_seeds is None else [int(seed) for seed in maze_seeds]
+        if len(seeds) != len(mazes):
+            raise ValueError(f"maze_seeds has {len(mazes)} seeds; it must have {len(seeds)}, as many as seeds")
+        preloaded = {pair: self._build_world(*pair) for pair in zip(seeds, mazes, strict=True)}
         if not preloaded:
             raise ValueError("seeds is empty; it must have at least one seed")
         self._preloaded = preloaded
@@ -150,20 +159,24 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
         """Stand still at the start of the seed's maze; without a seed, of one drawn by the generator."""
         super().reset(seed=seed)
-        if options:
-            raise ValueError(f"options has {sorted(options)}; this world has none")
+        options = options or {}
+        if unknown := sorted(set(options) - {"maze_seed"}):
+            raise ValueError(f"options has {unknown}; it may have 'maze_seed'")
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         if self._level is not None:
+            if "maze_seed" in options:
+                raise ValueError("options has 'maze_seed'; a Doom map has no maze of a seed")
             if not self._engine.running:
                 self._engine.start(self._level.lumps, self._level.name, self._level.game_wad, harmless=True)
             map_name = self._level.name
         else:
-            if not self._engine.running or seed not in self._loaded:
-                wanted = {} if seed in self._preloaded else {seed: self._build_world(seed)}
+            seeds = (seed, int(options.get("maze_seed", seed)))
+            if not self._engine.running or seeds not in self._loaded:
+                wanted = {} if seeds in self._preloaded else {seeds: self._build_world(*seeds)}
                 self._load({**self._preloaded, **wanted})
-            self.maze = self._loaded[seed].maze
-            map_name = _map_name(list(self._loaded).index(seed))
+            self.maze = self._loaded[seeds].maze
+            map_name = _map_name(list(self._loaded).index(seeds))
         self._noise_rng = _generator(seed, stream=2)
         self._turn_rate_deg, self._steps_walled_in, self._frame = 0.0, 0, 0
         self._picture, self._pose_xyyaw = self._engine.enter(map_name)
@@ -201,16 +214,17 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         """End the engine and delete its files; another reset starts it again."""
         self._engine.close()
 
-    def _build_world(self, seed: int) -> DoomWorld:
+    def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
         config = self.config
-        maze_rng, rng = _generator(seed, stream=0), _generator(seed, stream=1)
+        maze_rng, rng = _generator(maze_seed, stream=0), _generator(maze_seed, stream=1)
         maze = kruskal_maze(config.rows, config.cols, maze_rng, config.extra_openings, config.block_m)
         style = random_style(len(wall_faces(maze.walls)), rng, config.light_level)
+        rng = rng if seed == maze_seed else _generator(seed, stream=4)
         start_x, start_y = maze.block_center(rng.choice(maze.free_blocks()))
         start_heading_deg = int(rng.integers(360))
         return DoomWorld(maze, textmap(maze, style, (float(start_x), float(start_y)), start_heading_deg))
 
-    def _load(self, worlds: dict[int, DoomWorld]) -> None:
+    def _load(self, worlds: dict[_Seeds, DoomWorld]) -> None:
         texts = [world.text for world in worlds.values()]
         self._engine.start(map_lumps((_map_name(index), text) for index, text in enumerate(texts)), _map_name(0))
         self._loaded = worlds
@@ -230,7 +244,10 @@ def mean_2x2(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _generator(seed: int, stream: int) -> np.random.Generator:
-    """Return one of the independent generators of a seed: 0 maze, 1 textures and start, 2 actuation noise."""
+    """Return one of the independent generators of a seed.
+
+    0: maze, 1: textures and start, 2: actuation noise, 4: start in the maze of another seed (3 is the driver's).
+    """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
 
 
