@@ -2,12 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from ngo_estimator import se2
+from ngo_estimator.trajectory_errors import SegmentErrors, segment_errors
+from ngo_estimator.trajectory_file import SpatialPoses
 from training.worlds import World
+
+
+SEGMENTS_M = (5.0, 10.0, 20.0, 40.0)
+"""Lengths of KITTI's segments that fit 3D mazes, which are 27 to 39 m wide: less than two blocks, to a whole side."""
 
 
 @dataclass(frozen=True)
@@ -15,12 +22,23 @@ class Errors:
     """Errors of estimated trajectories whose first pose is the truth's, without any other alignment.
 
     ``position_m`` and ``heading_rad`` ``(trajectories, frames)``, the first frame, where they vanish, included;
-    ``path_m`` ``(trajectories,)``, the length of the path that was driven.
+    ``path_m`` ``(trajectories,)``, the length of the path that was driven; ``estimate`` and ``truth`` ``(trajectories,
+    frames, 3)``, the poses themselves.
     """
 
     position_m: np.ndarray
     heading_rad: np.ndarray
     path_m: np.ndarray
+    estimate: np.ndarray
+    truth: np.ndarray
+
+    @cached_property
+    def segments(self) -> list[SegmentErrors]:
+        """The segment errors of KITTI of each trajectory, at ``SEGMENTS_M``."""
+        return [
+            segment_errors(_spatial(estimate), _spatial(truth), SEGMENTS_M)
+            for estimate, truth in zip(self.estimate, self.truth, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -71,6 +89,18 @@ METRICS: dict[str, tuple[Metric, ...]] = {
             lambda errors, _: np.degrees(errors.heading_rad[:, -1]) / errors.path_m,
         ),
         Metric("position_rmse_m", "Position RMSE", "m", _position_rmse_m),
+        Metric(
+            "segment_translation_percent",
+            "Segment error",
+            "%",
+            lambda errors, _: np.array([found.translation_percent for found in errors.segments]),
+        ),
+        Metric(
+            "segment_rotation_deg_per_m",
+            "Segment heading error",
+            "deg/m",
+            lambda errors, _: np.array([found.rotation_deg_per_m for found in errors.segments]),
+        ),
     ),
 }
 """The metrics of each world; the first is the one that comparisons and figures are about."""
@@ -87,14 +117,20 @@ def errors_of(estimate: np.ndarray, truth: np.ndarray) -> Errors:
         raise ValueError(
             f"trajectories are {estimate.shape} and {truth.shape}; expected two of the same (trajectories, steps, 3)"
         )
-    with_origin = np.concatenate((np.zeros_like(truth[:, :1]), truth), axis=1)
-    path_m = np.linalg.norm(np.diff(with_origin[..., :2], axis=1), axis=2).sum(axis=1)
+    from_origin = [np.concatenate((np.zeros_like(poses[:, :1]), poses), axis=1) for poses in (estimate, truth)]
+    path_m = np.linalg.norm(np.diff(from_origin[1][..., :2], axis=1), axis=2).sum(axis=1)
     if path_m.min() <= 0.0:
         raise ValueError("a true path has no length; expected ones that move")
     turn = se2.wrap(torch.from_numpy(np.asarray(estimate[..., 2] - truth[..., 2], dtype=np.float64))).numpy()
     first = np.zeros((len(truth), 1))
     distance = np.linalg.norm(estimate[..., :2] - truth[..., :2], axis=2)
-    return Errors(np.concatenate((first, distance), axis=1), np.concatenate((first, np.abs(turn)), axis=1), path_m)
+    position, heading = (np.concatenate((first, error), axis=1) for error in (distance, np.abs(turn)))
+    return Errors(position, heading, path_m, *from_origin)
+
+
+def _spatial(poses: np.ndarray) -> SpatialPoses:
+    """Poses ``(frames, 3)`` in the plane as poses in space; segments do not ask for their stamps."""
+    return SpatialPoses.from_planar(np.arange(len(poses), dtype=np.int64), np.asarray(poses, dtype=np.float64))
 
 
 def scores(estimate: np.ndarray, truth: np.ndarray, world: World) -> dict[str, np.ndarray]:

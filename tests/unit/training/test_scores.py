@@ -35,14 +35,36 @@ def test_many_trajectories_score_as_single_ones() -> None:
 
 def test_the_metrics_of_the_3d_world() -> None:
     truth = np.zeros((1, 2, 3))
-    truth[0, :, 0] = [2.0, 4.0]
+    truth[0, :, 0] = [2.0, 8.0]
     estimate = truth.copy()
     estimate[0, :, 1] = [0.3, 0.4]
     estimate[0, :, 2] = [0.0, -np.radians(8.0)]
     found = scores(estimate, truth, world_named("maze3d"))
-    assert found["translation_percent"] == pytest.approx([10.0])
-    assert found["rotation_deg_per_m"] == pytest.approx([2.0])
+    assert found["translation_percent"] == pytest.approx([5.0])
+    assert found["rotation_deg_per_m"] == pytest.approx([1.0])
     assert found["position_rmse_m"] == pytest.approx([np.sqrt(0.25 / 3.0)])
+
+
+def test_segment_errors_of_the_3d_world() -> None:
+    """A scale of 1.1 and a turn of 0.1 deg a metre along a straight line, over segments of the lengths that fit."""
+    along = np.arange(0.5, 12.5, 0.5)
+    truth = np.stack((along, np.zeros_like(along), np.zeros_like(along)), axis=-1)[None]
+    estimate = truth * 1.1
+    estimate[..., 2] = np.radians(0.1) * along
+    found = scores(estimate, truth, world_named("maze3d"))
+    # The first frame beyond a length is half a metre farther on; segments start at 0 and 5 m (of 5 m), 0 m (of 10 m).
+    ends = {5.0: 5.5, 10.0: 10.5}
+    turns = [0.1 * ends[5.0] / 5.0] * 2 + [0.1 * ends[10.0] / 10.0]
+    assert found["segment_rotation_deg_per_m"] == pytest.approx([np.mean(turns)])
+    moved = [
+        _shifted(1.1 * ends[m], np.radians(0.1 * start), ends[m]) / m for start, m in ((0, 5.0), (5, 5.0), (0, 10.0))
+    ]
+    assert found["segment_translation_percent"] == pytest.approx([100.0 * np.mean(moved)])
+
+
+def _shifted(length: float, turn: float, true_length: float) -> float:
+    """How far a motion ahead is off that is seen from a pose that is turned."""
+    return float(np.hypot(length * np.cos(turn) - true_length, length * np.sin(turn)))
 
 
 def test_whole_turns_are_no_error() -> None:
