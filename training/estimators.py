@@ -21,7 +21,7 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import loop_factors
 from training.compass_factors import found_fixes
 from training.featurise import open_store
-from training.loop_factors import Seen
+from training.loop_factors import LoopFactors, Seen
 from training.pose_graph import PoseGraphSettings, optimize, optimize_exact
 from training.rows import ROWS, Sources
 from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
@@ -61,7 +61,7 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
     if row not in ROWS:
         raise ValueError(f"row is {row!r}; expected one of {', '.join(ROWS)}")
     kind = ROWS[row]
-    if row == "local":
+    if row == "local" or kind.odometry is not None:
         return [Estimator(local, row)]
     if row == "local_calibrated":
         calibration = calibration_of(sources)
@@ -130,11 +130,16 @@ def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None
 
 
 def optimized_by(
-    optimizer: NeuralGraphOptimizer, pair_head: PairHead, block_m: float, prepared: Prepared | None = None
+    optimizer: NeuralGraphOptimizer,
+    pair_head: PairHead,
+    block_m: float,
+    prepared: Prepared | None = None,
+    known: Callable[[Loops, Tensor, int], Loops] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
     """What ``optimize_offline`` does, for many trajectories at once.
 
     ``block_m`` is the side of a compass's lattice. ``prepared`` is of the same trajectories and the same pair head.
+    ``known`` makes other loops of those that are found, the true poses and the steps in a meta-pose.
     """
 
     def odometry_and_loops(first: int, whole: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], Loops | None]:
@@ -157,6 +162,8 @@ def optimized_by(
             some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
             whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
             odometry, loops = odometry_and_loops(first, whole)
+            if loops is not None and known is not None:
+                loops = known(loops, whole["truth"], optimizer.block)
             fixes = None
             if optimizer.config.compass:
                 reading, scale = (whole[name] for name in COMPASS_ARRAYS)
@@ -169,9 +176,16 @@ def optimized_by(
 
 
 def pose_graph(
-    row: str, settings: PoseGraphSettings, pair_head: PairHead, block_m: float
+    row: str,
+    settings: PoseGraphSettings,
+    pair_head: PairHead,
+    block_m: float,
+    known: Callable[[LoopFactors, np.ndarray], LoopFactors] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """The classical rows: GTSAM with the loops that are found (and a compass), or with those that are known."""
+    """The classical rows: GTSAM with the loops that are found (and a compass), or with those that are known.
+
+    ``known`` makes other loops of those of a trajectory and its true poses.
+    """
 
     def poses(arrays: Arrays) -> np.ndarray:
         whole = prefix(arrays, _whole(arrays["relative"].shape[1], settings.block))
@@ -191,6 +205,8 @@ def pose_graph(
                 ]
             else:
                 loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
+            if known is not None:
+                loops = [known(found, true) for found, true in zip(loops, truth, strict=True)]
             fixes: Sequence[CompassFixes | None] = [None] * len(truth)
             if ROWS[row].compass:
                 reading, scale = (whole[name] for name in COMPASS_ARRAYS)

@@ -13,7 +13,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 _GROUP = 8  # mazes of one size
 _MADE_WITH = "networks.json"
 _COMPASS = ("compass", "compass_log_scale")
+STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
+"""The arrays of a feature store, without those of a compass."""
 _MOST_STEPS = 1000  # of a stretch of a recording
 _BLOCK = PoseAggregationConfig(1).block
 
@@ -201,10 +203,10 @@ def main(arguments: Arguments) -> None:
         check_networks(store, local_description, place_description)
         (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
         part = (arguments.part, arguments.parts)
-        _fill(store, "done", world, driven, part, lambda e: features_of(world, e, folder, (local, place)))
+        fill(store, "done", world, driven, part, lambda e: features_of(world, e, folder, (local, place)))
         if arguments.compass is not None:
             compass, _ = load_compass(arguments.compass / world.name, world.name)
-            _fill(store, "compass_done", world, driven, part, partial(readings_of, world, compass))
+            fill(store, "compass_done", world, driven, part, partial(readings_of, world, compass))
 
 
 def _main_recorded(arguments: Arguments) -> None:
@@ -230,7 +232,7 @@ def _main_recorded(arguments: Arguments) -> None:
         (store / "done.0of1.json").write_text(json.dumps(list(range(0, len(found.cuts), _GROUP))))
 
 
-def _fill(
+def fill(
     store: Path,
     name: str,
     world: World,
@@ -259,9 +261,9 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
         raise runs.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
-def open_store(store: Path, with_compass: bool = False) -> dict[str, np.ndarray]:
+def open_store(store: Path, with_compass: bool = False, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:
     """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
-    names = ["relative", "log_std", "motion", "codes", "origin_code", "truth", *(_COMPASS if with_compass else ())]
+    names = [*stored, *(_COMPASS if with_compass else ())]
     hint = "run `python -m training.featurise` first"
     if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
         raise runs.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")

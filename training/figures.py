@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,20 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from ngo_sim.mazes import draw_maze
 from training import attention_map
+from training.deepvo import DEEPVO
 from training.estimators import Arrays
 from training.maze_views import in_maze, maze_and_start
 from training.measured import Measured
 from training.rows import ROWS, Sources, rows_of
-from training.scores import METRICS, in_sentence
+from training.scores import METRICS, Metric, in_sentence
 from training.trained import learning_curve, run_folder
 
 TRUTH, LOCAL_COLOR, CORRECTED = "#1f6fd6", "#2ca02c", "#ff7f0e"
 COLORS = {
     "local": LOCAL_COLOR,
     "local_calibrated": "#8fce8f",
+    "local_no_action": "#1b5e20",
+    "deepvo": "#0097a7",
     "paper_1": "#c5a3d9",
     "paper_5": "#9467bd",
     "ngo_1": "#ffc38a",
@@ -46,6 +50,7 @@ COLORS = {
 }
 MAIN_ROWS = (
     "local",
+    "deepvo",
     "paper_5",
     "gtsam",
     "oracle",
@@ -85,16 +90,14 @@ def draw_all(
     save(
         "error_by_frames",
         "Error against the number of frames that the estimator had seen; bands are 95 % intervals.",
-        by_prefix(result, metric.key, f"{metric.title}, {metric.unit}", "frames", lambda _, steps: float(steps)),
+        by_prefix(result, _absolute(sources.world.name), "frames", lambda _, steps: float(steps)),
     )
-    percent = next(one for one in METRICS[sources.world.name] if "%" in one.unit)
     save(
         "percent_by_distance",
-        "Error in percent of the distance travelled.",
+        "Error as a ratio to the distance travelled.",
         by_prefix(
             result,
-            percent.key,
-            f"{percent.title}, {percent.unit}",
+            _ratios(sources.world.name),
             "distance travelled, m",
             lambda table, steps: float(result["path_m"][table][str(steps)]),
         ),
@@ -145,29 +148,54 @@ def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], measur
     return figure
 
 
+def _absolute(world: str) -> list[Metric]:
+    """The first metric of a world that is no ratio to the path."""
+    return [next(one for one in METRICS[world] if "%" not in one.unit and "/" not in one.unit)]
+
+
+def _ratios(world: str) -> list[Metric]:
+    """The first metric of a world in percent of the path and, where it has one, that in degrees a metre of it."""
+    percent = next(one for one in METRICS[world] if "%" in one.unit)
+    return [percent, *[one for one in METRICS[world] if "deg/m" in one.unit][:1]]
+
+
 def by_prefix(
-    result: dict[str, Any], metric: str, label: str, across: str, position: Callable[[str, int], float]
+    result: dict[str, Any], metrics: Sequence[Metric], across: str, position: Callable[[str, int], float]
 ) -> Figure:
-    """A metric of the main rows over prefixes, one panel a table; ``position`` places (table, steps) on the x axis."""
+    """Metrics of the main rows over prefixes, one panel a metric and table.
+
+    ``position`` places (table, steps) on the x axis.
+    """
     tables = result["tables"]
     figure, panels = plt.subplots(
-        1, len(tables), figsize=(6.6 * len(tables), 5.4), sharey=True, squeeze=False, layout="constrained"
+        len(metrics),
+        len(tables),
+        figsize=(6.6 * len(tables), 5.4 * len(metrics)),
+        sharey="row",
+        squeeze=False,
+        layout="constrained",
     )
-    for axes, (table, rows) in zip(panels[0], tables.items(), strict=True):
-        for row in (name for name in MAIN_ROWS if name in rows):
-            prefixes = rows[row]["prefixes"]
-            x = [position(table, int(steps)) for steps in prefixes]
-            values = [prefixes[steps][metric] for steps in prefixes]
-            # The paper's form may lie on the odometry, so that only dashes show both.
-            style = "o--" if ROWS[row].form == "paper" else "o-"
-            axes.plot(x, [value["mean"] for value in values], style, color=COLORS[row], label=row, markersize=4)
-            low, high = zip(*(value["ci95"] for value in values), strict=True)
-            axes.fill_between(x, low, high, color=COLORS[row], alpha=0.15, linewidth=0)
-        _log_scale(axes)
-        axes.set(xlabel=across, title=f"{table}: {result['trajectories']} {result['split']} trajectories")
-    panels[0][0].set_ylabel(label)
-    panels[0][-1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    for line, metric in zip(panels, metrics, strict=True):
+        for axes, table in zip(line, tables, strict=True):
+            _over_prefixes(axes, tables[table], metric.key, partial(position, table))
+            title = f"{table}: {result['trajectories']} {result['split']} trajectories"
+            axes.set(xlabel=across, title=title)
+        line[0].set_ylabel(f"{metric.title}, {metric.unit}")
+        line[-1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     return figure
+
+
+def _over_prefixes(axes: Axes, rows: dict[str, Any], metric: str, position: Callable[[int], float]) -> None:
+    for row in (name for name in MAIN_ROWS if name in rows):
+        prefixes = rows[row]["prefixes"]
+        x = [position(int(steps)) for steps in prefixes]
+        values = [prefixes[steps][metric] for steps in prefixes]
+        # The paper's form may lie on the odometry, so that only dashes show both.
+        style = "o--" if ROWS[row].form == "paper" else "o-"
+        axes.plot(x, [value["mean"] for value in values], style, color=COLORS[row], label=row, markersize=4)
+        low, high = zip(*(value["ci95"] for value in values), strict=True)
+        axes.fill_between(x, low, high, color=COLORS[row], alpha=0.15, linewidth=0)
+    _log_scale(axes)
 
 
 def learning_curves(sources: Sources, seeds: int) -> Figure | None:
@@ -179,6 +207,7 @@ def learning_curves(sources: Sources, seeds: int) -> Figure | None:
             learning_curve(folder / "place"),
             {"validation_median_m": "median error of a pair, m", "median_m": "median error of a pair, m"},
         ),
+        "DeepVO": (learning_curve(folder / DEEPVO), {"validation_rmse_deg": "heading RMSE of a step, deg"}),
     }
     optimizers = {
         row: [curve for seed in range(seeds) if (curve := learning_curve(run_folder(sources, row, seed)))]
@@ -208,14 +237,14 @@ def _optimizer_curves(axes: Axes, curves: dict[str, list[dict[str, np.ndarray]]]
             continue
         epochs = min(len(curve["epoch"]) for curve in found)
         values = np.stack([curve["corrected_m"][:epochs] for curve in found])
-        x = found[0]["epoch"][:epochs] + 1
+        x = found[0]["step"][:epochs]
         axes.plot(x, values.mean(axis=0), color=COLORS[row], label=row)
         axes.fill_between(x, values.min(axis=0), values.max(axis=0), color=COLORS[row], alpha=0.2, linewidth=0)
         odometry = float(found[0]["odometry_m"][-1])
     if odometry is not None:
         axes.axhline(odometry, color=LOCAL_COLOR, linestyle=":", label="local")
     _log_scale(axes)
-    axes.set(title="optimizers", ylabel="position RMSE, m", xlabel="epoch")
+    axes.set(title="optimizers", ylabel="position RMSE, m", xlabel="updates")
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
 
 

@@ -16,7 +16,7 @@ from training.estimators import Arrays, Estimator, prefix
 from training.scores import scores
 from training.worlds import World
 
-_MADE_BY = ("compass_factors", "estimators", "loop_factors", "measured", "pose_graph", "scores")
+_MADE_BY = ("compass_factors", "estimators", "limits", "loop_factors", "measured", "pose_graph", "scores")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from training import (
     featurise,
     throughput,
     train_compass,
+    train_deepvo,
     train_end_to_end,
     train_local,
     train_optimizer,
@@ -25,7 +27,9 @@ from training import (
     tune_pose_graph,
 )
 from training.curves import write_at_once
+from training.deepvo import DEEPVO
 from training.featurise import open_store
+from training.own_odometry import make_odometry, open_odometry
 from training.rows import ROWS, Sources, rows_of
 
 
@@ -40,6 +44,7 @@ class Scripts:
     optimizer: train_optimizer.Arguments = field(default_factory=lambda: train_optimizer.Arguments(world="maze2d"))
     pose_graph: tune_pose_graph.Arguments = field(default_factory=lambda: tune_pose_graph.Arguments(world="maze2d"))
     speed: throughput.Arguments = field(default_factory=lambda: throughput.Arguments(world="maze2d"))
+    deepvo: train_deepvo.Arguments = field(default_factory=lambda: train_deepvo.Arguments(world="maze3d"))
     end_to_end: train_end_to_end.Arguments = field(default_factory=lambda: train_end_to_end.Arguments(world="maze2d"))
 
 
@@ -69,6 +74,7 @@ def prepare(sources: Sources, wanted: Wanted, scripts: Scripts) -> None:
         *_settings(sources, scripts),
         *_optimizers(sources, wanted, scripts),
         *_end_to_end(sources, wanted, scripts),
+        *_own_odometry(sources, wanted, scripts),
         Step("a measurement of how fast data is made", sources.speed_file.exists, lambda: _speed(sources, scripts)),
     ):
         if not step.is_there():
@@ -175,6 +181,21 @@ def _end_to_end(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[
         yield from _features(own, wanted, scripts, (wanted.split,))
 
 
+def _own_odometry(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:
+    for row in (name for name in rows_of(sources.world) if ROWS[name].odometry is not None):
+        own, kind = sources.of_row(row, 0), str(ROWS[row].odometry)
+        changes: dict[str, Any] = {"world": sources.world.name, "out": own.weights, "runs": sources.runs}
+        if kind == DEEPVO:
+            yield Step(row, _exists(own, kind), _call(train_deepvo.main, replace(scripts.deepvo, **changes)))
+        else:
+            arguments = replace(scripts.local, without_action=True, **changes)
+            yield Step(row, _exists(own, kind), _call(train_local.main, arguments))
+        for table in sources.world.tables:
+            store = own.store_folder(wanted.split, table)
+            make = partial(make_odometry, row, sources, wanted.split, table, wanted.trajectories)
+            yield Step(f"the odometry of {row} in {store.name}", _is_whole(partial(open_odometry, store)), make)
+
+
 def _speed(sources: Sources, scripts: Scripts) -> None:
     world: Any = sources.world.name
     measured = throughput.main(replace(scripts.speed, world=world))
@@ -190,9 +211,14 @@ def _exists(sources: Sources, kind: str) -> Callable[[], bool]:
 
 
 def _whole(sources: Sources, store: str) -> Callable[[], bool]:
+    folder = sources.runs / sources.world.name / "features" / store
+    return _is_whole(partial(open_store, folder, sources.has_compass))
+
+
+def _is_whole(opened: Callable[[], object]) -> Callable[[], bool]:
     def is_whole() -> bool:
         try:
-            open_store(sources.runs / sources.world.name / "features" / store, sources.has_compass)
+            opened()
         except ValueError:
             return False
         return True

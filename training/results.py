@@ -1,6 +1,7 @@
 """The tables and figures of a world's results, by one command from nothing.
 
     python -m training.results --world maze2d
+    python -m training.results --world maze3d
 
 makes whatever is missing (networks, features, the pose graph's settings, three trainings of every optimizer), measures
 every row on mazes that nothing was trained or chosen on, and writes ``training/results/WORLD.json``,
@@ -8,7 +9,7 @@ every row on mazes that nothing was trained or chosen on, and writes ``training/
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +21,9 @@ from training import attention, figures, results_page, runs, tables
 from training.curves import write_at_once
 from training.estimators import Arrays, Prepared, estimators
 from training.featurise import open_store
+from training.limits import LIMITED_WORLDS, LIMITS, limit_estimator
 from training.measured import Measured, measure
+from training.own_odometry import open_odometry
 from training.prerequisites import Scripts, Wanted, prepare
 from training.rows import COMPASS_WORLDS, ROWS, Sources, rows_of
 from training.trained import trainings_json
@@ -31,16 +34,16 @@ from training.worlds import world_named
 class Arguments:
     """Settings of the results."""
 
-    world: Literal["maze2d"]
+    world: Literal["maze2d", "maze3d"]
     """World to measure in."""
     split: Literal["validation", "test"] = "test"
     """Mazes to measure on; designs are chosen on validation, and the test split is for the final tables alone."""
-    trajectories: int = 100
-    """Trajectories of each table, each in a maze of its own."""
+    trajectories: int = 0
+    """Trajectories of each table, each in a maze of its own; 0 for as many as the world's tables have."""
     seeds: int = 3
     """Trainings of each optimizer, with the seeds 0, 1, ..."""
-    prefixes: tuple[int, ...] = (250, 500, 1000, 1500, 2000)
-    """Numbers of steps after which errors are given, as if the robot had stopped there."""
+    prefixes: tuple[int, ...] = ()
+    """Numbers of steps after which errors are given, as if the robot had stopped there; by default the world's."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/*.safetensors of the local network and the place encoder."""
     out: Path = runs.ROOT / "training" / "results"
@@ -51,11 +54,11 @@ class Arguments:
     """Folder of feature stores, rows' weights, logs and estimates."""
 
     def __post_init__(self) -> None:
-        if self.trajectories < 2 or self.seeds < 1:
+        if (self.trajectories < 2 and self.trajectories != 0) or self.seeds < 1:
             raise ValueError(
                 f"trajectories, seeds are {self.trajectories}, {self.seeds}; expected at least 2 and at least 1"
             )
-        if min(self.prefixes, default=0) < 1:
+        if min(self.prefixes, default=1) < 1:
             raise ValueError(f"prefixes are {self.prefixes}; expected numbers of steps, each at least 1")
 
 
@@ -64,13 +67,21 @@ _ATTENTION_TRAJECTORIES = 24
 
 def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]:
     """Make what is missing, measure, write everything, and return the JSON's content."""
-    world = world_named(arguments.world)
+    world, record = world_named(arguments.world), runs.record("results", arguments)
+    trajectories, prefixes = arguments.trajectories or world.table_trajectories, arguments.prefixes or world.prefixes
+    arguments = replace(arguments, trajectories=trajectories, prefixes=prefixes)
     has_compass = world.name in COMPASS_WORLDS
     sources = Sources(world, arguments.weights, arguments.runs, arguments.out, has_compass)
     prepare(sources, Wanted(arguments.split, arguments.trajectories, arguments.seeds), scripts or Scripts())
     stores = {table: table_data(arguments, sources, table).arrays for table in world.tables}
     measured = {table: measured_rows(arguments, sources, table) for table in world.tables}
-    result = summary(arguments, sources, stores, measured)
+    result = {**record, **summary(arguments, sources, stores, measured)}
+    result.pop("arguments")
+    if world.name in LIMITED_WORLDS:
+        result["limits"] = {
+            table: tables.rows_json(limited(arguments, sources, table, found), result["steps"], world)
+            for table, found in measured.items()
+        }
     write_at_once(arguments.out / f"{world.name}.json", json.dumps(result, indent=2) + "\n")
     images = figures.draw_all(arguments.docs / "images", sources, arguments.split, stores, measured, result)
     write_at_once(arguments.docs / f"results_{world.name}.md", results_page.page(result, images, world))
@@ -86,10 +97,13 @@ class TableData:
     identity: str
 
 
-def table_data(arguments: Arguments, sources: Sources, table: str) -> TableData:
-    """The features of a table's trajectories; raises ``ValueError`` if there are too few, or too short ones."""
+def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "local") -> TableData:
+    """What a row sees of a table's trajectories; raises ``ValueError`` if there are too few, or too short ones."""
+    kind = ROWS[row]
+    own = kind.own_networks or kind.odometry is not None
+    sources = sources.of_row(row, 0) if own else sources
     folder = sources.store_folder(arguments.split, table)
-    arrays = open_store(folder, sources.has_compass)
+    arrays = open_store(folder, sources.has_compass) if kind.odometry is None else open_odometry(folder)
     count, steps = arrays["relative"].shape[:2]
     if count < arguments.trajectories:
         raise ValueError(
@@ -104,13 +118,13 @@ def table_data(arguments: Arguments, sources: Sources, table: str) -> TableData:
 def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Measured]]:
     """What every row makes of a table's trajectories."""
     shared = table_data(arguments, sources, table)
-    cache = arguments.runs / sources.world.name / "results" / f"{arguments.split}_{table}"
+    cache = cache_folder(arguments, table)
     result: dict[str, list[Measured]] = {}
     prepared: Prepared = {}
     with tqdm(rows_of(sources.world), desc=f"{sources.world.name} {table}", unit="row") as bar:
         for row in bar:
             bar.set_postfix_str(row)
-            data = table_data(arguments, sources.of_row(row, 0), table) if ROWS[row].own_networks else shared
+            data = table_data(arguments, sources, table, row)
             if not np.array_equal(data.arrays["truth"], shared.arrays["truth"]):
                 raise ValueError(f"the features of {row} are of other trajectories than those of the table {table}")
             result[row] = [
@@ -127,6 +141,24 @@ def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
     return result
 
 
+def cache_folder(arguments: Arguments, table: str) -> Path:
+    """Folder of what rows make of a table's trajectories."""
+    return arguments.runs / arguments.world / "results" / f"{arguments.split}_{table}"
+
+
+def limited(
+    arguments: Arguments, sources: Sources, table: str, measured: dict[str, list[Measured]]
+) -> dict[str, list[Measured]]:
+    """What limits the rows of a table, beside these rows: of optimizers the first training seed."""
+    data, cache = table_data(arguments, sources, table), cache_folder(arguments, table)
+    result = {row: measured[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
+    for name in tqdm(LIMITS, desc=f"{sources.world.name} {table} limits", unit="row"):
+        estimator = limit_estimator(name, sources)
+        found = measure(estimator, data.arrays, data.identity, (), sources.world, cache / f"{name}.npz")
+        result[name] = [found]
+    return result
+
+
 def summary(
     arguments: Arguments,
     sources: Sources,
@@ -136,11 +168,8 @@ def summary(
     """The content of the JSON."""
     world, prefixes = sources.world, sorted(arguments.prefixes)
     steps = next(iter(stores.values()))["relative"].shape[1]
-    record = runs.record("results", arguments)
     few = {table: {k: v[:_ATTENTION_TRAJECTORIES] for k, v in arrays.items()} for table, arrays in stores.items()}
     return {
-        "command": record["command"],
-        "revision": record["revision"],
         "split": arguments.split,
         "trajectories": arguments.trajectories,
         "steps": steps,

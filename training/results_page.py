@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from training.limits import LIMITS
 from training.rows import ROWS
 from training.scores import METRICS, Metric
 from training.worlds import World
@@ -37,6 +38,12 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
             "The estimator has seen these steps alone, as in use.",
             _prefixes(table, metrics[0]),
         ]
+        if "limits" in result:
+            parts += [
+                "### What limits it",
+                "One part after the other replaced by the truth; of optimizers the first training seed.",
+                _table(result["limits"][name], metrics),
+            ]
         if result["attention"].get(name):
             parts += ["### Attention", _attention(result["attention"][name])]
     parts += ["## Figures", *(f"![{caption}](images/{name})\n\n{caption}" for name, caption in images.items())]
@@ -77,7 +84,7 @@ def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
             seeds = value.get("seeds")
             spread = f" ({number(min(seeds))} to {number(max(seeds))})" if seeds else ""
             texts.append(_interval(value) + spread)
-        return [f"`{row}`", ROWS[row].title, *texts]
+        return [f"`{row}`", (ROWS[row] if row in ROWS else LIMITS[row]).title, *texts]
 
     header = ["Row", "", *(f"{metric.title}, {metric.unit}" for metric in metrics)]
     return _markdown(header, (cells(row, entry) for row, entry in table.items()))

@@ -4,7 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from ngo_estimator.checkpoint import LOCAL
 from ngo_estimator.compass import COMPASS
+from training.deepvo import DEEPVO
 from training.worlds import World
 
 
@@ -15,6 +17,8 @@ class Row:
     ``form``, ``iterations`` and ``learning_rate`` (None: the script's own) are what is trained for it, with several
     seeds. With ``compass`` it takes the readings of a compass. With ``own_networks`` all its networks are its own, and
     so are its features. ``registered`` is what takes the odometry that was registered again, without our optimizer.
+    ``odometry`` is the kind of a network of its own whose relative poses are all there is to it. ``worlds`` have the
+    row; none: all of them.
     """
 
     title: str
@@ -24,10 +28,17 @@ class Row:
     learning_rate: float | None = None
     own_networks: bool = False
     registered: bool = False
+    odometry: str | None = None
+    worlds: tuple[str, ...] = ()
 
+
+COMPASS_WORLDS = ("maze2d",)
+"""Worlds with a lattice, in which a compass can be trained."""
 
 ROWS = {
     "local": Row("odometry of the local network"),
+    "local_no_action": Row("the same of a network that is not told the actions", odometry=LOCAL, worlds=("maze3d",)),
+    "deepvo": Row("DeepVO (Wang et al., 2017), trained on the same data", odometry=DEEPVO, worlds=("maze3d",)),
     "local_calibrated": Row("the same, with a constant bias and gain fitted on validation"),
     "registered": Row("odometry, each meta-step measured again by registering scans; no loops", registered=True),
     "paper_1": Row("the paper's optimizer, 1 iteration", "paper", 1),
@@ -40,14 +51,10 @@ ROWS = {
     "gtsam_registered": Row("`gtsam` on the odometry of `registered`, with settings of its own", registered=True),
     "true_pairs": Row("GTSAM with true revisits, measured by our pair head"),
     "oracle": Row("GTSAM with true revisits, measured exactly"),
-    "ngo_1_compass": Row("`ngo_1` with a compass", "loops", 1, compass=True, learning_rate=1e-4),
-    "ngo_5_compass": Row("`ngo_5` with a compass", "loops", 5, compass=True, learning_rate=1e-4),
-    "gtsam_compass": Row("`gtsam` with a compass, tuned on validation", compass=True),
+    "ngo_1_compass": Row("`ngo_1` with a compass", "loops", 1, compass=True, learning_rate=1e-4, worlds=COMPASS_WORLDS),
+    "ngo_5_compass": Row("`ngo_5` with a compass", "loops", 5, compass=True, learning_rate=1e-4, worlds=COMPASS_WORLDS),
+    "gtsam_compass": Row("`gtsam` with a compass, tuned on validation", compass=True, worlds=COMPASS_WORLDS),
 }
-
-
-COMPASS_WORLDS = ("maze2d",)
-"""Worlds with a lattice, in which a compass can be trained."""
 
 
 def rows_of(world: World) -> list[str]:
@@ -55,13 +62,14 @@ def rows_of(world: World) -> list[str]:
     return [
         name
         for name, row in ROWS.items()
-        if (world.name in COMPASS_WORLDS or not row.compass) and (world.registration or not row.registered)
+        if (not row.worlds or world.name in row.worlds) and (world.registration or not row.registered)
     ]
 
 
 def trainings_of(row: str, seeds: int) -> int:
     """How many trainings a row has, where optimizers have so many."""
-    return seeds if ROWS[row].form is not None else int(ROWS[row].own_networks)
+    kind = ROWS[row]
+    return seeds if kind.form is not None else int(kind.own_networks or kind.odometry is not None)
 
 
 @dataclass(frozen=True)

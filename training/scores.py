@@ -12,7 +12,6 @@ from ngo_estimator.trajectory_errors import SegmentErrors, segment_errors
 from ngo_estimator.trajectory_file import SpatialPoses
 from training.worlds import World
 
-
 SEGMENTS_M = (5.0, 10.0, 20.0, 40.0)
 """Lengths of KITTI's segments that fit 3D mazes, which are 27 to 39 m wide: less than two blocks, to a whole side."""
 

@@ -17,11 +17,14 @@ Table = Mapping[str, Sequence[Measured]]
 
 PAIRS = (
     ("local", "local_calibrated"),
+    ("local_no_action", "local"),
+    ("deepvo", "local"),
     ("paper_5", "local"),
     ("gtsam", "local"),
     ("gauss_newton", "local"),
     ("ngo_1", "local"),
     ("ngo_5", "local"),
+    ("ngo_5", "deepvo"),
     ("ngo_5", "ngo_1"),
     ("ngo_5", "paper_5"),
     ("ngo_5", "gauss_newton"),
@@ -55,6 +58,11 @@ def table_json(table: Table, prefixes: Sequence[int], steps: int, world: World) 
         }
         for row, found in table.items()
     }
+
+
+def rows_json(table: Table, steps: int, world: World) -> dict[str, Any]:
+    """``ROW.METRIC.{mean, ci95}`` of whole trajectories alone."""
+    return {row: _metrics(found, steps, world) for row, found in table.items()}
 
 
 def _metrics(row: Sequence[Measured], steps: int, world: World) -> dict[str, Any]:

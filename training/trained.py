@@ -8,6 +8,7 @@ import numpy as np
 
 from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, load_description
 from ngo_estimator.compass import COMPASS
+from training.deepvo import DEEPVO
 from training.rows import ROWS, Sources, rows_of, trainings_of
 
 _KEPT = ("command", "revision", "seconds", "datapoints_per_s", "peak_memory_mb", "peak_gpu_memory_mb", "processes")
@@ -24,8 +25,10 @@ def trainings_json(sources: Sources, seeds: int) -> dict[str, Any]:
         result[COMPASS] = _kept(load_description(path, COMPASS, name))
     for row in rows_of(sources.world):
         for seed in range(trainings_of(row, seeds)):
-            folder = sources.of_row(row, 0).networks if ROWS[row].own_networks else sources.row_folder(row, seed)
-            result[f"{row}-seed{seed}"] = _kept(load_description(folder / f"{OPTIMIZER}.safetensors", OPTIMIZER, name))
+            network = ROWS[row].odometry or OPTIMIZER
+            own = ROWS[row].own_networks or ROWS[row].odometry is not None
+            folder = sources.of_row(row, 0).networks if own else sources.row_folder(row, seed)
+            result[f"{row}-seed{seed}"] = _kept(load_description(folder / f"{network}.safetensors", network, name))
     return result
 
 
@@ -39,6 +42,8 @@ def run_folder(sources: Sources, row: str, seed: int) -> Path:
     kind, folder = ROWS[row], sources.runs / sources.world.name
     if kind.own_networks:
         return folder / f"{row}-seed{seed}"
+    if kind.odometry is not None:
+        return folder / (DEEPVO if kind.odometry == DEEPVO else "local-no_action")
     return folder / f"optimizer-{kind.form}{'-compass' if kind.compass else ''}-{kind.iterations}-seed{seed}"
 
 

@@ -70,8 +70,8 @@ class World(Domain):
 
     ``block_m`` is the corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and
     ``extra_openings`` the ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of
-    trajectories that results are given for; those of the first stretch of seeds with the world's driver are in mazes
-    that nothing was trained in. No driver here drives backwards, whether the world ``reverses`` or not.
+    trajectories that results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how
+    many steps their errors are given. No driver here drives backwards, whether the world ``reverses`` or not.
     """
 
     driver: str
@@ -79,6 +79,8 @@ class World(Domain):
     rows: tuple[int, int]
     extra_openings: tuple[int, int]
     tables: dict[str, Table]
+    table_trajectories: int = 64
+    prefixes: tuple[int, ...] = (250, 500, 750, 1000)
 
     @property
     def unseen_tables(self) -> tuple[str, ...]:
@@ -158,6 +160,8 @@ WORLDS = {
         # Ranges are exact but for their storage as float16.
         registration=RegistrationConfig(rays=241, field_of_view_deg=300.0, noise_m=0.001),
         tables={"perfect": Table(MazeSize(7, 0)), "cycles": Table(MazeSize(7, 8), stretch=1)},
+        table_trajectories=100,
+        prefixes=(250, 500, 1000, 1500, 2000),
     ),
     "maze3d": World(
         name="maze3d",
@@ -181,6 +185,8 @@ WORLDS = {
         tables={
             "seen": Table(stretch=1, seen=True),
             "unseen": Table(),
+            # With the driver "learned" in ngo_sim.drivers: the same mazes and starts, driven by it.
+            # "seen_policy": Table(stretch=1, seen=True, driver="learned"), "unseen_policy": Table(driver="learned"),
         },
     ),
     # The 2D world as any 2D lidar sees it; corridors and paces are drawn, so lengths here are those of the middle.

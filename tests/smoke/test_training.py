@@ -26,11 +26,13 @@ from training import (
     featurise,
     runs,
     throughput,
+    train_deepvo,
     train_end_to_end,
     train_local,
     train_optimizer,
     train_place,
 )
+from training.deepvo import DEEPVO
 
 
 class Killed(RuntimeError):
@@ -100,6 +102,7 @@ TRAININGS: dict[str, tuple[Callable[[Any], Any], Callable[..., Any], type[lightn
     "local": (train_local.main, toy.local, train_local.LocalTraining, "weights", LOCAL),
     "place": (train_place.main, toy.place, train_place.PlaceTraining, "weights", PLACE),
     "optimizer": (train_optimizer.main, toy.optimizer, train_optimizer.OptimizerTraining, "weights", OPTIMIZER),
+    "deepvo": (train_deepvo.main, toy.deepvo, train_deepvo.DeepVOTraining, "weights", DEEPVO),
     "end_to_end": (train_end_to_end.main, toy.end_to_end, train_end_to_end.EndToEndTraining, "end_to_end", "*"),
 }
 

@@ -11,6 +11,7 @@ from training import (
     featurise,
     streams,
     throughput,
+    train_deepvo,
     train_end_to_end,
     train_local,
     train_optimizer,
@@ -22,7 +23,8 @@ from training import (
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:
     """Episodes of ``frames`` frames (``place_frames`` where places must be seen again), two mazes at a time."""
     simulate = streams.simulate
-    monkeypatch.setattr(train_local, "simulate", lambda world, seeds, _: simulate(world, seeds[:2], frames))
+    for script in (train_local, train_deepvo):
+        monkeypatch.setattr(script, "simulate", lambda world, seeds, _: simulate(world, seeds[:2], frames))
     monkeypatch.setattr(streams, "_GROUP", 2)
     monkeypatch.setattr(featurise, "_GROUP", 2)
     monkeypatch.setattr(streams.PairStream, "FRAMES", frames)
@@ -43,6 +45,22 @@ def local(world: str, folder: Path, epochs: int = 1, **changes: Any) -> train_lo
         out=folder / "weights",
         runs=folder / "runs",
         **changes,
+    )
+
+
+def deepvo(world: Any, folder: Path, epochs: int = 1) -> train_deepvo.Arguments:
+    return train_deepvo.Arguments(
+        world=world,
+        width=0.03,
+        epochs=epochs,
+        datapoints=1,
+        steps=16,
+        batch_size=4,
+        validation_mazes=1,
+        calibration_mazes=2,
+        workers=0,
+        out=folder / "weights",
+        runs=folder / "runs",
     )
 
 

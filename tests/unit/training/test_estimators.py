@@ -110,7 +110,7 @@ def test_rows_with_a_compass_say_so() -> None:
     for name, row in ROWS.items():
         assert row.compass == ("compass" in name)
     for world in WORLDS.values():
-        assert {name for name, row in ROWS.items() if not (row.compass or row.registered)} <= set(rows_of(world))
+        assert {name for name, row in ROWS.items() if not (row.worlds or row.registered)} <= set(rows_of(world))
 
 
 def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
@@ -119,8 +119,15 @@ def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
         assert name in rows_of(world_named("maze2d")) and name not in rows_of(world_named("maze3d"))
 
 
+def test_worlds_have_the_rows_that_are_theirs() -> None:
+    in_2d, in_3d = (set(rows_of(WORLDS[name])) for name in ("maze2d", "maze3d"))
+    assert in_3d - in_2d == {"local_no_action", "deepvo"}
+    assert in_2d - in_3d == {name for name, row in ROWS.items() if row.compass or row.registered}
+
+
 def test_only_what_is_trained_has_trainings() -> None:
-    assert [trainings_of(row, 3) for row in ("local", "gtsam", "ngo_5", "end_to_end")] == [0, 0, 3, 1]
+    rows = ("local", "gtsam", "ngo_5", "end_to_end", "deepvo", "local_no_action")
+    assert [trainings_of(row, 3) for row in rows] == [0, 0, 3, 1, 1, 1]
 
 
 def test_what_is_registered_is_what_our_optimizer_takes() -> None:
