@@ -12,7 +12,6 @@ import pytest
 from tests.smoke import toy
 from training import (
     featurise,
-    prerequisites,
     results,
     streams,
     throughput,
@@ -34,32 +33,7 @@ PREFIXES = (40, 77, STEPS)
 
 
 def arguments(folder: Path) -> results.Arguments:
-    return results.Arguments(
-        world="maze2d",
-        split="validation",
-        trajectories=3,
-        seeds=2,
-        prefixes=PREFIXES,
-        weights=folder / "weights",
-        runs=folder / "runs",
-        out=folder / "results",
-        docs=folder / "docs",
-    )
-
-
-def scripts(folder: Path) -> prerequisites.Scripts:
-    return prerequisites.Scripts(
-        local=toy.local("maze2d", folder),
-        place=toy.place("maze2d", folder),
-        compass=train_compass.Arguments(
-            world="maze2d", width=4, epochs=1, datapoints=1, batch_size=32, validation_mazes=2, workers=0
-        ),
-        features=toy.features("maze2d", folder),
-        optimizer=toy.optimizer("maze2d", folder),
-        pose_graph=tune_pose_graph.Arguments(world="maze2d", trajectories=2, passes=1),
-        speed=toy.speed("maze2d"),
-        end_to_end=toy.end_to_end("maze2d", folder),
-    )
+    return toy.results_of("maze2d", folder, trajectories=3, seeds=2, prefixes=PREFIXES)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +49,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
         tables = {"perfect": Table(MazeSize(2, 0)), "cycles": Table(MazeSize(2, 1), stretch=1)}
         world = dataclasses.replace(worlds.WORLDS["maze2d"], tables=tables)
         patch.setitem(worlds.WORLDS, "maze2d", world)
-        yield folder, results.main(arguments(folder), scripts(folder))
+        yield folder, results.main(arguments(folder), toy.scripts("maze2d", folder))
 
 
 def test_every_row_has_every_number(made: tuple[Path, dict[str, Any]]) -> None:
@@ -148,7 +122,7 @@ def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: p
     for module in (featurise, throughput, tune_pose_graph):
         monkeypatch.setattr(module, "main", refuse)
     monkeypatch.setattr("training.measured.scores", refuse)
-    assert results.main(arguments(folder), scripts(folder)) == result
+    assert results.main(arguments(folder), toy.scripts("maze2d", folder)) == result
 
 
 def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, dict[str, Any]]) -> None:
@@ -173,7 +147,7 @@ def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, di
 def test_too_few_trajectories_in_a_store_are_said(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
     with pytest.raises(ValueError, match="holds 3 trajectories; expected 4"):
-        results.main(dataclasses.replace(arguments(folder), trajectories=4), scripts(folder))
+        results.main(dataclasses.replace(arguments(folder), trajectories=4), toy.scripts("maze2d", folder))
 
 
 def test_weights_that_were_trained_on_other_networks_are_refused(made: tuple[Path, dict[str, Any]]) -> None:
@@ -183,6 +157,6 @@ def test_weights_that_were_trained_on_other_networks_are_refused(made: tuple[Pat
     try:
         path.write_text(json.dumps({**json.loads(kept), "place_encoder_sha256": "another"}))
         with pytest.raises(ValueError, match=r"ngo_1-seed0 was trained on features of other networks"):
-            results.main(arguments(folder), scripts(folder))
+            results.main(arguments(folder), toy.scripts("maze2d", folder))
     finally:
         path.write_text(kept)

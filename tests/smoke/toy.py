@@ -9,13 +9,17 @@ import pytest
 from training import (
     evaluate,
     featurise,
+    prerequisites,
+    results,
     streams,
     throughput,
+    train_compass,
     train_deepvo,
     train_end_to_end,
     train_local,
     train_optimizer,
     train_place,
+    tune_pose_graph,
     worlds,
 )
 
@@ -121,3 +125,32 @@ def speed(world: str) -> throughput.Arguments:
 
 def evaluation(world: str, folder: Path) -> evaluate.Arguments:
     return evaluate.Arguments(world=world, trajectories=2, frames=60, weights=folder / "weights")
+
+
+def scripts(world: Any, folder: Path) -> prerequisites.Scripts:
+    """Every script that results need."""
+    return prerequisites.Scripts(
+        local=local(world, folder),
+        place=place(world, folder),
+        compass=train_compass.Arguments(
+            world="maze2d", width=4, epochs=1, datapoints=1, batch_size=32, validation_mazes=2, workers=0
+        ),
+        features=features(world, folder),
+        optimizer=optimizer(world, folder),
+        pose_graph=tune_pose_graph.Arguments(world=world, trajectories=2, passes=1),
+        speed=speed(world),
+        deepvo=deepvo("maze3d", folder),
+        end_to_end=end_to_end(world, folder),
+    )
+
+
+def results_of(world: Any, folder: Path, **changes: Any) -> results.Arguments:
+    return results.Arguments(
+        world=world,
+        split="validation",
+        weights=folder / "weights",
+        runs=folder / "runs",
+        out=folder / "results",
+        docs=folder / "docs",
+        **changes,
+    )

@@ -1,0 +1,130 @@
+"""The tables of the 3D world at toy size: seen and unseen mazes, networks of their own, and what limits the result."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from ngo_estimator.checkpoint import write_untrained
+from tests.smoke import toy
+from training import results, train_deepvo, train_end_to_end, train_local, train_optimizer, tune_pose_graph
+from training.featurise import open_store
+from training.limits import LIMITS
+from training.own_odometry import open_odometry
+from training.rows import Sources, rows_of
+from training.runs import RunError
+from training.worlds import world_named
+
+STEPS = 160
+PREFIXES = (80, STEPS)
+METRICS = (
+    "translation_percent",
+    "rotation_deg_per_m",
+    "position_rmse_m",
+    "segment_translation_percent",
+    "segment_rotation_deg_per_m",
+)
+
+
+def arguments(folder: Path) -> results.Arguments:
+    return toy.results_of("maze3d", folder, trajectories=2, seeds=1, prefixes=PREFIXES)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("results")
+    # That these are trained where they are missing is shown in 2D.
+    write_untrained(folder / "weights" / "maze3d", "maze3d")
+    (folder / "weights" / "maze3d" / "neural_graph_optimizer.safetensors").unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        toy.shrink(patch, STEPS + 1, 300)
+        grid = tune_pose_graph.GRID
+        patch.setattr(tune_pose_graph, "GRID", tuple(group[:1] for group in grid))
+        speed = sources(folder).speed_file
+        speed.parent.mkdir(parents=True)
+        speed.write_text('{"workers": 1, "local_datapoints_per_s": 1000.0}')
+        yield folder, results.main(arguments(folder), toy.scripts("maze3d", folder))
+
+
+def sources(folder: Path) -> Sources:
+    return Sources(world_named("maze3d"), folder / "weights", folder / "runs", folder / "results")
+
+
+def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, Any]]) -> None:
+    folder, result = made
+    assert json.loads((folder / "results" / "maze3d.json").read_text()) == result
+    assert result["command"].startswith("python -m training.results --world maze3d ")
+    assert (result["trajectories"], result["steps"], result["seeds"]) == (2, STEPS, [0])
+    assert list(result["tables"]) == ["seen", "unseen"] == list(result["limits"])
+    assert {"local", "local_no_action", "deepvo", "paper_1", "paper_5", "ngo_1", "ngo_5", "gauss_newton", "gtsam",
+            "true_pairs", "oracle", "end_to_end"} < set(rows_of(world_named("maze3d")))  # fmt: skip
+    for name, table in result["tables"].items():
+        assert list(table) == rows_of(world_named("maze3d"))
+        for row in table.values():
+            assert list(row["prefixes"]) == [str(length) for length in PREFIXES]
+            for entry in (row, *row["prefixes"].values()):
+                for metric in METRICS:
+                    low, high = entry[metric]["ci95"]
+                    assert 0.0 <= low <= entry[metric]["mean"] <= high
+        assert list(result["limits"][name]) == ["ngo_5", "gtsam", "true_pairs", "oracle", *LIMITS]
+        assert result["limits"][name]["gtsam"] == {metric: table["gtsam"][metric] for metric in METRICS}
+    assert {"deepvo-seed0", "local_no_action-seed0", "ngo_5-seed0"} < set(result["trainings"])
+    assert "--without-action" in result["trainings"]["local_no_action-seed0"]["command"]
+    assert str(folder) not in json.dumps(result)
+
+
+def test_networks_of_their_own_saw_the_same_trajectories(made: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = made
+    for table in ("seen", "unseen"):
+        shared = open_store(sources(folder).store_folder("validation", table))
+        for row in ("local_no_action", "deepvo"):
+            own = open_odometry(sources(folder).of_row(row, 0).store_folder("validation", table))
+            np.testing.assert_array_equal(own["truth"], shared["truth"])
+            assert not np.allclose(own["relative"], shared["relative"])
+    seen, unseen = (open_store(sources(folder).store_folder("validation", table)) for table in ("seen", "unseen"))
+    assert not np.allclose(seen["truth"], unseen["truth"])
+
+
+def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = made
+    page = (folder / "docs" / "results_maze3d.md").read_text()
+    for name in ("seen", "unseen"):
+        assert f"## Table `{name}`" in page
+    assert page.count("### What limits it") == 2
+    for name in LIMITS:
+        assert page.count(f"| `{name}` |") == 2
+    images = sorted((folder / "docs" / "images").iterdir())
+    assert len(images) >= 4
+    for image in images:
+        assert f"(images/{image.name})" in page
+        assert matplotlib.image.imread(image).std() > 0.01
+
+
+def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, result = made
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("this is there already")
+
+    for module in (train_deepvo, train_end_to_end, train_local, train_optimizer, tune_pose_graph):
+        monkeypatch.setattr(module, "main", refuse)
+    monkeypatch.setattr("training.prerequisites.make_odometry", refuse)
+    monkeypatch.setattr("training.measured.scores", refuse)
+    assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result
+
+
+def test_odometry_of_another_network_is_not_mixed_in(made: tuple[Path, dict[str, Any]]) -> None:
+    from training.own_odometry import make_odometry
+
+    folder, _ = made
+    store = sources(folder).of_row("deepvo", 0).store_folder("validation", "seen")
+    kept = (store / "networks.json").read_text()
+    try:
+        (store / "networks.json").write_text('["another"]')
+        with pytest.raises(RunError, match="made with another network"):
+            make_odometry("deepvo", sources(folder), "validation", "seen", 2)
+    finally:
+        (store / "networks.json").write_text(kept)
