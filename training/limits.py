@@ -77,7 +77,7 @@ def limit_estimator(name: str, sources: Sources) -> Estimator:
             poses = pose_graph("gtsam", settings, pair_head, block_m)
     else:
         optimizer, _ = load_optimizer(sources.row_folder(limit.row, 0), sources.world.name)
-        poses = optimized_by(optimizer, pair_head, block_m, exact_loops if limit.exact_loops else None)
+        poses = optimized_by(optimizer, pair_head, block_m, known=exact_loops if limit.exact_loops else None)
     return Estimator(lambda arrays: poses(told(arrays, limit)), f"{name} {base.identity}")
 
 

@@ -37,10 +37,12 @@ COMPASS_WORLDS = ("maze2d",)
 
 ROWS = {
     "local": Row("odometry of the local network"),
-    "local_no_action": Row("the same of a network that is not told the actions", odometry=LOCAL, worlds=("maze3d",)),
-    "deepvo": Row("DeepVO (Wang et al., 2017), trained on the same data", odometry=DEEPVO, worlds=("maze3d",)),
     "local_calibrated": Row("the same, with a constant bias and gain fitted on validation"),
     "registered": Row("odometry, each meta-step measured again by registering scans; no loops", registered=True),
+    "local_no_action": Row(
+        "odometry of a local network that is not told the actions", odometry=LOCAL, worlds=("maze3d",)
+    ),
+    "deepvo": Row("DeepVO (Wang et al., 2017), trained on the same data", odometry=DEEPVO, worlds=("maze3d",)),
     "paper_1": Row("the paper's optimizer, 1 iteration", "paper", 1),
     "paper_5": Row("the paper's optimizer, 5 iterations", "paper", 5),
     "ngo_1": Row("our optimizer, 1 iteration", "loops", 1),

@@ -50,7 +50,7 @@ class Arguments(runs.TrainerArguments):
     """Steps of a stretch."""
     batch_size: int = 8
     """Stretches in a step of the optimiser, in each process."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 5e-4
     """Highest learning rate of the one-cycle schedule."""
     validation_mazes: int = 8
     """Mazes of the validation split that each epoch is measured on."""
