@@ -9,7 +9,7 @@ import torch
 from ngo_estimator import se2
 from ngo_estimator.place_encoder import PairHead
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.estimators import Arrays, local, optimized_by, pose_graph
+from training.estimators import Arrays, local, optimized_by, pose_graph, seen_in
 from training.limits import LIMITS, Limit, exact_factors, exact_loops, right_factors, told
 from training.loop_factors import LoopFactors, exact_revisits, found_loops
 from training.pose_graph import PoseGraphSettings
@@ -24,7 +24,7 @@ def arrays() -> Arrays:
     found = {name: value.numpy() for name, value in zip(names, values, strict=True)}
     rng = np.random.default_rng(0)
     true = found["relative"] + rng.normal(0.0, 0.02, found["relative"].shape)
-    return {**found, "truth": local({"relative": true})}
+    return {**found, "origin_code": found["codes"][:, :1], "truth": local({"relative": true})}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_exact_loops_agree_with_the_true_poses(pair_head: PairHead) -> None:
         expected = se2.between(nodes[k, found.start[k]], nodes[k, found.end[k] + 1])
         torch.testing.assert_close(exact.measured[k], expected.float(), atol=1e-5, rtol=1e-5)
     poses = optimized_by(optimizer, pair_head, 1.0)(some)
-    informed = optimized_by(optimizer, pair_head, 1.0, exact_loops)(some)
+    informed = optimized_by(optimizer, pair_head, 1.0, known=exact_loops)(some)
     assert informed.shape == poses.shape and not np.allclose(informed, poses, atol=1e-4)
 
 
@@ -87,7 +87,7 @@ def test_the_classical_graph_takes_what_is_known(pair_head: PairHead) -> None:
     some, settings = arrays(), PoseGraphSettings(min_logit=-100.0, kernel="none")
     exact = pose_graph("gtsam", settings, pair_head, 1.0, lambda found, true: exact_factors(found, true, BLOCK))(some)
     plain = pose_graph("gtsam", settings, pair_head, 1.0)(some)
-    assert found_loops(pair_head, some["relative"], some["codes"], settings.search)[0].start.size
+    assert found_loops(pair_head, seen_in(some), settings.search)[0].start.size
 
     def error(poses: np.ndarray) -> float:
         return float(np.linalg.norm((poses - some["truth"])[..., :2], axis=-1).mean())
