@@ -1,5 +1,6 @@
 """The feature store and what the optimizer's training takes from it."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -65,11 +66,19 @@ def test_arrays_are_made_once_and_their_size_is_checked(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
 def test_parts_share_the_groups_without_overlap(parts: int) -> None:
-    seeds = list(range(45))
-    groups = [group for part in range(parts) for group in featurise._groups(seeds, part, parts)]
-    assert sorted(first for first, _ in groups) == list(range(0, 45, 8))
-    assert sorted(seed for _, group in groups for seed in group) == seeds
-    assert all(group[0] == first for first, group in groups)
+    groups = [first for part in range(parts) for first in featurise._groups(45, part, parts)]
+    assert sorted(groups) == list(range(0, 45, 8))
+
+
+def test_a_group_of_a_store_is_driven_as_its_seeds_say() -> None:
+    world = dataclasses.replace(WORLDS["maze2d"], episode_frames=20)
+    driven = featurise.driven_in_table(world, "cycles", "validation", 10)
+    assert driven.mazes == driven.seeds == list(world.table_seeds("cycles", "validation")[:10])
+    second = list(driven.episodes(world, 8))
+    assert len(second) == 2
+    expected = simulate(world, driven.seeds[8:], 21, world.tables["cycles"].size)
+    for found, episode in zip(second, expected, strict=True):
+        np.testing.assert_array_equal(found.poses_xyyaw, episode.poses_xyyaw)
 
 
 def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> None:
