@@ -41,8 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
     (folder / "weights" / "maze3d" / "neural_graph_optimizer.safetensors").unlink()
     with pytest.MonkeyPatch.context() as patch:
         toy.shrink(patch, STEPS + 1, 300)
-        grid = tune_pose_graph.GRID
-        patch.setattr(tune_pose_graph, "GRID", tuple(group[:1] for group in grid))
+        patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
         speed = sources(folder).speed_file
         speed.parent.mkdir(parents=True)
         speed.write_text('{"workers": 1, "local_datapoints_per_s": 1000.0}')
