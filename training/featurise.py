@@ -13,7 +13,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -32,12 +32,13 @@ from ngo_estimator.local_pose_network import LocalPoseNetwork
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.domains import Domain
+from training.driven import Driven, driven_in_table
 from training.metrics import seen_from_first
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import known_to, told, windows
 from training.recorded_tracks import Part, Track
-from training.streams import Batch, episodes_in, images_of, mirrored
-from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, MazeSize, World, WorldName, world_named
+from training.streams import Batch, images_of, mirrored
+from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, WorldName, world_named
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
@@ -146,27 +147,6 @@ def readings_of(world: World, compass: Compass, episode: Episode) -> dict[str, n
     return {"compass": readings.numpy(), "compass_log_scale": log_scale.numpy()}
 
 
-class Driven(NamedTuple):
-    """Trajectories of a feature store: the seed of each one's maze and that of its episode, and how they are driven."""
-
-    mazes: list[int]
-    seeds: list[int]
-    size: MazeSize
-    driver: str
-
-    def episodes(self, world: World, first: int) -> Iterator[Episode]:
-        """Those of the group that begins with ``first``, of the world's number of steps."""
-        group = slice(first, first + _GROUP)
-        frames = world.episode_frames + 1
-        return episodes_in(world, self.mazes[group], self.seeds[group], frames, self.size, self.driver)
-
-
-def driven_in_table(world: World, table: str, split: str, count: int) -> Driven:
-    """The first ``count`` trajectories of a table of results."""
-    mazes, seeds = (list(of(table, split)[:count]) for of in (world.table_mazes, world.table_seeds))
-    return Driven(mazes, seeds, world.tables[table].size, world.table_driver(table))
-
-
 def driven_in(arguments: Arguments, world: World) -> dict[str, Driven]:
     """The trajectories of each store that is to be made."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
@@ -247,7 +227,7 @@ def fill(
     for first in tqdm(_groups(len(driven.seeds), *part), desc=f"{world.name} {store.name}"):
         if first in done:
             continue
-        for offset, episode in enumerate(driven.episodes(world, first)):
+        for offset, episode in enumerate(driven.episodes(world, slice(first, first + _GROUP))):
             for key, value in arrays_of(episode).items():
                 _array(store / f"{key}.npy", (len(driven.seeds), *value.shape), value.dtype)[first + offset] = value
         mine.add(first)

@@ -12,7 +12,8 @@ from torch import Tensor
 from ngo_estimator.checkpoint import LOCAL, load_local
 from training import runs
 from training.deepvo import DEEPVO, load_deepvo, trajectory_steps
-from training.featurise import driven_in_table, fill, open_store
+from training.driven import driven_in_table
+from training.featurise import fill, open_store
 from training.metrics import seen_from_first
 from training.rows import ROWS, Sources
 from training.streams import images_of

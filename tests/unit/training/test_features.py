@@ -11,6 +11,7 @@ import torch
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_place, write_untrained
 from training import featurise
+from training.driven import driven_in_table
 from training.featurise import check_networks, features_of, open_store
 from training.streams import simulate
 from training.worlds import WORLDS
@@ -72,9 +73,9 @@ def test_parts_share_the_groups_without_overlap(parts: int) -> None:
 
 def test_a_group_of_a_store_is_driven_as_its_seeds_say() -> None:
     world = dataclasses.replace(WORLDS["maze2d"], episode_frames=20)
-    driven = featurise.driven_in_table(world, "cycles", "validation", 10)
+    driven = driven_in_table(world, "cycles", "validation", 10)
     assert driven.mazes == driven.seeds == list(world.table_seeds("cycles", "validation")[:10])
-    second = list(driven.episodes(world, 8))
+    second = list(driven.episodes(world, slice(8, 16)))
     assert len(second) == 2
     expected = simulate(world, driven.seeds[8:], 21, world.tables["cycles"].size)
     for found, episode in zip(second, expected, strict=True):

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from training.featurise import _GROUP, driven_in_table
+from training.driven import driven_in_table
+from training.featurise import _GROUP
 from training.streams import PairStream, PlaceStream, simulate
 from training.train_local import Arguments
 from training.worlds import (
@@ -110,12 +111,24 @@ def test_seen_mazes_are_those_of_the_local_network_and_unseen_ones_of_no_trainin
 def test_an_episode_in_a_seen_maze_has_the_walls_of_training_and_another_start_and_drive() -> None:
     world = WORLDS["maze3d"]
     driven = driven_in_table(world, "seen", "validation", 2)
-    seen = list(driven.episodes(dataclasses.replace(world, episode_frames=30), 0))
+    seen = list(driven.episodes(dataclasses.replace(world, episode_frames=30), slice(0, 2)))
     trained = list(simulate(world, driven.mazes, 31))
     for now, then in zip(seen, trained, strict=True):
         np.testing.assert_array_equal(now.maze.walls, then.maze.walls)
         assert not np.array_equal(now.poses_xyyaw[0], then.poses_xyyaw[0])
         assert not np.array_equal(now.actions, then.actions)
+
+
+def test_a_table_of_another_driver_has_the_same_mazes_and_starts() -> None:
+    tables = {"unseen": Table(), "unseen_by_chance": Table(driver="random")}
+    world = dataclasses.replace(WORLDS["maze2d"], tables=tables, episode_frames=30)
+    assert world.unseen_tables == ("unseen",) and world.validation_stores == ("validation_unseen",)
+    ours, by_chance = (
+        next(driven_in_table(world, table, "validation", 1).episodes(world, slice(0, 1))) for table in tables
+    )
+    np.testing.assert_array_equal(ours.maze.walls, by_chance.maze.walls)
+    np.testing.assert_array_equal(ours.poses_xyyaw[0], by_chance.poses_xyyaw[0])
+    assert not np.array_equal(ours.actions, by_chance.actions)
 
 
 @pytest.mark.parametrize(
