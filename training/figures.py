@@ -149,8 +149,9 @@ def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], measur
 
 
 def _absolute(world: str) -> list[Metric]:
-    """The first metric of a world that is no ratio to the path."""
-    return [next(one for one in METRICS[world] if "%" not in one.unit and "/" not in one.unit)]
+    """The first metric of a world that is no ratio to the path, and that of headings."""
+    absolute = [one for one in METRICS[world] if "%" not in one.unit and "/" not in one.unit]
+    return [absolute[0], next(one for one in absolute if one.unit == "deg")]
 
 
 def _ratios(world: str) -> list[Metric]:

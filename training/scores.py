@@ -88,6 +88,7 @@ METRICS: dict[str, tuple[Metric, ...]] = {
             lambda errors, _: np.degrees(errors.heading_rad[:, -1]) / errors.path_m,
         ),
         Metric("position_rmse_m", "Position RMSE", "m", _position_rmse_m),
+        Metric("heading_rmse_deg", "Heading RMSE", "deg", _heading_rmse_deg),
         Metric(
             "segment_translation_percent",
             "Segment error",

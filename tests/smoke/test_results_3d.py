@@ -24,6 +24,7 @@ METRICS = (
     "translation_percent",
     "rotation_deg_per_m",
     "position_rmse_m",
+    "heading_rmse_deg",
     "segment_translation_percent",
     "segment_rotation_deg_per_m",
 )
