@@ -206,14 +206,15 @@ def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, f
     changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale}
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
+    place, _ = load_place(arguments.weights / domain.name, domain.name)
     chosen = choices(arguments, domain)
     search = LoopSearch(
         per_pose=chosen.loops_per_pose,
         most=chosen.max_loops,
         min_apart=domain.loops_apart,
         views=domain.loop_views,
-        # Every iteration also measures once more.
-        registrations=0 if domain.registration is None else arguments.iterations,
+        # Where the place codes hold scans, every iteration also measures once more.
+        registrations=0 if place.config.registration is None else arguments.iterations,
     )
     return NeuralGraphOptimizerConfig(
         aggregation=aggregation,

@@ -226,7 +226,8 @@ def main(arguments: Arguments) -> PoseGraphSettings:
         for name in ("relative", "log_std", "codes", "origin_code", "truth", *(_COMPASS if with_compass else ()))
     }
     path = arguments.out / f"{world.name}.gtsam.json"
-    registrations = 0 if world.registration is None else REGISTRATIONS
+    pair_head = load_place(arguments.weights / world.name, world.name)[0].pair_head
+    registrations = 0 if pair_head.config.registration is None else REGISTRATIONS
     start = PoseGraphSettings()
     start = replace(start, search=replace(start.search, registrations=registrations))
     grid = [[_registering(change, registrations) for change in group] for group in GRID]
@@ -241,7 +242,6 @@ def main(arguments: Arguments) -> PoseGraphSettings:
         relative = start.calibrated(arrays["relative"])
         readings, log_scale = (arrays[name] for name in _COMPASS)
         compass = found_fixes(readings, log_scale, relative, arrays["log_std"], start.block, world.block_m)
-    pair_head = load_place(arguments.weights / world.name, world.name)[0].pair_head
     objective = Objective(arrays, pair_head, compass, arguments.form == "registered")
     started = time.monotonic()
     best, least = tune(objective, start, grid, arguments.passes)
