@@ -29,6 +29,8 @@ _KERNELS: dict[str, Callable[[float], Any]] = {
     "dcs": gtsam.noiseModel.mEstimator.DCS.Create,
 }
 _HUBER_WIDTH = 1.0
+_DRIFT_LEFT = (*(0.25**stage for stage in range(6)), 0.0)
+_DRIFT_RAD_A_M = 0.2
 _UNKNOWN = 1e4  # scale of a deviation that is not to matter
 
 
@@ -58,6 +60,10 @@ class PoseGraphSettings:
     """Robust kernel over loops and compass readings."""
     kernel_width: float = 2.0
     """Parameter of the kernel over loops, in deviations."""
+    drift_m: float = 1.0
+    """What the graph allows the odometry to have drifted at first: so much, and a fifth of it in rad, is added to each
+    loop's deviation, then a quarter of that, and so on, in the end nothing (as in graduated non-convexity). With 0 it
+    begins with a convex kernel instead."""
     compass_position_scale: float = 2.0
     """Scale of the compass readings' deviations in position."""
     compass_heading_scale: float = 2.0
@@ -75,6 +81,8 @@ class PoseGraphSettings:
                 raise ValueError(f"{name} is {value}; expected three finite numbers (x, y, turn)")
         if self.kernel not in ("none", *_KERNELS):
             raise ValueError(f"kernel is {self.kernel!r}; expected none or one of {', '.join(_KERNELS)}")
+        if not 0.0 <= self.drift_m < math.inf:
+            raise ValueError(f"drift_m is {self.drift_m}; expected 0 or more")
         if math.isnan(self.min_logit):
             raise ValueError("min_logit is nan; expected a number")
         for name in ("block", "compass_rounds"):
@@ -114,7 +122,7 @@ def optimize_exact(
     relative: np.ndarray, log_std: np.ndarray, truth: np.ndarray, settings: PoseGraphSettings
 ) -> np.ndarray:
     """What perfect loops would give: as ``optimize``, with true revisits and their true relative poses."""
-    exact = replace(settings, kernel="none", loop_position_scale=1.0, loop_heading_scale=1.0)
+    exact = replace(settings, kernel="none", drift_m=0.0, loop_position_scale=1.0, loop_heading_scale=1.0)
     return optimize(relative, log_std, exact_revisits(truth, settings.search, settings.block), exact)
 
 
@@ -134,13 +142,14 @@ class _Graph:
             self._base.add(gtsam.BetweenFactorPose2(node, node + 1, gtsam.Pose2(*step), noise))
         believed = loops.logit >= settings.min_logit
         scale = np.exp(loops.log_scale[believed].astype(np.float64))[:, [0, 0, 1]]
+        by = np.array([settings.loop_position_scale, settings.loop_position_scale, settings.loop_heading_scale])
+        self._loop_deviations = scale * by
         self._loops = [
-            (start, end + 1, gtsam.Pose2(*measured), noise)
-            for start, end, measured, noise in zip(
+            (start, end + 1, gtsam.Pose2(*measured))
+            for start, end, measured in zip(
                 loops.start[believed].tolist(),
                 loops.end[believed].tolist(),
                 loops.measured[believed].astype(np.float64),
-                _noises(scale, settings.loop_position_scale, settings.loop_heading_scale),
                 strict=True,
             )
         ]
@@ -170,13 +179,21 @@ class _Graph:
         values = gtsam.Values()
         for node, pose in enumerate(self._odometry):
             values.insert(node, gtsam.Pose2(*pose))
-        for kernel, width in dict.fromkeys((self._convex, (self._settings.kernel, self._settings.kernel_width))):
-            values = _minimum(self._with_loops(kernel, width), values)
+        settings = self._settings
+        last = settings.kernel, settings.kernel_width
+        if settings.drift_m == 0.0 or settings.kernel == "none":
+            stages = [(*kernel, 0.0) for kernel in dict.fromkeys((self._convex, last))]
+        else:
+            stages = [(*self._convex, settings.drift_m), *((*last, settings.drift_m * share) for share in _DRIFT_LEFT)]
+        for stage in stages:
+            values = _minimum(self._with_loops(*stage), values)
         return values
 
-    def _with_loops(self, kernel: Kernel, width: float) -> gtsam.NonlinearFactorGraph:
+    def _with_loops(self, kernel: Kernel, width: float, drift_m: float = 0.0) -> gtsam.NonlinearFactorGraph:
         graph = self._base.clone()
-        for start, end, measured, noise in self._loops:
+        drift = drift_m * np.array([1.0, 1.0, _DRIFT_RAD_A_M])
+        noises = _noises(np.hypot(self._loop_deviations, drift), 1.0, 1.0)
+        for (start, end, measured), noise in zip(self._loops, noises, strict=True):
             graph.add(gtsam.BetweenFactorPose2(start, end, measured, _robust(noise, kernel, width)))
         return graph
 

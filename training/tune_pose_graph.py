@@ -44,6 +44,7 @@ GRID: tuple[tuple[dict[str, Any], ...], ...] = (
         }.items()
         for width in widths
     ),
+    tuple({"drift_m": value} for value in (0.0, 0.2, 0.5, 1.0, 2.0)),
     tuple({"odometry_position_scale": value} for value in (0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0)),
     tuple({"odometry_heading_scale": value} for value in (0.7, 1.0, 1.5, 2.0, 3.0, 4.0)),
     tuple({"loop_position_scale": value} for value in (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)),

@@ -21,6 +21,7 @@ PLAIN = PoseGraphSettings(
     loop_position_scale=1.0,
     loop_heading_scale=1.0,
     kernel="none",
+    drift_m=0.0,
 )
 SEARCH = LoopSearch(per_pose=1, most=200)
 NO_LOOPS = LoopFactors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
@@ -196,3 +197,29 @@ def test_what_does_not_fit_together_is_refused() -> None:
     steps = laps(1)
     with pytest.raises(ValueError, match="do not divide into blocks"):
         optimize(steps[:-1], stds(steps[:-1], 0.02), NO_LOOPS, PLAIN)
+
+
+def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measurements_allow() -> None:
+    """Exact loops of a millimetre, an odometry that is decimetres off, and a third of the loops wrong."""
+    rng = np.random.default_rng(0)
+    steps, turn = 320, 2.0 * np.pi / 80.0
+    true_steps = np.tile([0.1, 0.0, turn], (steps, 1))
+    truth = se2.r2g(torch.from_numpy(true_steps)).numpy()
+    odometry = true_steps + np.array([0.0, 0.0, 0.004])
+    loops = exact_revisits(truth, LoopSearch(per_pose=2, most=500), 8)
+    measured = loops.measured.copy()
+    wrong = rng.random(len(measured)) < 0.33
+    measured[wrong] += rng.uniform(-2.0, 2.0, (int(wrong.sum()), 3))
+    loops = replace(loops, measured=measured)
+    errors = {}
+    for drift_m in (0.0, 1.0):
+        settings = PoseGraphSettings(drift_m=drift_m, kernel="geman_mcclure", min_logit=0.0)
+        poses = optimize(odometry, np.full((steps, 3), np.log(0.004)), loops, settings)
+        errors[drift_m] = float(np.linalg.norm((poses - truth)[:, :2], axis=1).max())
+    drifted = np.linalg.norm((se2.r2g(torch.from_numpy(odometry)).numpy() - truth)[:, :2], axis=1).max()
+    assert errors[1.0] < 0.1 * drifted and errors[1.0] < 0.2 * errors[0.0], (errors, drifted)
+
+
+def test_a_drift_below_zero_is_refused() -> None:
+    with pytest.raises(ValueError, match="drift_m is -1.0; expected 0 or more"):
+        PoseGraphSettings(drift_m=-1.0)
