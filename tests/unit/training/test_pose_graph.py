@@ -221,5 +221,5 @@ def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measure
 
 
 def test_a_drift_below_zero_is_refused() -> None:
-    with pytest.raises(ValueError, match="drift_m is -1.0; expected 0 or more"):
+    with pytest.raises(ValueError, match=r"drift_m is -1\.0; expected 0 or more"):
         PoseGraphSettings(drift_m=-1.0)
