@@ -61,9 +61,9 @@ class PoseGraphSettings:
     kernel_width: float = 2.0
     """Parameter of the kernel over loops, in deviations."""
     drift_m: float = 1.0
-    """What the graph allows the odometry to have drifted at first: so much, and a fifth of it in rad, is added to each
-    loop's deviation, then a quarter of that, and so on, in the end nothing (as in graduated non-convexity). With 0 it
-    begins with a convex kernel instead."""
+    """What the graph allows the odometry to have drifted at first: so much, and a fifth of it in rad, is added (in
+    squares) to each loop's deviation, then a quarter of that, and so on, in the end nothing (as in graduated
+    non-convexity). With 0 it begins with a convex kernel instead."""
     compass_position_scale: float = 2.0
     """Scale of the compass readings' deviations in position."""
     compass_heading_scale: float = 2.0

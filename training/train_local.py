@@ -203,7 +203,7 @@ def step_losses(mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor) -> tu
 def step_metrics(mean: Tensor, log_std: Tensor, truth: Tensor) -> dict[str, float]:
     """Errors a step: RMSE (m, deg), constant bias (m, deg) and how many predicted deviations the errors have."""
     error = mean - truth
-    error = torch.cat((error[:, :2], se2.wrap(error[:, 2:])), dim=1).double()
+    error = se2.wrapped(error).double()
     return {
         "rmse_m": float(error[:, :2].square().sum(1).mean().sqrt()),
         "rmse_deg": float(error[:, 2].square().mean().sqrt().rad2deg()),

@@ -109,7 +109,7 @@ def trajectory_loss(meta_relative: list[Tensor], truth: Tensor, correction_std: 
 def step_loss(relative: Tensor, truth: Tensor, std: Tensor) -> Tensor:
     """Huber loss on relative poses ``(batch, steps, 3)`` in units of their deviations."""
     step = relative - truth
-    step = torch.cat((step[..., :2], se2.wrap(step[..., 2:])), dim=-1) / std
+    step = se2.wrapped(step) / std
     return huber_loss(step, torch.zeros_like(step), delta=1.0)
 
 

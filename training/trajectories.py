@@ -186,7 +186,7 @@ def correction_scale(data: StoredTrajectories) -> tuple[float, float, float]:
         error = poses_in_blocks(batch["relative"], data.block)[..., -1, :] - se2.g2r(
             batch["truth"][:, data.block - 1 :: data.block]
         )
-        error = torch.cat((error[..., :2], se2.wrap(error[..., 2:])), dim=-1).square()
+        error = se2.wrapped(error).square()
         total, count = total + error.sum(dim=(0, 1)), count + error.shape[1]
     x, y, yaw = (total / count).sqrt().tolist()
     return x, y, yaw

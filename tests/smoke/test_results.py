@@ -113,15 +113,8 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise AssertionError("this is there already")
-
-    for module in (train_compass, train_end_to_end, train_local, train_optimizer, train_place):
-        monkeypatch.setattr(module, "main", refuse)
-    for module in (featurise, throughput, tune_pose_graph):
-        monkeypatch.setattr(module, "main", refuse)
-    monkeypatch.setattr("training.measured.scores", refuse)
+    networks = (train_compass, train_end_to_end, train_local, train_optimizer, train_place)
+    toy.refuse(monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.measured.scores")
     assert results.main(arguments(folder), toy.scripts("maze2d", folder)) == result
 
 

@@ -105,14 +105,8 @@ def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, An
 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise AssertionError("this is there already")
-
-    for module in (train_deepvo, train_end_to_end, train_local, train_optimizer, tune_pose_graph):
-        monkeypatch.setattr(module, "main", refuse)
-    monkeypatch.setattr("training.prerequisites.make_odometry", refuse)
-    monkeypatch.setattr("training.measured.scores", refuse)
+    scripts = (train_deepvo, train_end_to_end, train_local, train_optimizer, tune_pose_graph)
+    toy.refuse(monkeypatch, scripts, "training.prerequisites.make_odometry", "training.measured.scores")
     assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result
 
 

@@ -1,7 +1,9 @@
 """The training scripts at toy size: short episodes, few mazes, thin networks."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -35,6 +37,18 @@ def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> N
     monkeypatch.setattr(streams.PlaceStream, "FRAMES", place_frames)
     for name, world in worlds.WORLDS.items():
         monkeypatch.setitem(worlds.WORLDS, name, dataclasses.replace(world, episode_frames=frames - 1, rows=(4, 4)))
+
+
+def refuse(monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType], *others: str) -> None:
+    """Let the scripts in ``modules``, and functions by their names, fail where they are called."""
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise AssertionError("this is there already")
+
+    for module in modules:
+        monkeypatch.setattr(module, "main", fail)
+    for name in others:
+        monkeypatch.setattr(name, fail)
 
 
 def local(world: str, folder: Path, epochs: int = 1, **changes: Any) -> train_local.Arguments:

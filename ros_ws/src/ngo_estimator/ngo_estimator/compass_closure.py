@@ -127,13 +127,12 @@ def compass_factors(fixes: CompassFixes, gate: CompassGate, lattice: Tensor, pos
     frame = lattice.unsqueeze(1)
     measured = snapped(fixes.readings.double(), se2.between(frame, at), fixes.block_m)
     in_map = se2.compose(frame, measured)
-    residual = torch.cat((in_map[..., :2] - at[..., :2], se2.wrap(in_map[..., 2:] - at[..., 2:])), dim=-1)
+    residual = se2.wrapped(in_map - at)
     information = gate(fixes, residual.to(fixes.readings.dtype), drift.to(fixes.readings.dtype)).double()
     nodes = torch.stack((torch.full_like(fixes.node, poses.shape[1]), fixes.node), dim=-1)
     # One more: the first estimate of the lattice, as seen from the origin.
     prior = torch.cat((torch.zeros_like(nodes[:, :1, :1]), nodes[:, :1, :1]), dim=-1)
-    off = (fixes.lattice.double() - lattice).unsqueeze(1)
-    off = torch.cat((off[..., :2], se2.wrap(off[..., 2:])), dim=-1)
+    off = se2.wrapped((fixes.lattice.double() - lattice).unsqueeze(1))
     certainty = off.new_tensor(_LATTICE_STD).square().reciprocal().expand_as(off)
     return pair_factors(
         torch.cat((nodes, prior), dim=1),

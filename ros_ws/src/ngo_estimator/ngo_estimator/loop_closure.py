@@ -191,8 +191,7 @@ def fuse_views(measured: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor, Ten
         erred independently, and logarithm of their spread ``(..., 2)``.
     """
     precision = torch.exp(-2.0 * log_scale)
-    error = measured - measured[0]
-    error = torch.cat((error[..., :2], se2.wrap(error[..., 2:])), dim=-1)
+    error = se2.wrapped(measured - measured[0])
     weight, mean = precision, torch.zeros_like(measured[0])
     for _ in range(_REWEIGHTINGS + 1):
         by_component = weight[..., [0, 0, 1]]
@@ -201,8 +200,7 @@ def fuse_views(measured: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor, Ten
         squares = torch.stack((left[..., 0] + left[..., 1], left[..., 2]), dim=-1)
         weight = precision / (1.0 + 0.25 * precision * squares)
     spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=SMALLEST_SPREAD).log()
-    fused = measured[0] + mean
-    return torch.cat((fused[..., :2], se2.wrap(fused[..., 2:])), dim=-1), -0.5 * weight.sum(0).log(), spread
+    return se2.wrapped(measured[0] + mean), -0.5 * weight.sum(0).log(), spread
 
 
 def _with_starts(in_blocks: Tensor) -> Tensor:

@@ -70,7 +70,7 @@ class MetaGraph:
         self._kept = np.zeros((0, 3))  # poses of key frames when some were let go last
         self._gone = np.zeros(0, np.int64)  # nodes between these
         self._loops: OnlineLoops | None = None
-        self._registrations = optimizer.config.search.registrations if optimizer.config.loops else 0
+        self._registrations = optimizer.config.registrations
         self._origin_code: np.ndarray | None = None
         if optimizer.config.loops:
             assert pair_head is not None
@@ -207,7 +207,7 @@ class MetaGraph:
             old, new = torch.from_numpy(self._kept), torch.from_numpy(nodes[keys])
             segment = np.searchsorted(keys, self._gone, side="right") - 1
             bent = se2.between(new[:-1], new[1:]) - se2.between(old[:-1], old[1:])
-            bent = torch.cat((bent[:, :2], se2.wrap(bent[:, 2:])), dim=1)
+            bent = se2.wrapped(bent)
             share = torch.from_numpy((self._gone - keys[segment]) / (keys[segment + 1] - keys[segment]))
             relative = se2.between(old[segment], torch.from_numpy(nodes[self._gone]))
             nodes[self._gone] = se2.compose(new[segment], relative + share[:, None] * bent[segment]).numpy()

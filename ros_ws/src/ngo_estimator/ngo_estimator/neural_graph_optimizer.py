@@ -79,6 +79,11 @@ class NeuralGraphOptimizerConfig:
         if not 0.0 < self.covariance_scale < math.inf:
             raise ValueError(f"covariance_scale is {self.covariance_scale}; expected a positive number")
 
+    @property
+    def registrations(self) -> int:
+        """Steps in which scans are registered, 0 where they are not."""
+        return self.search.registrations if self.loops else 0
+
     @classmethod
     def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> "NeuralGraphOptimizerConfig":
         """Nine plain convolutions of kernel 3 over features and attention; no place codes and no loops."""
@@ -234,7 +239,7 @@ class NeuralGraphOptimizer(nn.Module):
 
         Measured again by the scans in the codes, as ``registered_steps`` does, or where it registers nothing as it is.
         """
-        registrations = self.config.search.registrations if self.config.loops else 0
+        registrations = self.config.registrations
         return registered_steps(pair_head, relative, log_std, place_codes, self.block, registrations, origin_code)
 
     def find_loops(self, relative: Tensor, place_codes: Tensor, pair_head: PairHead) -> Loops:
@@ -345,7 +350,7 @@ class NeuralGraphOptimizer(nn.Module):
                 step = step if self.config.robust else self.loop_gain * step
                 after, before_it = se2.g2r(torch.cat((poses + step[:, :nodes], poses))[:, 1:]).chunk(2)
                 change = after - before_it
-                change = torch.cat((change[..., :2], se2.wrap(change[..., 2:])), dim=-1)
+                change = se2.wrapped(change)
                 deviation = deviation + change.to(deviation.dtype)
                 lattice = None if lattice is None else lattice + step[:, nodes]
             results.append(adjusted + deviation)

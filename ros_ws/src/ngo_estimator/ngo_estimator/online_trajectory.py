@@ -99,8 +99,7 @@ class OnlineTrajectory:
             raise ValueError(f"key_frames is {key_frames}; expected at least 2")
         if optimizer.config.loops and pair_head is None:
             raise ValueError("an optimizer with loops needs a pair head")
-        registers = optimizer.config.loops and optimizer.config.search.registrations > 0
-        if registers and (pair_head is None or pair_head.config.registration is None):
+        if optimizer.config.registrations and (pair_head is None or pair_head.config.registration is None):
             raise ValueError("an optimizer that registers scans needs a pair head whose codes hold them")
         self._optimizer, self._pair_head = optimizer.eval(), pair_head
         self._block = block

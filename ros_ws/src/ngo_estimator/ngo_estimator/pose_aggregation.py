@@ -101,8 +101,7 @@ def in_block_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
         meta_relative: corrected relative meta-poses ``(batch, blocks, 3)``.
     """
     block = in_blocks.shape[2]
-    correction = meta_relative - in_blocks[..., -1, :]
-    correction = torch.cat((correction[..., :2], se2.wrap(correction[..., 2:])), dim=-1)
+    correction = se2.wrapped(meta_relative - in_blocks[..., -1, :])
     share = torch.arange(1, block + 1, dtype=in_blocks.dtype, device=in_blocks.device) / block
     return in_blocks + share[:, None] * correction.unsqueeze(-2)
 

@@ -44,25 +44,25 @@ def registered_steps(
     before = ends[:, :-1, -1]
     if origin_code is not None:
         starts = torch.cat((origin_code.unsqueeze(1), before), dim=1)
-        both = registered_blocks(pair_head, steps, deviations, starts, ends, registrations)
+        both = _registered_blocks(pair_head, steps, deviations, starts, ends, registrations)
         return both[0].flatten(1, 2), both[1].flatten(1, 2)
-    first = unanchored_block(pair_head, steps[:, 0], deviations[:, 0], ends[:, 0], registrations)
-    others = registered_blocks(pair_head, steps[:, 1:], deviations[:, 1:], before, ends[:, 1:], registrations)
+    first = _unanchored_block(pair_head, steps[:, 0], deviations[:, 0], ends[:, 0], registrations)
+    others = _registered_blocks(pair_head, steps[:, 1:], deviations[:, 1:], before, ends[:, 1:], registrations)
     new = [torch.cat((one.unsqueeze(1), more), dim=1).flatten(1, 2) for one, more in zip(first, others, strict=True)]
     return new[0], new[1]
 
 
-def unanchored_block(
+def _unanchored_block(
     pair_head: PairHead, relative: Tensor, log_std: Tensor, codes: Tensor, registrations: int
 ) -> tuple[Tensor, Tensor]:
-    """As ``registered_blocks`` for blocks whose start has no code: registered to the frame after their first step."""
-    rest = registered_blocks(
+    """As ``_registered_blocks`` for blocks whose start has no code: registered to the frame after their first step."""
+    rest = _registered_blocks(
         pair_head, relative[..., 1:, :], log_std[..., 1:, :], codes[..., 0, :], codes[..., 1:, :], registrations
     )
     return torch.cat((relative[..., :1, :], rest[0]), dim=-2), torch.cat((log_std[..., :1, :], rest[1]), dim=-2)
 
 
-def registered_blocks(
+def _registered_blocks(
     pair_head: PairHead, relative: Tensor, log_std: Tensor, start_codes: Tensor, codes: Tensor, registrations: int
 ) -> tuple[Tensor, Tensor]:
     """The steps of blocks ``(..., block, 3)``, measured again.

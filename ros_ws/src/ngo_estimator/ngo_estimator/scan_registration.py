@@ -128,14 +128,12 @@ def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Te
         lever = normal[..., 1] * turned[..., 0] - normal[..., 0] * turned[..., 1]
         jacobian = torch.cat((normal, lever.unsqueeze(-1)), dim=-1)
         weighted = jacobian * (weight / config.noise_m**2).unsqueeze(-1)
-        moved = start - pose
-        moved = torch.cat((moved[:, :2], se2.wrap(moved[:, 2:])), dim=-1)
+        moved = se2.wrapped(start - pose)
         information = weighted.mT @ jacobian + torch.diag_embed(prior)
         gradient = -(weighted * distance.unsqueeze(-1)).sum(1) + prior * moved
         pose = pose + torch.linalg.solve(information, gradient)
         share = weight.sum(-1) / both.sum(-1).clamp(min=_SEEN_BY_BOTH * config.rays)
-    pose = torch.cat((pose[:, :2], se2.wrap(pose[:, 2:])), dim=-1)
-    return _where_better(start, log_std, prior, pose, information, share)
+    return _where_better(start, log_std, prior, se2.wrapped(pose), information, share)
 
 
 def _surfaces(a: Tensor, b: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -158,8 +156,7 @@ def _surfaces(a: Tensor, b: Tensor, directions: Tensor) -> tuple[Tensor, Tensor,
 def _where_better(
     start: Tensor, log_std: Tensor, prior: Tensor, pose: Tensor, information: Tensor, share: Tensor
 ) -> tuple[Tensor, Tensor]:
-    moved = pose - start
-    moved = torch.cat((moved[:, :2], se2.wrap(moved[:, 2:])), dim=-1)
+    moved = se2.wrapped(pose - start)
     covariance = torch.linalg.inv(information)
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     after = torch.stack((variance[:, :2].mean(-1), variance[:, 2]), dim=-1).log() * 0.5

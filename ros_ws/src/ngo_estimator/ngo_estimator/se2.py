@@ -17,6 +17,11 @@ def wrap(angle: Tensor) -> Tensor:
     return angle - 2.0 * math.pi * turns
 
 
+def wrapped(poses: Tensor) -> Tensor:
+    """Poses, or differences of poses, with their yaw in ``(-pi, pi]``."""
+    return torch.cat((poses[..., :2], wrap(poses[..., 2:])), dim=-1)
+
+
 def rotate(yaw: Tensor, xy: Tensor) -> Tensor:
     """Rotate vectors ``xy`` of shape ``(..., 2)`` by ``yaw`` of shape ``(...)``."""
     cos, sin = torch.cos(yaw), torch.sin(yaw)
