@@ -33,7 +33,7 @@ class Features(BaseFeaturesExtractor):
         self.hidden = nn.Linear(int(np.prod(config.feature_shape)) + SENSES, config.hidden)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """(batch, 2 hidden) of pictures (batch, pictures, height, width) in [0, 1] and senses (batch, 6)."""
+        """(batch, 2 hidden) of pictures (batch, pictures, height, width) in [0, 1] and senses (batch, 8)."""
         pictures, senses = observations["pictures"], observations["senses"]
         mirrored_senses = senses[:, list(MIRRORED_SENSES)] * senses.new_tensor(MIRRORED_SIGNS)
         seen = self.convolutions(torch.cat((pictures, pictures.flip(-1))))

@@ -23,7 +23,7 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
     """Mazes of the training split of a world, each driven through once for ``frames`` frames.
 
     Observations are what PolicyView holds, as a dict: ``pictures`` uint8 (pictures, height, width) and ``senses``
-    float32 (6,). A step is a decision: config.hold_frames frames of the simulator, taken at once. Its reward is the
+    float32 (8,). A step is a decision: config.hold_frames frames of the simulator, taken at once. Its reward is the
     distance travelled in m times REWARD_PER_M. ``mazes`` of one size are made at a time. Which mazes come is a function
     of ``stream``, any sequence of whole numbers.
     """

@@ -51,7 +51,7 @@ class Arguments:
     """Mazes of one size that an environment makes at a time."""
     learning_rate: float = 7e-4
     """At the beginning; it falls to zero along a line."""
-    discount: float = 0.97
+    discount: float = 0.98
     """Worth of a reward one decision later."""
     entropy: float = 0.04
     """Weight of the entropy of the actions in the loss, at the beginning; it falls to zero as well."""

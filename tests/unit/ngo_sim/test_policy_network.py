@@ -64,15 +64,32 @@ def test_a_view_holds_the_newest_pictures_and_the_motion_between_decisions() -> 
     grey = [grey_picture(frame, 6, 8) for frame in frames]
     view.see(frames[0], np.array((1.0, 2.0, math.pi / 2)))
     np.testing.assert_array_equal(view.pictures, [grey[0], grey[0]])
-    assert view.senses.tolist() == [0.0] * 6
+    assert view.senses.tolist() == [0.0] * 8
     view.did(Action.TURN_LEFT)
     view.see(frames[1], np.array((0.75, 2.5, -math.pi + 0.25)))
     np.testing.assert_array_equal(view.pictures, [grey[1], grey[0]])
-    np.testing.assert_allclose(view.senses, [0, 1, 0, 0.5, 0.25, math.pi / 2 + 0.25], atol=1e-6)
+    np.testing.assert_allclose(view.senses, [0, 1, 0, 0.5, 0.25, math.pi / 2 + 0.25, 0.0, 0.0], atol=1e-6)
     view.did(Action.FORWARD)
     view.see(frames[2], np.array((0.75, 2.5, -math.pi + 0.25)))
     np.testing.assert_array_equal(view.pictures, [grey[2], grey[1]])
-    assert view.senses.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert view.senses.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_a_view_knows_the_way_since_the_last_bend_and_the_one_before() -> None:
+    view, frame = PolicyView(SMALL), pictures(1)[0]
+    drive = (
+        [(x, 0.0, 0.1 * (-1) ** x) for x in range(6)]  # 5 m, hardly straight
+        + [(5.0, 0.5, math.radians(60)), (5.0, 1.0, math.radians(110))]  # two bends, too little way between them
+        + [(5.0, 1.0 + y, math.pi / 2) for y in (1.0, 2.0, 3.0)]
+    )
+    seen = []
+    for pose in drive:
+        view.see(frame, np.array(pose))
+        seen.append(view.senses[-2:].tolist())
+    np.testing.assert_allclose(seen[5], [0.5, 0.0], atol=1e-6)
+    np.testing.assert_allclose(seen[6], [0.0, 0.55], atol=1e-6)
+    np.testing.assert_allclose(seen[7], [0.0, 0.55], atol=1e-6)
+    np.testing.assert_allclose(seen[-1], [0.3, 0.55], atol=1e-6)
 
 
 def test_the_forward_pass_is_that_of_the_definition() -> None:
@@ -89,8 +106,8 @@ def test_the_forward_pass_is_that_of_the_definition() -> None:
         return np.maximum(tensors["hidden.weight"] @ np.array([*values, *senses]) + tensors["hidden.bias"], 0.0)
 
     images = view.pictures / 255.0
-    a, b, c, forward, left, turned = view.senses
-    own, other = hidden(images, view.senses), hidden(images[:, :, ::-1], np.array((a, c, b, forward, -left, -turned)))
+    a, b, c, forward, left, turned, way, earlier = view.senses
+    own, other = hidden(images, view.senses), hidden(images[:, :, ::-1], np.array((a, c, b, forward, -left, -turned, way, earlier)))
     ahead, turn = tensors["common.weight"] @ (own + other) + tensors["common.bias"]
     (side,) = tensors["turn.weight"] @ (own - other)
     expected = (ahead, turn + side, turn - side)
@@ -152,7 +169,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
         (tensors, {"network": "optimizer"}, "is not the description of a driver of format 1"),
         (tensors, {"sha256": "0"}, "is not the file that driver.json describes"),
         (tensors, {"config": {**config, "size": 3}}, "expected an object with height, width, pictures"),
-        (tensors, {"config": {**config, "hidden": 6}}, "hidden.weight has shape (5, 24); expected (6, 24)"),
+        (tensors, {"config": {**config, "hidden": 6}}, "hidden.weight has shape (5, 26); expected (6, 26)"),
         (infinite, {}, "hidden.bias has shape (5,); expected (5,), all finite"),
     ]
     for given, changes, expected in cases:

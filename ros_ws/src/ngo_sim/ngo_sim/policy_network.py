@@ -18,11 +18,15 @@ FORMAT = 1
 NETWORK = "driver"
 SHIPPED = Path(__file__).with_name("weights") / "driver.safetensors"
 ACTIONS = 3
-SENSES = ACTIONS + 3
-MIRRORED_SENSES = (0, 2, 1, 3, 4, 5)
+SENSES = ACTIONS + 5
+MIRRORED_SENSES = (0, 2, 1, 3, 4, 5, 6, 7)
 """Where each of the senses is found for a robot in a mirror: left and right actions exchanged."""
-MIRRORED_SIGNS = (1.0, 1.0, 1.0, 1.0, -1.0, -1.0)
+MIRRORED_SIGNS = (1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 """What they are multiplied by then: motion to the left and turning have the other sign."""
+
+_BEND_RAD = math.radians(45.0)
+_SHORTEST_RUN_M = 2.0
+_RUN_UNIT_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,13 @@ class PolicyConfig:
 
 
 class PolicyView:
-    """What the network looks at: the pictures of the newest decisions, and how it moved since the last one.
+    """What the network looks at: the pictures of the newest decisions, how it moved since the last one, and how far.
 
-    pictures: uint8 (pictures, height, width), the newest first. senses: float32 (6,), 1 for the last of the three
-    actions, then the motion since it was decided on: m forward, m to the left, rad counter-clockwise; at the first
-    decision all 0.
+    pictures: uint8 (pictures, height, width), the newest first. senses: float32 (8,), 1 for the last of the three
+    actions; the motion since it was decided on: m forward, m to the left, rad counter-clockwise; and in units of 10 m
+    the way since the last bend and the way before it, between two bends: whether it is worth to turn back is not to be
+    seen at the end of a corridor. A bend is where the heading has left that of the last bend by over 45 degrees; ways of
+    less than 2 m belong to it. At the first decision all senses are 0.
     """
 
     def __init__(self, config: PolicyConfig) -> None:
@@ -86,6 +92,7 @@ class PolicyView:
         self.pictures = np.zeros((config.pictures, config.height, config.width), dtype=np.uint8)
         self.senses = np.zeros(SENSES, dtype=np.float32)
         self._last_pose: tuple[float, float, float] | None = None
+        self._bend_yaw, self._run_m, self._earlier_run_m = 0.0, 0.0, 0.0
 
     def see(self, observation: npt.NDArray[np.uint8], pose_xyyaw: npt.NDArray[np.float64]) -> None:
         """Take in what is seen at a decision, and where; the first picture counts as having been seen all the time."""
@@ -93,11 +100,18 @@ class PolicyView:
         x, y, yaw = pose_xyyaw.tolist()
         if self._last_pose is None:
             self.pictures[:] = picture
+            self._bend_yaw = yaw
         else:
             last_x, last_y, last_yaw = self._last_pose
             dx, dy, cos, sin = x - last_x, y - last_y, math.cos(last_yaw), math.sin(last_yaw)
             turned = math.remainder(yaw - last_yaw, math.tau)
-            self.senses[ACTIONS:] = cos * dx + sin * dy, cos * dy - sin * dx, turned
+            self._run_m += math.hypot(dx, dy)
+            if abs(math.remainder(yaw - self._bend_yaw, math.tau)) > _BEND_RAD:
+                if self._run_m >= _SHORTEST_RUN_M:
+                    self._earlier_run_m = self._run_m
+                self._bend_yaw, self._run_m = yaw, 0.0
+            ways = self._run_m / _RUN_UNIT_M, self._earlier_run_m / _RUN_UNIT_M
+            self.senses[ACTIONS:] = cos * dx + sin * dy, cos * dy - sin * dx, turned, *ways
         self._last_pose = x, y, yaw
         self.pictures[1:] = self.pictures[:-1].copy()
         self.pictures[0] = picture
