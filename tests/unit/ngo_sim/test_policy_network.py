@@ -107,7 +107,8 @@ def test_the_forward_pass_is_that_of_the_definition() -> None:
 
     images = view.pictures / 255.0
     a, b, c, forward, left, turned, way, earlier = view.senses
-    own, other = hidden(images, view.senses), hidden(images[:, :, ::-1], np.array((a, c, b, forward, -left, -turned, way, earlier)))
+    mirrored = np.array((a, c, b, forward, -left, -turned, way, earlier))
+    own, other = hidden(images, view.senses), hidden(images[:, :, ::-1], mirrored)
     ahead, turn = tensors["common.weight"] @ (own + other) + tensors["common.bias"]
     (side,) = tensors["turn.weight"] @ (own - other)
     expected = (ahead, turn + side, turn - side)

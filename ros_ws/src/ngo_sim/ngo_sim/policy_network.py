@@ -82,9 +82,9 @@ class PolicyView:
 
     pictures: uint8 (pictures, height, width), the newest first. senses: float32 (8,), 1 for the last of the three
     actions; the motion since it was decided on: m forward, m to the left, rad counter-clockwise; and in units of 10 m
-    the way since the last bend and the way before it, between two bends: whether it is worth to turn back is not to be
-    seen at the end of a corridor. A bend is where the heading has left that of the last bend by over 45 degrees; ways of
-    less than 2 m belong to it. At the first decision all senses are 0.
+    the way since the last bend and the way before that bend, because at the end of a corridor its length is not to be
+    seen. A bend is where the heading has left that of the last bend by over 45 degrees; ways of less than 2 m belong to
+    it. At the first decision all senses are 0.
     """
 
     def __init__(self, config: PolicyConfig) -> None:
