@@ -1,4 +1,6 @@
+import hashlib
 import importlib.util
+import itertools
 import re
 import struct
 import subprocess
@@ -11,12 +13,16 @@ import numpy as np
 import pytest
 
 from ngo_sim.doom_map import (
+    DECORATIONS,
     FLATS,
+    TEXTURE_SETS,
     UNITS_PER_M,
     WALL_HEIGHT_UNITS,
     WALL_TEXTURES,
+    Decoration,
     MapStyle,
     map_lumps,
+    random_decorations,
     random_style,
     textmap,
     wall_faces,
@@ -108,6 +114,58 @@ def test_a_style_is_a_function_of_the_generator_and_uses_all_textures() -> None:
     assert style != random_style(5000, np.random.default_rng(4))
     assert set(style.wall_textures) == set(WALL_TEXTURES)
     assert {style.floor, style.ceiling} <= set(FLATS) and style.floor != style.ceiling
+
+
+def test_a_map_without_choices_is_what_it_has_always_been() -> None:
+    """Mazes that networks were trained in must not change, not by a byte."""
+    maze, rng = small_maze(), np.random.default_rng(1)
+    text = textmap(maze, random_style(len(wall_faces(maze.walls)), rng), (4.5, 10.5), 30)
+    expected = "a683c533e56d8b33df397007b7012bd818676899f6f37347d2cc6f29fe880db1"
+    assert hashlib.sha256(text.encode()).hexdigest() == expected
+
+
+def test_texture_sets_share_nothing_and_are_everything_together() -> None:
+    assert TEXTURE_SETS["all"].walls == WALL_TEXTURES and TEXTURE_SETS["all"].flats == FLATS
+    parts = [names for name, names in TEXTURE_SETS.items() if name != "all"]
+    assert len(parts) >= 4
+    for a, b in itertools.combinations(parts, 2):
+        assert not set(a.walls) & set(b.walls) and not set(a.flats) & set(b.flats)
+    assert sorted(name for part in parts for name in part.walls) == sorted(WALL_TEXTURES)
+    assert sorted(name for part in parts for name in part.flats) == sorted(FLATS)
+
+
+@pytest.mark.parametrize("name", TEXTURE_SETS)
+def test_a_style_has_all_of_its_set_and_nothing_else(name: str) -> None:
+    style = random_style(2000, np.random.default_rng(3), textures=name)
+    assert set(style.wall_textures) == set(TEXTURE_SETS[name].walls)
+    assert {style.floor, style.ceiling} <= set(TEXTURE_SETS[name].flats) and style.floor != style.ceiling
+
+
+def test_an_unknown_set_of_textures_is_refused() -> None:
+    with pytest.raises(ValueError, match="textures is 'wool'; it must be one of all, stone, brick, tech, industrial"):
+        random_style(4, np.random.default_rng(0), textures="wool")
+
+
+def test_decorations_are_of_all_kinds_in_free_blocks_and_off_the_walls() -> None:
+    maze = small_maze()
+    drawn = random_decorations(maze, 500, np.random.default_rng(0))
+    assert len(drawn) == 500 and {item.kind for item in drawn} == set(DECORATIONS)
+    assert drawn == random_decorations(maze, 500, np.random.default_rng(0))
+    assert random_decorations(maze, 0, np.random.default_rng(0)) == ()
+    for item in drawn:
+        for dx, dy in itertools.product((-0.49, 0.49), repeat=2):
+            assert not maze.walls[maze.block_at(item.x_m + dx, item.y_m + dy)]
+
+
+def test_decorations_are_things_behind_all_that_was_there_before() -> None:
+    maze = small_maze()
+    style = random_style(len(wall_faces(maze.walls)), np.random.default_rng(1))
+    bare = textmap(maze, style, (4.5, 10.5), 90)
+    text = textmap(maze, style, (4.5, 10.5), 90, [Decoration(34, 4.25, 10.5)])
+    assert text.startswith(bare)
+    player, candle = blocks_of(text, "thing")
+    assert (candle["type"], float(candle["x"]), float(candle["y"])) == ("34", 136.0, 336.0)
+    assert {**candle, "type": "1", "x": player["x"], "angle": "90"} == player
 
 
 def test_mistakes_in_a_map_are_told() -> None:

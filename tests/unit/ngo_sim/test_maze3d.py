@@ -17,10 +17,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ngo_sim.doom_map import (
+    DECORATIONS,
     FLATS,
+    TEXTURE_SETS,
     UNITS_PER_M,
     WALL_HEIGHT_UNITS,
     WALL_TEXTURES,
+    Decoration,
     MapStyle,
     textmap,
     wall_faces,
@@ -330,6 +333,71 @@ def test_textures_vary_from_face_to_face(shared: Maze3D) -> None:
     assert len(set(texts)) == 3
 
 
+def test_worlds_without_choices_are_what_they_have_always_been() -> None:
+    """Networks were trained in them, and seeds of results name them: not a byte may change."""
+    env = Maze3D(Maze3DConfig(textures="all", decorations=0))
+    texts = [env._build_world(*seeds).text for seeds in ((0, 0), (7, 7), (5, 9))]
+    assert [hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts] == [
+        "3fbfe24e0b811895", "14763fad43d50ea4", "4506b3e688bddc5e"]  # fmt: skip
+    env.close()
+
+
+@pytest.mark.parametrize("maze_seed", [3, 4])
+def test_textures_light_and_decorations_change_nothing_else(maze_seed: int) -> None:
+    def things(text: str) -> list[str]:
+        return [line for line in text.splitlines() if not line.startswith(("sidedef", "sector"))]
+
+    plain = Maze3D()._build_world(3, maze_seed)
+    for name in TEXTURE_SETS:
+        world = Maze3D(Maze3DConfig(textures=name, light_level=150, decorations=12))._build_world(3, maze_seed)
+        np.testing.assert_array_equal(world.maze.walls, plain.maze.walls)
+        assert things(world.text)[:-12] == things(plain.text)
+        assert set(re.findall(r'texturemiddle="([^"]+)"', world.text)) <= set(TEXTURE_SETS[name].walls)
+        assert set(re.findall(r'texture(?:floor|ceiling)="([^"]+)"', world.text)) <= set(TEXTURE_SETS[name].flats)
+    # Those of a maze do not depend on where one starts in it.
+    assert things(world.text)[-12:] == things(Maze3D(world_config(12))._build_world(9, maze_seed).text)[-12:]
+
+
+def world_config(decorations: int) -> Maze3DConfig:
+    return Maze3DConfig(actuation_noise=0.0, decorations=decorations)
+
+
+class Decorated(Room):
+    """The room with one decoration in the way, the one of the seed; none for seed 0."""
+
+    def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
+        style = MapStyle(("MARBGRAY",) * len(FACES), "FLAT8", "FLAT5")
+        things = [Decoration(DECORATIONS[seed - 1], 12.0, 15.0)] if seed else []
+        return DoomWorld(ROOM, textmap(ROOM, style, (12.0, 12.5), 90, things))
+
+
+def test_every_decoration_is_seen_stays_as_it_is_and_is_in_nobodys_way() -> None:
+    walker = Decorated(EXACT, render_mode="rgb_array")
+    watcher = Decorated(Maze3DConfig(turn_deg=0.0), render_mode="rgb_array")
+    for env in (walker, watcher):
+        env.preload(range(len(DECORATIONS) + 1))
+    bare, free = drive(walker, 0, [FORWARD] * 40)
+    assert free[-1, 1] > 18.0  # past where they are
+    for seed, kind in enumerate(DECORATIONS, start=1):
+        pictures, poses = drive(walker, seed, [FORWARD] * 40)
+        np.testing.assert_array_equal(poses, free)
+        assert (pictures[0] != bare[0]).any(axis=-1).sum() > 40, kind
+        np.testing.assert_array_equal(pictures[-1], bare[-1])  # it was not carried along
+        pictures, _ = drive(watcher, seed, [LEFT] * 45)
+        assert (pictures == pictures[0]).all(), kind
+    for env in (walker, watcher):
+        env.close()
+
+
+def test_a_decorated_maze_is_driven_as_the_bare_one() -> None:
+    bare, decorated = (Maze3D(world_config(count), render_mode="rgb_array") for count in (0, 60))
+    actions = [*itertools.islice(itertools.cycle((FORWARD, FORWARD, LEFT, FORWARD, FORWARD, RIGHT)), 150)]
+    (pictures, poses), (others, same) = drive(bare, 2, actions), drive(decorated, 2, actions)
+    np.testing.assert_array_equal(poses, same)
+    assert (pictures != others).any(axis=(1, 2, 3)).mean() > 0.5
+    bare.close(), decorated.close()
+
+
 def test_same_seed_same_bytes(shared: Maze3D) -> None:
     """Preloaded or not, first or after other episodes, alone or beside another environment."""
     expected = digest(shared, 6)
@@ -513,7 +581,9 @@ def test_an_engine_that_dies_is_told_and_started_again(temporary: Path) -> None:
      ("width", 81, "one of 80 x 60"), ("height", 80, "one of 80 x 60"),
      ("field_of_view_deg", 108.5, "an integer from 30 to 150"), ("field_of_view_deg", 180, "from 30 to 150"),
      ("frame_skip", 0, "from 1 to 35"), ("thrust", 51, "from 1 to 50"), ("turn_deg", 91.0, "from 0 to 90"),
-     ("turn_decay", 1.0, "from 0 to 0.99"), ("light_level", 256, "from 0 to 255")],
+     ("turn_decay", 1.0, "from 0 to 0.99"), ("light_level", 256, "from 0 to 255"),
+     ("textures", "wool", "one of all, stone, brick, tech, industrial"), ("decorations", -1, "from 0 to 1000"),
+     ("decorations", 1001, "from 0 to 1000"), ("decorations", 2.0, "an integer from 0 to 1000")],
 )  # fmt: skip
 def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(field: str, value: Any, allowed: str) -> None:
     with pytest.raises(ValueError, match=field) as caught:

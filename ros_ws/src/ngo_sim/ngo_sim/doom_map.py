@@ -44,6 +44,48 @@ FLATS: tuple[str, ...] = (
     "RROCK16", "SLIME16",
 )  # fmt: skip
 
+
+@dataclass(frozen=True)
+class TextureSet:
+    """What a maze may be clad with: names of textures for its walls, of flats for its floor and its ceiling."""
+
+    walls: tuple[str, ...]
+    flats: tuple[str, ...]
+
+
+TEXTURE_SETS: dict[str, TextureSet] = {
+    "all": TextureSet(WALL_TEXTURES, FLATS),
+    "stone": TextureSet(
+        ("A-CAMO1", "A-CAMO3", "A-CAMO4", "A-CONCTE", "A-MOSRK2", "A-MOSROK", "AQCONC06", "AQCONC13",
+         "AROCK2", "CARLLF2", "CEMENT7", "MARBGRAY", "SP_ROCK1", "STONE7", "STONEW5"),
+        ("AQF025", "GRASS1", "MFLR8_3", "RROCK11", "RROCK16"),
+    ),
+    "brick": TextureSet(
+        ("A-BROCK2", "A-DBRI28", "A-TILE", "AQBRIK02", "AQBRIK03", "AQTILE02", "BIGBRIK3", "BRONZE4",
+         "BROWN1", "BSTONE3", "SPACEW4", "STWALL", "ZZWOLF9"),
+        ("AQF047", "FLAT8", "FLOOR5_2", "SLIME16"),
+    ),
+    "tech": TextureSet(
+        ("COMPOHSO", "COMPUTE1", "CRATE3", "ESPIG2", "GRAYTAN9", "LITE2", "LITEMET", "MODWALL3",
+         "SHAWN01", "SILVER2", "STARG2", "STARTAN2", "TEKGREN3"),
+        ("CEIL3_2", "FLAT5_4", "FLOOR0_1", "FLOOR0_7"),
+    ),
+    "industrial": TextureSet(
+        ("AQPANL03", "AQRUST06", "AQSECT04", "AQSECT10", "AQTRIM01", "AQTRIM07", "PANBLUE", "PANBOOK",
+         "PIPE8", "PIPES", "REDWALL", "SPACEW2", "WOODMET2"),
+        ("AQF027", "AQF057", "FLAT1_1", "FLAT5", "FLOOR4_6"),
+    ),
+}  # fmt: skip
+"""Everything by the name "all", and its parts by what they look like: every texture and flat is in one of these."""
+
+DECORATIONS: tuple[int, ...] = (10, 15, 18, 19, 20, 21, 22, 24, 34, 59, 60, 61, 62, 79, 80, 81)
+"""Doom's numbers of the things that decorate: remains on the floor, a candle, what hangs from the ceiling.
+
+None of them moves, is in the way or can be taken; 12 looks like 10, 23 vanishes at once and 63 twitches.
+"""
+
+_DECORATION_GAP_M = 0.5  # between a decoration's middle and the walls of its block
+
 _LUMP_NAME = re.compile(r"[A-Z0-9_\-\[\]\\]{1,8}")
 
 
@@ -66,6 +108,15 @@ class MapStyle:
     def __post_init__(self) -> None:
         if not 0 <= self.light_level <= 255:
             raise ValueError(f"light_level is {self.light_level}; it must be from 0 to 255")
+
+
+@dataclass(frozen=True)
+class Decoration:
+    """One of DECORATIONS, and where it stands or hangs, m, in the maze's frame."""
+
+    kind: int
+    x_m: float
+    y_m: float
 
 
 def wall_faces(walls: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -100,21 +151,49 @@ def wall_faces(walls: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.concatenate(faces)
 
 
-def random_style(face_count: int, rng: np.random.Generator, light_level: int = 208) -> MapStyle:
-    """Draw a wall texture for each of ``face_count`` faces, one floor and one ceiling."""
-    textures = rng.integers(len(WALL_TEXTURES), size=face_count)
-    floor, ceiling = rng.choice(len(FLATS), size=2, replace=False)
-    return MapStyle(tuple(WALL_TEXTURES[i] for i in textures), FLATS[floor], FLATS[ceiling], light_level)
+def random_style(
+    face_count: int, rng: np.random.Generator, light_level: int = 208, textures: str = "all"
+) -> MapStyle:
+    """Draw a wall texture for each of ``face_count`` faces, one floor and one ceiling, out of a set of textures.
+
+    Raises:
+        ValueError: If ``textures`` is none of TEXTURE_SETS.
+    """
+    if textures not in TEXTURE_SETS:
+        raise ValueError(f"textures is {textures!r}; it must be one of {', '.join(TEXTURE_SETS)}")
+    walls, flats = TEXTURE_SETS[textures].walls, TEXTURE_SETS[textures].flats
+    drawn = rng.integers(len(walls), size=face_count)
+    floor, ceiling = rng.choice(len(flats), size=2, replace=False)
+    return MapStyle(tuple(walls[i] for i in drawn), flats[floor], flats[ceiling], light_level)
 
 
-def textmap(maze: Maze, style: MapStyle, start_xy: tuple[float, float], start_heading_deg: int) -> str:
-    """Return the UDMF text of a maze: one sector, one line a wall face, the player and nothing else.
+def random_decorations(maze: Maze, count: int, rng: np.random.Generator) -> tuple[Decoration, ...]:
+    """Draw ``count`` decorations, each anywhere in a free block but near its walls."""
+    free = maze.free_blocks()
+    kinds = rng.choice(DECORATIONS, size=count)
+    centers = maze.block_center(free[rng.integers(len(free), size=count)])
+    reach = maze.block_m / 2 - _DECORATION_GAP_M
+    positions = centers + rng.uniform(-reach, reach, size=(count, 2))
+    return tuple(
+        Decoration(int(kind), float(x), float(y)) for kind, (x, y) in zip(kinds, positions, strict=True)
+    )
+
+
+def textmap(
+    maze: Maze,
+    style: MapStyle,
+    start_xy: tuple[float, float],
+    start_heading_deg: int,
+    decorations: Iterable[Decoration] = (),
+) -> str:
+    """Return the UDMF text of a maze: one sector, one line a wall face, the player and what decorates.
 
     Args:
         maze: The maze; a block is ``maze.block_m * UNITS_PER_M`` units wide.
         style: Textures, one for each face of ``wall_faces(maze.walls)``.
         start_xy: Where the player starts, m, in the maze's frame.
         start_heading_deg: Its heading in whole degrees (the format has no finer), counter-clockwise from x.
+        decorations: What else is in the maze.
 
     Raises:
         ValueError: If the number of textures differs from the number of faces, or the start is inside a wall.
@@ -130,8 +209,7 @@ def textmap(maze: Maze, style: MapStyle, start_xy: tuple[float, float], start_he
     x, y = (value * UNITS_PER_M for value in start_xy)
     parts = [
         'namespace="zdoom";\n',
-        f"thing{{type=1;x={x:.4f};y={y:.4f};angle={int(start_heading_deg) % 360};"
-        "skill1=true;skill2=true;skill3=true;skill4=true;skill5=true;single=true;coop=true;dm=true;}\n",
+        _thing(1, x, y, int(start_heading_deg) % 360),
         f'sector{{heightfloor=0;heightceiling={WALL_HEIGHT_UNITS};texturefloor="{style.floor}";'
         f'textureceiling="{style.ceiling}";lightlevel={style.light_level};}}\n',
     ]
@@ -140,7 +218,15 @@ def textmap(maze: Maze, style: MapStyle, start_xy: tuple[float, float], start_he
     parts += [
         f"linedef{{v1={v1};v2={v2};sidefront={side};blocking=true;}}\n" for side, (v1, v2) in enumerate(ends)
     ]
+    parts += [_thing(item.kind, item.x_m * UNITS_PER_M, item.y_m * UNITS_PER_M, 0) for item in decorations]
     return "".join(parts)
+
+
+def _thing(kind: int, x: float, y: float, angle: int) -> str:
+    return (
+        f"thing{{type={kind};x={x:.4f};y={y:.4f};angle={angle};"
+        "skill1=true;skill2=true;skill3=true;skill4=true;skill5=true;single=true;coop=true;dm=true;}\n"
+    )
 
 
 def map_lumps(maps: Iterable[tuple[str, str]]) -> list[Lump]:

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from ngo_sim.doom_engine import RESOLUTIONS, DoomEngine
 from ngo_sim.doom_level import DoomLevel, load_level
-from ngo_sim.doom_map import PLAYER_RADIUS_UNITS, UNITS_PER_M, map_lumps, random_style, textmap, wall_faces
+from ngo_sim.doom_map import (
+    PLAYER_RADIUS_UNITS,
+    TEXTURE_SETS,
+    UNITS_PER_M,
+    map_lumps,
+    random_decorations,
+    random_style,
+    textmap,
+    wall_faces,
+)
 from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_maze_size, kruskal_maze
 
@@ -46,6 +55,8 @@ class Maze3DConfig:
     turn_deg: float = 2.2  # gain of turn rate by one turn action, degrees a step [0 to 90]
     turn_decay: float = 0.75  # share of the turn rate that a step leaves [0 to 0.99]
     light_level: int = 208  # of the whole maze, 0 is black [0 to 255]
+    textures: str = "all"  # set that walls, floor and ceiling are drawn from [all, stone, brick, tech or industrial]
+    decorations: int = 0  # things that lie, stand or hang in the maze and are in nobody's way [0 to 1000]
     wad: str = ""  # Doom map to walk in instead of a maze: its file [a WAD file, or the name of one that ViZDoom ships]
     map: str = ""  # name of the map in that file, as MAP01 [a map of the wad; empty without one]
 
@@ -63,6 +74,9 @@ class Maze3DConfig:
         _check_number("turn_deg", self.turn_deg, 0.0, 90.0)
         _check_number("turn_decay", self.turn_decay, 0.0, 0.99)
         _check_integer("light_level", self.light_level, 0, 255)
+        if self.textures not in TEXTURE_SETS:
+            raise ValueError(f"textures is {self.textures!r}; it must be one of {', '.join(TEXTURE_SETS)}")
+        _check_integer("decorations", self.decorations, 0, 1000)
         if bool(self.wad) != bool(self.map):
             raise ValueError(f"wad is {self.wad!r} and map is {self.map!r}; they must be given both, or neither")
 
@@ -97,9 +111,10 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     themselves. info has "pose_xyyaw", float64 (3,) in the maze's frame (m, m, rad in [-pi, pi],
     counter-clockwise) at the very tic that the picture shows, and "time_s" since the reset.
 
-    reset(seed=s) makes maze, textures, start and noise functions of s and the config, to the byte, preloaded
-    or not. Option "maze_seed" of reset takes maze and textures of another seed; start and noise remain those of
-    s. A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
+    reset(seed=s) makes maze, textures, decorations, start and noise functions of s and the config, to the byte,
+    preloaded or not. Maze, start and noise are the same with any textures, light and decorations. Option
+    "maze_seed" of reset takes maze, textures and decorations of another seed; start and noise remain those of s.
+    A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
     door opens to who walks against it. Raises ValueError for a map that is not there.
 
     The engine is a process with files of its own, which end with close(), with the environment or
@@ -218,11 +233,17 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         config = self.config
         maze_rng, rng = _generator(maze_seed, stream=0), _generator(maze_seed, stream=1)
         maze = kruskal_maze(config.rows, config.cols, maze_rng, config.extra_openings, config.block_m)
-        style = random_style(len(wall_faces(maze.walls)), rng, config.light_level)
+        face_count = len(wall_faces(maze.walls))
+        style = random_style(face_count, rng, config.light_level)
+        if config.textures != "all":
+            # Drawn beside the other, after which the start is the same.
+            style = random_style(face_count, _generator(maze_seed, stream=5), config.light_level, config.textures)
+        decorations = random_decorations(maze, config.decorations, _generator(maze_seed, stream=6))
         rng = rng if seed == maze_seed else _generator(seed, stream=4)
         start_x, start_y = maze.block_center(rng.choice(maze.free_blocks()))
         start_heading_deg = int(rng.integers(360))
-        return DoomWorld(maze, textmap(maze, style, (float(start_x), float(start_y)), start_heading_deg))
+        start_xy = float(start_x), float(start_y)
+        return DoomWorld(maze, textmap(maze, style, start_xy, start_heading_deg, decorations))
 
     def _load(self, worlds: dict[_Seeds, DoomWorld]) -> None:
         texts = [world.text for world in worlds.values()]
@@ -246,7 +267,8 @@ def mean_2x2(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _generator(seed: int, stream: int) -> np.random.Generator:
     """Return one of the independent generators of a seed.
 
-    0: maze, 1: textures and start, 2: actuation noise, 4: start in the maze of another seed (3 is the driver's).
+    0: maze, 1: textures and start, 2: actuation noise, 4: start in the maze of another seed, 5: textures of a part
+    of them, 6: decorations (3 is the driver's).
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
 
