@@ -29,13 +29,16 @@ from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from training import runs
 from training.domains import Domain
+from training.looks import LooksName, check_looks
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedSteps
 from training.streams import Batch, PairStream, Share, images_of, loader, relative_poses, simulate
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
 HEADING_WEIGHT = 3.0
 LIKELIHOOD_WEIGHT = 0.1
+_ONE_LOOK = 4
+"""Mazes of one look among those that a network is measured and calibrated in, where looks are drawn."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Arguments(runs.TrainerArguments):
     """Recordings to train on instead."""
     without_action: bool = False
     """Whether the network of a world is to do without the actions, from the images alone."""
+    looks: LooksName | None = None
+    """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8
@@ -71,6 +76,7 @@ class Arguments(runs.TrainerArguments):
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
+        check_looks(self.world, self.looks)
         if self.without_action and self.world is None:
             raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
 
@@ -172,7 +178,9 @@ class _Data(lightning.LightningDataModule):
 def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
     """All consecutive frames of an episode in each of the mazes ``seeds``."""
     result = []
-    for episode in simulate(world, seeds, 1000):
+    together = len(seeds) if world.looks is None else _ONE_LOOK
+    groups = [seeds[first : first + together] for first in range(0, len(seeds), together)]
+    for episode in (episode for group in groups for episode in simulate(world, group, 1000)):
         images = images_of(world, episode)
         pairs = {"earlier": images[:-1], "later": images[1:], "relative": relative_poses(episode.poses_xyyaw)}
         if world.actions:
@@ -246,7 +254,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     steps: Steps
     if recorded is None:
-        world = world_named(str(arguments.world))
+        world = world_looking(str(arguments.world), arguments.looks)
         if arguments.without_action:
             world = dataclasses.replace(world, actions=0, mirrored_actions=())
         domain: Domain = world
@@ -254,8 +262,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     else:
         domain = recorded.domain
         steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
+    kind = "local-no_action" if arguments.without_action else "local"
     run = runs.Run(
-        arguments.runs / domain.name / ("local-no_action" if arguments.without_action else "local"),
+        arguments.runs / domain.name / (kind if arguments.looks is None else f"{kind}-{arguments.looks}"),
         "train_local",
         arguments,
         arguments.epochs,

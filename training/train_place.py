@@ -24,10 +24,11 @@ from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_chec
 from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
 from training.domains import Domain
+from training.looks import LooksName, check_looks
 from training.recorded import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedPlaces
 from training.streams import Batch, PlaceStream, Share, loader
-from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
+from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Arguments(runs.TrainerArguments):
     """World to train for."""
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
     """Recordings to train on instead."""
+    looks: LooksName | None = None
+    """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 10
@@ -61,6 +64,7 @@ class Arguments(runs.TrainerArguments):
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
+        check_looks(self.world, self.looks)
 
 
 class PlaceTraining(lightning.LightningModule):
@@ -200,8 +204,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     places: Places
     if recorded is None:
-        domain: Domain = world_named(str(arguments.world))
-        places = SimulatedPlaces(arguments, world_named(str(arguments.world)))
+        world = world_looking(str(arguments.world), arguments.looks)
+        domain: Domain = world
+        places = SimulatedPlaces(arguments, world)
     else:
         domain = recorded.domain
         found = RecordedPlaces(recorded, arguments.batches, 8 * arguments.pairs_a_maze, arguments.validation_batches)
@@ -210,7 +215,7 @@ def main(arguments: Arguments) -> dict[str, float]:
             _write_untrained(arguments, recorded, found.too_few)
             return {}
     run = runs.Run(
-        arguments.runs / domain.name / "place",
+        arguments.runs / domain.name / ("place" if arguments.looks is None else f"place-{arguments.looks}"),
         "train_place",
         arguments,
         arguments.epochs,

@@ -5,6 +5,8 @@ The simulators are loaded where an environment is made: training on recordings d
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,6 +15,7 @@ import numpy as np
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.scan_registration import RegistrationConfig
 from training.domains import Domain
+from training.looks import TRAINING_LOOKS, Looks, LooksName, check_looks
 
 if TYPE_CHECKING:
     import gymnasium
@@ -71,7 +74,8 @@ class World(Domain):
     ``block_m`` is the corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and
     ``extra_openings`` the ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of
     trajectories that results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how
-    many steps their errors are given. No driver here drives backwards, whether the world ``reverses`` or not.
+    many steps their errors are given. ``looks`` is what ``make_random`` draws beside a size, None: nothing, the
+    simulator's own looks. No driver here drives backwards, whether the world ``reverses`` or not.
     """
 
     driver: str
@@ -81,6 +85,10 @@ class World(Domain):
     tables: dict[str, Table]
     table_trajectories: int = 64
     prefixes: tuple[int, ...] = (250, 500, 750, 1000)
+    looks: Looks | None = None
+
+    def __post_init__(self) -> None:
+        check_looks(self.name, self.looks)
 
     @property
     def unseen_tables(self) -> tuple[str, ...]:
@@ -91,9 +99,13 @@ class World(Domain):
     def validation_stores(self) -> tuple[str, ...]:
         return tuple(f"validation_{table}" for table in self.unseen_tables)
 
-    def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of this size, by default the simulator's own size."""
-        changes: dict[str, Any] = {} if rows is None else {"rows": rows, "cols": rows}
+    def make(
+        self, rows: int | None = None, extra_openings: int | None = None, look: Mapping[str, Any] | None = None
+    ) -> gymnasium.Env[Any, Any]:
+        """An environment with mazes of this size and look (``Looks.draw``), by default the simulator's own."""
+        changes: dict[str, Any] = dict(look or {})
+        if rows is not None:
+            changes.update(rows=rows, cols=rows)
         if extra_openings is not None:
             changes["extra_openings"] = extra_openings
         if self.name == "maze2d":
@@ -135,12 +147,16 @@ class World(Domain):
         return self.tables[table].driver or self.driver
 
     def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of ``size``, a random size and number of openings where that has None."""
+        """An environment with mazes of ``size``, a random size and number of openings where that has None.
+
+        Where the world has ``looks``, one of these is drawn after the size.
+        """
         rows = int(rng.integers(self.rows[0], self.rows[1] + 1))
         openings = int(rng.integers(self.extra_openings[0], self.extra_openings[1] + 1))
         return self.make(
             rows if size.rows is None else size.rows,
             openings if size.extra_openings is None else size.extra_openings,
+            None if self.looks is None else self.looks.draw(rng),
         )
 
 
@@ -215,3 +231,9 @@ def world_named(name: str) -> World:
     if name not in WORLDS:
         raise ValueError(f"world is {name!r}; expected one of {', '.join(WORLDS)}")
     return WORLDS[name]
+
+
+def world_looking(name: str, looks: LooksName | None) -> World:
+    """The world called ``name``, with the looks of a training that have this name; None: its own."""
+    world = world_named(name)
+    return world if looks is None else dataclasses.replace(world, looks=TRAINING_LOOKS[looks])
