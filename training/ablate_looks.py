@@ -164,9 +164,7 @@ def _measured(arguments: Arguments, place: train_place.Arguments, looks: str) ->
     local_networks = {name: load_local(folder, WORLD) for name, folder in folders.items()}
     place_networks = {name: load_place(folder, WORLD) for name, folder in folders.items()}
     made_with = {
-        "networks": [
-            description["sha256"] for _, description in (*local_networks.values(), *place_networks.values())
-        ],
+        "networks": [description["sha256"] for _, description in (*local_networks.values(), *place_networks.values())],
         "looks": dataclasses.asdict(MEASURED_LOOKS[looks]),
         "settings": [arguments.mazes, arguments.frames, arguments.place_groups, place.pairs_a_maze],
     }

@@ -151,9 +151,7 @@ def wall_faces(walls: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.concatenate(faces)
 
 
-def random_style(
-    face_count: int, rng: np.random.Generator, light_level: int = 208, textures: str = "all"
-) -> MapStyle:
+def random_style(face_count: int, rng: np.random.Generator, light_level: int = 208, textures: str = "all") -> MapStyle:
     """Draw a wall texture for each of ``face_count`` faces, one floor and one ceiling, out of a set of textures.
 
     Raises:
@@ -174,9 +172,7 @@ def random_decorations(maze: Maze, count: int, rng: np.random.Generator) -> tupl
     centers = maze.block_center(free[rng.integers(len(free), size=count)])
     reach = maze.block_m / 2 - _DECORATION_GAP_M
     positions = centers + rng.uniform(-reach, reach, size=(count, 2))
-    return tuple(
-        Decoration(int(kind), float(x), float(y)) for kind, (x, y) in zip(kinds, positions, strict=True)
-    )
+    return tuple(Decoration(int(kind), float(x), float(y)) for kind, (x, y) in zip(kinds, positions, strict=True))
 
 
 def textmap(
@@ -215,9 +211,7 @@ def textmap(
     ]
     parts += [f"vertex{{x={cx * block_units:.4f};y={cy * block_units:.4f};}}\n" for cx, cy in corners]
     parts += [f'sidedef{{sector=0;texturemiddle="{texture}";}}\n' for texture in style.wall_textures]
-    parts += [
-        f"linedef{{v1={v1};v2={v2};sidefront={side};blocking=true;}}\n" for side, (v1, v2) in enumerate(ends)
-    ]
+    parts += [f"linedef{{v1={v1};v2={v2};sidefront={side};blocking=true;}}\n" for side, (v1, v2) in enumerate(ends)]
     parts += [_thing(item.kind, item.x_m * UNITS_PER_M, item.y_m * UNITS_PER_M, 0) for item in decorations]
     return "".join(parts)
 
