@@ -1,4 +1,4 @@
-"""Train the learned driver of the 3D world: a small network that drives as far as it can, by advantage actor-critic.
+"""Train the learned driver of the 3D world: a network that drives as far as it can, by advantage actor-critic (PPO).
 
     python -m training.train_driver
 
@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 import tyro
-from stable_baselines3 import A2C
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
@@ -43,17 +43,21 @@ class Arguments:
     """Decisions to train on, of all environments together; each holds its action for three frames."""
     environments: int = 16
     """Mazes that are driven through side by side."""
-    steps: int = 20
-    """Decisions of each environment between two updates."""
+    steps: int = 128
+    """Decisions of each environment between two rounds of updates."""
+    batch_size: int = 256
+    """Decisions in an update."""
+    passes: int = 4
+    """How often a round goes through its decisions."""
     episode_frames: int = 600
     """Frames in one maze."""
     mazes: int = 16
     """Mazes of one size that an environment makes at a time."""
-    learning_rate: float = 7e-4
+    learning_rate: float = 5e-4
     """At the beginning; it falls to zero along a line."""
     discount: float = 0.98
     """Worth of a reward one decision later."""
-    entropy: float = 0.04
+    entropy: float = 0.02
     """Weight of the entropy of the actions in the loss, at the beginning; it falls to zero as well."""
     checkpoint_decisions: int = 50_000
     """Decisions between two checkpoints."""
@@ -67,8 +71,10 @@ class Arguments:
     """Folder of checkpoints and logs."""
 
     def __post_init__(self) -> None:
-        counts = ("decisions", "environments", "steps", "episode_frames", "mazes", "checkpoint_decisions", "threads")
-        for name in counts:
+        for name in (
+            "decisions", "environments", "steps", "batch_size", "passes", "episode_frames", "mazes",
+            "checkpoint_decisions", "threads",
+        ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
@@ -171,13 +177,15 @@ def main(arguments: Arguments) -> dict[str, Any]:
     return description
 
 
-def make_model(arguments: Arguments, config: PolicyConfig, environments: VecMonitor) -> A2C:
+def make_model(arguments: Arguments, config: PolicyConfig, environments: VecMonitor) -> PPO:
     """The training, its networks fresh."""
-    return A2C(
+    return PPO(
         MirroredPolicy,
         environments,
         learning_rate=lambda remaining: arguments.learning_rate * remaining,
         n_steps=arguments.steps,
+        batch_size=arguments.batch_size,
+        n_epochs=arguments.passes,
         gamma=arguments.discount,
         gae_lambda=0.95,
         ent_coef=arguments.entropy,
