@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ngo_estimator import se2
+from ngo_estimator.images import reduced
 from training.domains import MIRRORED_ACTIONS
 from training.worlds import DRAWN, MazeSize, World
 
@@ -53,7 +54,9 @@ def episodes_in(
 
 
 def images_of(world: World, episode: Episode) -> Tensor:
-    """An episode's observations as ``(frames, height, width, channels)``."""
+    """An episode's observations as ``(frames, height, width, channels)``, made smaller where the format says so."""
+    if world.image.reduction > 1:
+        return torch.from_numpy(np.stack([reduced(frame, world.image.reduction) for frame in episode.observations]))
     return torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
 
 

@@ -65,6 +65,11 @@ class Arguments(runs.TrainerArguments):
     """Highest learning rate of the one-cycle schedule."""
     validation_mazes: int = 8
     """Mazes of the validation split that each epoch is measured on."""
+    calibration_mazes: int | None = None
+    """Mazes that the network's output is calibrated in; None: 64."""
+    picture_height: int | None = None
+    """Rows of the pictures of the 3D world, a whole part of its own or a larger size of the simulator's; None: its
+    own."""
     workers: int = 1
     """Processes that simulate for each one that trains."""
     seed: int = 0
@@ -79,6 +84,12 @@ class Arguments(runs.TrainerArguments):
         check_looks(self.world, self.looks)
         if self.without_action and self.world is None:
             raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
+        if self.picture_height is not None and self.world is None:
+            raise ValueError(
+                "picture_height is given with recordings; expected --reduction, which makes theirs smaller"
+            )
+        if self.calibration_mazes is not None and self.calibration_mazes < 1:
+            raise ValueError(f"calibration_mazes is {self.calibration_mazes}; expected at least 1")
 
 
 class LocalTraining(lightning.LightningModule):
@@ -151,7 +162,7 @@ class SimulatedSteps:
         return self.fixed
 
     def unseen(self) -> list[Batch]:
-        return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-64:]))
+        return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-(self.arguments.calibration_mazes or 64) :]))
 
     def typical(self) -> Tensor:
         return torch.cat([p["relative"] for p in episode_pairs(self.world, list(TRAIN_SEEDS[:8]))])
@@ -255,6 +266,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     steps: Steps
     if recorded is None:
         world = world_looking(str(arguments.world), arguments.looks)
+        if arguments.picture_height is not None:
+            world = world.with_pictures(arguments.picture_height)
         if arguments.without_action:
             world = dataclasses.replace(world, actions=0, mirrored_actions=())
         domain: Domain = world

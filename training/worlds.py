@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
+from ngo_estimator.images import ImageFormat
 from ngo_estimator.scan_registration import RegistrationConfig
 from training.domains import Domain
 from training.looks import TRAINING_LOOKS, Looks, LooksName, check_looks
@@ -86,6 +87,7 @@ class World(Domain):
     table_trajectories: int = 64
     prefixes: tuple[int, ...] = (250, 500, 750, 1000)
     looks: Looks | None = None
+    simulator: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_looks(self.name, self.looks)
@@ -103,7 +105,7 @@ class World(Domain):
         self, rows: int | None = None, extra_openings: int | None = None, look: Mapping[str, Any] | None = None
     ) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size and look (``Looks.draw``), by default the simulator's own."""
-        changes: dict[str, Any] = dict(look or {})
+        changes: dict[str, Any] = {**self.simulator, **(look or {})}
         if rows is not None:
             changes.update(rows=rows, cols=rows)
         if extra_openings is not None:
@@ -119,6 +121,33 @@ class World(Domain):
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
         return Maze3D(Maze3DConfig(**changes))
+
+    def with_corridors(self, block_m: float) -> World:
+        """The world with corridors of this width, m."""
+        return dataclasses.replace(self, block_m=block_m, simulator={**self.simulator, "block_m": block_m})
+
+    def with_pictures(self, height: int) -> World:
+        """The 3D world in pictures of another height: larger ones are simulated, smaller ones means of its own pixels.
+
+        Raises ``ValueError`` in another world, or for a height that is no whole part of the world's own; the simulator
+        refuses larger ones that it cannot make.
+        """
+        own = self.image
+        if self.name != "maze3d":
+            raise ValueError(f"pictures of height {height} are asked of {self.name}; expected maze3d")
+        if height > own.height:
+            width = height * own.width // own.height
+            larger = ImageFormat(height, width, own.channels, own.dtype)
+            return dataclasses.replace(
+                self, image=larger, simulator={**self.simulator, "width": width, "height": height}
+            )
+        if height < 1 or own.height % height:
+            raise ValueError(
+                f"height of pictures is {height}; expected a whole part of {own.height}, or more than that"
+            )
+        factor = own.height // height
+        smaller = ImageFormat(height, own.width // factor, own.channels, own.dtype, reduction=factor)
+        return dataclasses.replace(self, image=smaller)
 
     def table_seeds(self, table: str, split: str) -> range:
         """Seeds of a table's episodes in the ``validation`` or ``test`` split."""
