@@ -66,12 +66,14 @@ def number(value: float) -> str:
     return f"{value:.{digits}f}"
 
 
-def _interval(entry: dict[str, Any]) -> str:
+def interval(entry: dict[str, Any]) -> str:
+    """A mean with its interval in brackets, of ``{mean, ci95}``."""
     low, high = entry["ci95"]
     return f"{number(entry['mean'])} [{number(low)}, {number(high)}]"
 
 
-def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -83,11 +85,11 @@ def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
             value = entry[metric.key]
             seeds = value.get("seeds")
             spread = f" ({number(min(seeds))} to {number(max(seeds))})" if seeds else ""
-            texts.append(_interval(value) + spread)
+            texts.append(interval(value) + spread)
         return [f"`{row}`", (ROWS[row] if row in ROWS else LIMITS[row]).title, *texts]
 
     header = ["Row", "", *(f"{metric.title}, {metric.unit}" for metric in metrics)]
-    return _markdown(header, (cells(row, entry) for row, entry in table.items()))
+    return markdown(header, (cells(row, entry) for row, entry in table.items()))
 
 
 def _bias(result: dict[str, Any], name: str) -> str:
@@ -102,19 +104,19 @@ def _pairs(pairs: dict[str, Any], metric: Metric) -> str:
         difference, relative = entry[metric.key]["difference"], entry[metric.key]["relative_percent"]
         low, high = (f"{value:+.1f}" for value in relative["ci95"])
         apart = "yes" if difference["ci95"][0] > 0 or difference["ci95"][1] < 0 else "no"
-        return [f"`{row}`", f"`{other}`", f"{relative['mean']:+.1f} % [{low}, {high}]", _interval(difference), apart]
+        return [f"`{row}`", f"`{other}`", f"{relative['mean']:+.1f} % [{low}, {high}]", interval(difference), apart]
 
     header = ["Row", "Against", f"{metric.title}, relative", f"Difference, {metric.unit}", "Interval excludes zero"]
-    return _markdown(header, (cells(name, entry) for name, entry in pairs.items()))
+    return markdown(header, (cells(name, entry) for name, entry in pairs.items()))
 
 
 def _prefixes(table: dict[str, Any], metric: Metric) -> str:
     lengths = list(next(iter(table.values()))["prefixes"])
     rows = (
-        [f"`{row}`", *(_interval(entry["prefixes"][length][metric.key]) for length in lengths)]
+        [f"`{row}`", *(interval(entry["prefixes"][length][metric.key]) for length in lengths)]
         for row, entry in table.items()
     )
-    return _markdown(["Row", *(f"{length} steps" for length in lengths)], rows)
+    return markdown(["Row", *(f"{length} steps" for length in lengths)], rows)
 
 
 def _attention(found: dict[str, Any]) -> str:
@@ -143,7 +145,7 @@ def _attention(found: dict[str, Any]) -> str:
         f"Of the first {counted} trajectories that come back to a place; entropy in units of that of uniform "
         "attention; a revisit is another visit of the same place, in the past or the future."
     )
-    return text + "\n\n" + _markdown(header, (cells(row, entry) for row, entry in found.items()))
+    return text + "\n\n" + markdown(header, (cells(row, entry) for row, entry in found.items()))
 
 
 def _trainings(trainings: dict[str, Any]) -> str:
@@ -157,7 +159,7 @@ def _trainings(trainings: dict[str, Any]) -> str:
         ]
 
     header = ["Network", "Time", "Datapoints", "Peak memory", "Command"]
-    return _markdown(header, (cells(name, entry) for name, entry in trainings.items()))
+    return markdown(header, (cells(name, entry) for name, entry in trainings.items()))
 
 
 def _generation(speed: dict[str, float]) -> str:
