@@ -1,0 +1,60 @@
+"""Episodes in validation mazes, and what a local network makes of their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ngo_estimator import se2
+from ngo_estimator.local_pose_network import LocalPoseNetwork
+from training import streams
+from training.metrics import TrajectoryError, trajectory_error
+from training.worlds import VALIDATION_SEEDS, World
+
+if TYPE_CHECKING:
+    from ngo_sim.episodes import Episode
+
+_TOGETHER = 128  # pairs of frames that go through a network at once
+
+
+def validation_episodes(world: World, mazes: int, frames: int) -> Iterator[Episode]:
+    """Episodes of the world's driver in the first so many validation mazes, whose sizes are drawn as in training."""
+    if not 2 <= mazes <= len(VALIDATION_SEEDS):
+        raise ValueError(f"mazes is {mazes}; expected 2 to {len(VALIDATION_SEEDS)}")
+    seeds = list(VALIDATION_SEEDS[:mazes])
+    for first in range(0, mazes, streams._GROUP):
+        yield from streams.simulate(world, seeds[first : first + streams._GROUP], frames)
+
+
+@torch.inference_mode()
+def estimated_steps(network: LocalPoseNetwork, world: World, episode: Episode) -> np.ndarray:
+    """Relative poses ``(frames - 1, 3)``, float64, that a network of the world estimates along an episode."""
+    images = streams.images_of(world, episode)
+    actions = torch.from_numpy(episode.actions).long().split(_TOGETHER)
+    pairs = zip(images[:-1].split(_TOGETHER), images[1:].split(_TOGETHER), actions, strict=True)
+    told = bool(network.config.actions)
+    steps = [network(earlier, later, action if told else None)[0] for earlier, later, action in pairs]
+    return torch.cat(steps).double().numpy()
+
+
+def true_steps(episode: Episode) -> np.ndarray:
+    """The true relative poses ``(frames - 1, 3)``, float64."""
+    poses = torch.from_numpy(episode.poses_xyyaw)
+    return se2.between(poses[:-1], poses[1:]).numpy()
+
+
+def step_errors(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Errors ``(steps, 2)`` of steps ``(steps, 3)``: the distance in m, the turn in deg."""
+    error = se2.wrapped(torch.from_numpy(estimated - true)).numpy()
+    return np.stack((np.hypot(error[:, 0], error[:, 1]), np.degrees(error[:, 2])), axis=1)
+
+
+def odometry_error(steps: np.ndarray, true: np.ndarray) -> TrajectoryError:
+    """The error of the trajectory of steps ``(steps, 3)`` against that of the true ones."""
+    estimate, truth = (
+        np.concatenate((np.zeros((1, 3)), se2.r2g(torch.from_numpy(one[None])).numpy()[0])) for one in (steps, true)
+    )
+    return trajectory_error(estimate, truth)
