@@ -70,7 +70,7 @@ def main(arguments: Arguments) -> dict[str, object]:
         drives.append(drive_of(episode, estimated_steps(network, world, episode), camera))
         driven.append(replace(episode, observations=episode.observations[:0]))
     result: dict[str, object] = {
-        **runs.record(NAME, arguments),
+        **json.loads(json.dumps(runs.record(NAME, arguments))),
         "network_sha256": description["sha256"],
         "mazes": arguments.mazes,
         "frames": arguments.frames,

@@ -96,9 +96,12 @@ def hard_frames(view: WallView, camera: Maze3DConfig) -> HardFrames:
     near = view.distance_m < camera.block_m / 2.0
     near_shipped = view.distance_m < Maze3DConfig.block_m / 2.0
     filled = view.depth_m < filled_depth_m(camera)
-    shares = (columns.mean(axis=1) for columns in (near, near_shipped, filled))
-    near_frames, *others = (share >= HARD_SHARE for share in shares)
-    return HardFrames(near_frames, near.any(axis=1), *others)
+    return HardFrames(
+        near=near.mean(axis=1) >= HARD_SHARE,
+        any_near=near.any(axis=1),
+        near_shipped=near_shipped.mean(axis=1) >= HARD_SHARE,
+        filled=filled.mean(axis=1) >= HARD_SHARE,
+    )
 
 
 def drive_of(episode: Episode, estimated: np.ndarray | None, camera: Maze3DConfig) -> Drive:

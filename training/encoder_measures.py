@@ -1,0 +1,76 @@
+"""What a local network costs and what it is worth: speed of its training and inference, errors on validation mazes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from ngo_estimator.local_pose_network import LocalPoseNetwork
+from training import train_local
+from training.curves import rows
+from training.statistics import mean_interval, rms_interval
+from training.streams import PairStream, images_of, loader, simulate
+from training.validation_steps import estimated_steps, odometry_error, step_errors, true_steps, validation_episodes
+from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+
+_WARM_UP = 4  # batches: the process that simulates has started
+_LATENCIES, _UNTIMED = 200, 20
+
+
+def pairs_a_second(arguments: train_local.Arguments, seconds: float) -> float:
+    """Frame pairs a second of a training with these arguments, simulation included, measured for some seconds."""
+    world = world_named(str(arguments.world))
+    if arguments.picture_height is not None:
+        world = world.with_pictures(arguments.picture_height)
+    steps = train_local.SimulatedSteps(arguments, world)
+    network = train_local.initial_network(arguments, world, steps)[0]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4)
+    endless = PairStream(world, TRAIN_SEEDS, 0, 10**8, arguments.batch_size)
+    batches = iter(loader(endless, arguments.workers))
+    count, started = 0, time.monotonic()
+    for k, batch in enumerate(batches):
+        if k == _WARM_UP:
+            count, started = 0, time.monotonic()
+        with torch.autocast("cpu", torch.bfloat16, enabled=arguments.precision == "bf16-mixed"):
+            mean, log_std = train_local.estimated(network, batch)[:2]
+            pose, likelihood = train_local.step_losses(mean, log_std, batch["relative"], network.relative_std)
+        optimizer.zero_grad()
+        (pose + likelihood).backward()
+        optimizer.step()
+        count += rows(batch)
+        if k >= _WARM_UP and time.monotonic() > started + seconds:
+            break
+    return count / (time.monotonic() - started)
+
+
+@torch.inference_mode()
+def inference_ms(network: LocalPoseNetwork, world: World) -> float:
+    """Median time, ms, in which a network estimates one step on the present number of threads."""
+    (episode,) = simulate(world, [VALIDATION_SEEDS[0]], 3)
+    images = images_of(world, episode)
+    step = images[:1], images[1:2], torch.from_numpy(episode.actions[:1]).long()
+    took = []
+    for _ in range(_UNTIMED + _LATENCIES):
+        started = time.perf_counter()
+        network(*step)
+        took.append(time.perf_counter() - started)
+    return 1e3 * float(np.median(took[_UNTIMED:]))
+
+
+def measured(network: LocalPoseNetwork, world: World, mazes: int, frames: int) -> dict[str, Any]:
+    """RMSE of a step (m, deg) and the odometry's final error (% of the path) on validation mazes, with intervals."""
+    squares, steps, final_percent = [], [], []
+    for episode in validation_episodes(world, mazes, frames):
+        estimated, true = estimated_steps(network, world, episode), true_steps(episode)
+        squares.append(np.square(step_errors(estimated, true)).sum(axis=0))
+        steps.append(float(len(true)))
+        final_percent.append(odometry_error(estimated, true).final_percent)
+    totals, counts = np.array(squares), np.array(steps)
+    return {
+        "rmse_m": rms_interval(totals[:, 0], counts).as_json(),
+        "rmse_deg": rms_interval(totals[:, 1], counts).as_json(),
+        "final_percent": mean_interval(np.array(final_percent)).as_json(),
+    }
