@@ -98,7 +98,7 @@ def hard_frames(view: WallView, camera: Maze3DConfig) -> HardFrames:
     filled = view.depth_m < filled_depth_m(camera)
     return HardFrames(
         near=near.mean(axis=1) >= HARD_SHARE,
-        any_near=near.any(axis=1),
+        any_near=view.distance_m.min(axis=1) < camera.block_m / 2.0,
         near_shipped=near_shipped.mean(axis=1) >= HARD_SHARE,
         filled=filled.mean(axis=1) >= HARD_SHARE,
     )
