@@ -92,7 +92,7 @@ class Drive:
 
 
 def hard_frames(view: WallView, camera: Maze3DConfig) -> HardFrames:
-    """Which frames of a view are hard, by each of the three measures."""
+    """Which frames of a view are hard, by each of the measures."""
     near = view.distance_m < camera.block_m / 2.0
     near_shipped = view.distance_m < Maze3DConfig.block_m / 2.0
     filled = view.depth_m < filled_depth_m(camera)
