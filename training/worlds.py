@@ -75,8 +75,9 @@ class World(Domain):
     ``block_m`` is the corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and
     ``extra_openings`` the ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of
     trajectories that results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how
-    many steps their errors are given. ``simulator`` are settings of it that are not its own defaults. ``looks`` is what ``make_random`` draws beside a size, None: nothing, the
-    simulator's own looks. No driver here drives backwards, whether the world ``reverses`` or not.
+    many steps their errors are given. ``simulator`` holds its settings that are not its own defaults. ``looks`` is what
+    ``make_random`` draws beside a size, None: nothing, the simulator's own looks. No driver here drives backwards,
+    whether the world ``reverses`` or not.
     """
 
     driver: str
