@@ -24,7 +24,8 @@ class Domain:
 
     What an optimizer here begins with: ``robust`` says whether the loops' gates start from a robust kernel or from
     nothing, ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart`` meta-poses from each other and
-    ``max_loops`` of a trajectory, and it is trained for ``optimizer_epochs``.
+    ``max_loops`` of a trajectory. It is trained for ``optimizer_epochs``, and errors count by their square below
+    ``loss_scale``: so many corridor widths, and as many fifths of a radian.
     """
 
     name: str
@@ -46,6 +47,17 @@ class Domain:
     max_loops: int = LoopSearch.most
     loops_apart: int = LoopSearch.min_apart
     optimizer_epochs: int = 6
+    loss_scale: float = 0.1
+
+    @property
+    def loss_scale_m(self) -> float:
+        """Errors of position below are counted by their square."""
+        return self.loss_scale * self.block_m
+
+    @property
+    def loss_scale_rad(self) -> float:
+        """Errors of heading below are counted by their square."""
+        return 0.2 * self.loss_scale
 
     @property
     def validation_stores(self) -> tuple[str, ...]:

@@ -83,9 +83,10 @@ class EndToEndTraining(lightning.LightningModule):
         place: PlaceNetworks,
         optimizer: NeuralGraphOptimizer,
         scale_m: float,
+        scale_rad: float,
     ) -> None:
         super().__init__()
-        self.arguments, self.scale_m = arguments, scale_m
+        self.arguments, self.scale_m, self.scale_rad = arguments, scale_m, scale_rad
         self.local, self.place, self.optimizer = local, place, optimizer
         self.requires_grad_(True)
         self.place.requires_grad_(optimizer.config.loops)  # the paper's form has no use for them
@@ -115,7 +116,8 @@ class EndToEndTraining(lightning.LightningModule):
         relative, log_std, result = self(batch)
         block = self.optimizer.block
         truth = se2.r2g(batch["relative"])[:, block - 1 :: block]
-        corrected = trajectory_loss(result.meta_relative, truth, self.optimizer.correction_std, self.scale_m)
+        std = self.optimizer.correction_std
+        corrected = trajectory_loss(result.meta_relative, truth, std, self.scale_m, self.scale_rad)
         pose_loss, likelihood = step_losses(relative, log_std, batch["relative"], self.local.relative_std)
         loss = corrected + self.arguments.local_weight * (pose_loss + LIKELIHOOD_WEIGHT * likelihood)
         figures = {"loss": loss, "trajectory_loss": corrected, "pose_loss": pose_loss, "likelihood": likelihood}
@@ -206,7 +208,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         datapoints=lambda batch: batch["action"].numel(),
     )
-    training = EndToEndTraining(arguments, local, place, optimizer, world.block_m)
+    training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad)
     data = _Data(arguments, world)
     before = measure(training, data.validation())
     run.fit(training, data)

@@ -33,8 +33,6 @@ from training.streams import Batch, Share
 from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, fixes_of, loops_of
 from training.worlds import WorldName, world_named
 
-POSITION_SCALE = 0.1  # corridor widths: errors below count by their square, so that large ones do not rule the rest
-HEADING_SCALE = 0.02  # rad
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
 _FEWEST_STEPS = 8  # of an epoch
@@ -85,21 +83,23 @@ class Arguments(runs.TrainerArguments):
         check_source(self.world, self.recordings)
 
 
-def trajectory_loss(meta_relative: list[Tensor], truth: Tensor, correction_std: Tensor, scale_m: float) -> Tensor:
+def trajectory_loss(
+    meta_relative: list[Tensor], truth: Tensor, correction_std: Tensor, scale_m: float, scale_rad: float
+) -> Tensor:
     """Huber losses on global and relative meta-poses after every iteration, later ones with more weight.
 
     Args:
         meta_relative: relative meta-poses ``(batch, blocks, 3)`` after each iteration.
         truth: true global meta-poses ``(batch, blocks, 3)``.
         correction_std: typical error of a relative meta-pose ``(3,)``.
-        scale_m: the size of a position's error (m) below which its square counts.
+        scale_m, scale_rad: errors of position and heading below count by their square, so that large ones do not rule.
     """
     true_relative = se2.g2r(truth)
     loss, weights = truth.new_zeros(()), 0.0
     for number, relative in enumerate(meta_relative, start=1):
         error = se2.r2g(relative) - truth
         position = huber_loss(error[..., :2] / scale_m, torch.zeros_like(error[..., :2]), delta=1.0)
-        heading = huber_loss(error[..., 2] / HEADING_SCALE, torch.zeros_like(error[..., 2]), delta=1.0)
+        heading = huber_loss(error[..., 2] / scale_rad, torch.zeros_like(error[..., 2]), delta=1.0)
         local = step_loss(relative, true_relative, correction_std)
         loss = loss + number * (position + HEADING_WEIGHT * heading + RELATIVE_WEIGHT * local)
         weights += number
@@ -116,12 +116,12 @@ def step_loss(relative: Tensor, truth: Tensor, std: Tensor) -> Tensor:
 class OptimizerTraining(lightning.LightningModule):
     """``trajectory_loss`` on stretches of trajectories; on the validation split, errors of whole ones."""
 
-    def __init__(self, arguments: Arguments, optimizer: NeuralGraphOptimizer, block_m: float) -> None:
+    def __init__(self, arguments: Arguments, optimizer: NeuralGraphOptimizer, domain: Domain) -> None:
         super().__init__()
-        self.arguments, self.optimizer, self.block_m = arguments, optimizer, block_m
+        self.arguments, self.optimizer, self.domain = arguments, optimizer, domain
 
     def forward(self, batch: Batch) -> Any:
-        fixes = fixes_of(batch, self.optimizer.block, self.block_m)
+        fixes = fixes_of(batch, self.optimizer.block, self.domain.block_m)
         return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops_of(batch), fixes)
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
@@ -130,7 +130,8 @@ class OptimizerTraining(lightning.LightningModule):
             result.meta_relative,
             batch["truth"][:, block - 1 :: block],
             self.optimizer.correction_std,
-            POSITION_SCALE * self.block_m,
+            self.domain.loss_scale_m,
+            self.domain.loss_scale_rad,
         )
         self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
         return loss
@@ -263,7 +264,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     )
     if optimizer is None:
         optimizer = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train)))
-    training = OptimizerTraining(arguments, optimizer, domain.block_m)
+    training = OptimizerTraining(arguments, optimizer, domain)
     data = _Data(arguments, train, validation)
     run.fit(training, data)
     metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}

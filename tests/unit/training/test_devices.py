@@ -72,6 +72,6 @@ def test_the_place_encoders_loss_stays_on_its_device(weights: Path) -> None:
 def test_the_loss_of_all_networks_together_stays_on_its_device(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # meta knows none
     networks = (load(weights)[0] for load in (load_local, load_place, load_optimizer))
-    module = train_end_to_end.EndToEndTraining(train_end_to_end.Arguments("maze3d"), *networks, 1.0)
+    module = train_end_to_end.EndToEndTraining(train_end_to_end.Arguments("maze3d"), *networks, 1.0, 0.02)
     batch = {"images": images(2, 129), "action": torch.zeros(2, 128).long(), "relative": torch.zeros(2, 128, 3)}
     assert step(module, batch).device.type == "meta"

@@ -11,7 +11,7 @@ from training.worlds import WORLDS, world_named
 
 
 def test_a_world_says_what_suits_it() -> None:
-    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(False, 2, 96, 20)
+    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(False, 2, 96, 40)
     assert choices(Arguments(world="maze2d"), world_named("maze2d")) == Choices(True, 4, 512, 6)
 
 
