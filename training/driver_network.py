@@ -33,7 +33,7 @@ class Features(BaseFeaturesExtractor):
         self.hidden = nn.Linear(int(np.prod(config.feature_shape)) + SENSES, config.hidden)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """(batch, 2 hidden) of pictures (batch, pictures, height, width) in [0, 1] and senses (batch, 10)."""
+        """(batch, 2 hidden) of pictures (batch, pictures, height, width) in [0, 1] and senses (batch, 8)."""
         pictures, senses = observations["pictures"], observations["senses"]
         mirrored_senses = senses[:, list(MIRRORED_SENSES)] * senses.new_tensor(MIRRORED_SIGNS)
         seen = self.convolutions(torch.cat((pictures, pictures.flip(-1))))
@@ -43,20 +43,20 @@ class Features(BaseFeaturesExtractor):
 
 
 class Odds(nn.Module):
-    """The last layer of ngo_sim.policy_network: (batch, 2 hidden) to the logarithms of the odds, (batch, 4)."""
+    """The last layer of ngo_sim.policy_network: (batch, 2 hidden) to the logarithms of the odds, (batch, 3)."""
 
     def __init__(self, hidden: int) -> None:
         super().__init__()
-        self.common, self.turn = nn.Linear(hidden, 3), nn.Linear(hidden, 1, bias=False)
+        self.common, self.turn = nn.Linear(hidden, 2), nn.Linear(hidden, 1, bias=False)
         for layer in (self.common, self.turn):
             nn.init.orthogonal_(layer.weight, gain=0.01)
         nn.init.zeros_(self.common.bias)
 
     def forward(self, features: Tensor) -> Tensor:
         even, odd = features.chunk(2, dim=1)
-        forward, turn, about = self.common(even).unbind(1)
+        forward, turn = self.common(even).unbind(1)
         left = self.turn(odd).squeeze(1)
-        return torch.stack((forward, turn + left, turn - left, about), dim=1)
+        return torch.stack((forward, turn + left, turn - left), dim=1)
 
 
 class Worth(nn.Module):

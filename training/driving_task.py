@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
-from ngo_sim.policy_network import DECISIONS, SENSES, PolicyConfig, PolicyView
+from ngo_sim.policy_network import ACTIONS, SENSES, PolicyConfig, PolicyView
 from training.worlds import TRAIN_SEEDS, World
 
 Look = dict[str, Any]
@@ -23,7 +23,7 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
     """Mazes of the training split of a world, each driven through once for ``frames`` frames.
 
     Observations are what PolicyView holds, as a dict: ``pictures`` uint8 (pictures, height, width) and ``senses``
-    float32 (10,). A step is a decision: config.hold_frames frames of the simulator, taken at once. Its reward is the
+    float32 (8,). A step is a decision: config.hold_frames frames of the simulator, taken at once. Its reward is the
     distance travelled in m times REWARD_PER_M. ``mazes`` of one size are made at a time. Which mazes come is a function
     of ``stream``, any sequence of whole numbers.
     """
@@ -34,7 +34,7 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
         self._env: Any = None
         self._seeds: list[int] = []
         self._decisions = 0
-        self.action_space = gymnasium.spaces.Discrete(DECISIONS)
+        self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         pictures = (config.pictures, config.height, config.width)
         self.observation_space = gymnasium.spaces.Dict(
             {
@@ -61,7 +61,8 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
 
     def step(self, action: np.int64 | int) -> tuple[Look, float, bool, bool, dict[str, Any]]:
         """Take a decision; an episode is cut off after its frames."""
-        observation, travelled, _, _, info = self._env.step(int(self._view.did(int(action))))
+        observation, travelled, _, _, info = self._env.step(int(action))
+        self._view.did(int(action))
         self._view.see(observation, info["pose_xyyaw"])
         self._decisions += 1
         over = self._decisions * self._config.hold_frames >= self._frames

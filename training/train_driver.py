@@ -39,7 +39,7 @@ CHECKPOINT = "last.pt"
 class Arguments:
     """Settings of a training of the driver."""
 
-    decisions: int = 1_000_000
+    decisions: int = 500_000
     """Decisions to train on, of all environments together; each holds its action for three frames."""
     environments: int = 16
     """Mazes that are driven through side by side."""

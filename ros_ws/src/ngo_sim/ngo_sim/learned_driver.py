@@ -39,6 +39,7 @@ class LearnedDriver:
             logits = self._network.logits(self._view).astype(np.float64)
             odds = np.exp(logits - logits.max())
             drawn = self._rng.random() * odds.sum()
-            self._action = self._view.did(int((np.cumsum(odds)[:-1] <= drawn).sum()))
+            self._action = Action(int((np.cumsum(odds)[:-1] <= drawn).sum()))
+            self._view.did(self._action)
         self._held_frames = (self._held_frames + 1) % self._network.config.hold_frames
         return self._action

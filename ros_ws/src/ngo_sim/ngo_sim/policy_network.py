@@ -14,18 +14,14 @@ import numpy.typing as npt
 import safetensors
 from safetensors.numpy import load
 
-from ngo_sim.drivers import Action
-
 FORMAT = 1
 NETWORK = "driver"
 SHIPPED = Path(__file__).with_name("weights") / "driver.safetensors"
-DECISIONS = 4
-"""The three actions, and to turn about: the fourth."""
-ABOUT = 3
-SENSES = DECISIONS + 6
-MIRRORED_SENSES = (0, 2, 1, 3, 4, 5, 6, 7, 8, 9)
+ACTIONS = 3
+SENSES = ACTIONS + 5
+MIRRORED_SENSES = (0, 2, 1, 3, 4, 5, 6, 7)
 """Where each of the senses is found for a robot in a mirror: left and right actions exchanged."""
-MIRRORED_SIGNS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
+MIRRORED_SIGNS = (1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 """What they are multiplied by then: motion to the left and turning have the other sign."""
 
 _BEND_RAD = math.radians(45.0)
@@ -41,14 +37,13 @@ class PolicyConfig:
     width: int = 40  # of a picture, pixels
     pictures: int = 3  # of the newest decisions, the present one among them
     hold_frames: int = 3  # for which an action is held: a decision is taken in every so many frames
-    about_decisions: int = 7  # for which turning about takes the place of what is decided
     channels: tuple[int, ...] = (16, 32, 32)  # of the convolutions
     kernels: tuple[int, ...] = (5, 3, 3)  # sides of their kernels, pixels
     strides: tuple[int, ...] = (2, 2, 2)  # of their kernels, pixels
     hidden: int = 128  # units of the layer behind them
 
     def __post_init__(self) -> None:
-        for name in ("height", "width", "pictures", "hold_frames", "about_decisions", "hidden"):
+        for name in ("height", "width", "pictures", "hold_frames", "hidden"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} is {value!r}; it must be an integer of at least 1")
@@ -77,7 +72,7 @@ class PolicyConfig:
             before = channels
         shapes["hidden.weight"] = (self.hidden, int(np.prod(self.feature_shape)) + SENSES)
         shapes["hidden.bias"] = (self.hidden,)
-        shapes["common.weight"], shapes["common.bias"] = (3, self.hidden), (3,)
+        shapes["common.weight"], shapes["common.bias"] = (2, self.hidden), (2,)
         shapes["turn.weight"] = (1, self.hidden)
         return shapes
 
@@ -85,11 +80,11 @@ class PolicyConfig:
 class PolicyView:
     """What the network looks at: the pictures of the newest decisions, how it moved since the last one, and how far.
 
-    pictures: uint8 (pictures, height, width), the newest first. senses: float32 (10,), 1 for the last of the four
-    decisions; the share of a turn about that is still to come; the motion since the decision: m forward, m to the left,
-    rad counter-clockwise; and in units of 10 m the way since the last bend and the way before that bend, because at the
-    end of a corridor its length is not to be seen. A bend is where the heading has left that of the last bend by over
-    45 degrees; ways of less than 2 m belong to it. At the first decision all senses are 0.
+    pictures: uint8 (pictures, height, width), the newest first. senses: float32 (8,), 1 for the last of the three
+    actions; the motion since it was decided on: m forward, m to the left, rad counter-clockwise; and in units of 10 m
+    the way since the last bend and the way before that bend, because at the end of a corridor its length is not to be
+    seen. A bend is where the heading has left that of the last bend by over 45 degrees; ways of less than 2 m belong to
+    it. At the first decision all senses are 0.
     """
 
     def __init__(self, config: PolicyConfig) -> None:
@@ -98,7 +93,6 @@ class PolicyView:
         self.senses = np.zeros(SENSES, dtype=np.float32)
         self._last_pose: tuple[float, float, float] | None = None
         self._bend_yaw, self._run_m, self._earlier_run_m = 0.0, 0.0, 0.0
-        self._about_left = 0
 
     def see(self, observation: npt.NDArray[np.uint8], pose_xyyaw: npt.NDArray[np.float64]) -> None:
         """Take in what is seen at a decision, and where; the first picture counts as having been seen all the time."""
@@ -117,24 +111,15 @@ class PolicyView:
                     self._earlier_run_m = self._run_m
                 self._bend_yaw, self._run_m = yaw, 0.0
             ways = self._run_m / _RUN_UNIT_M, self._earlier_run_m / _RUN_UNIT_M
-            self.senses[DECISIONS + 1 :] = cos * dx + sin * dy, cos * dy - sin * dx, turned, *ways
+            self.senses[ACTIONS:] = cos * dx + sin * dy, cos * dy - sin * dx, turned, *ways
         self._last_pose = x, y, yaw
         self.pictures[1:] = self.pictures[:-1].copy()
         self.pictures[0] = picture
 
-    def did(self, decision: int) -> Action:
-        """Remember what was decided, and return the action that follows from it.
-
-        Turning about is to turn left for config.about_decisions decisions, whatever is decided on the way.
-        """
-        if decision == ABOUT and self._about_left == 0:
-            self._about_left = self.config.about_decisions
-        turns_about = self._about_left > 0
-        self._about_left -= turns_about
-        self.senses[: DECISIONS + 1] = 0.0
-        self.senses[ABOUT if turns_about else decision] = 1.0
-        self.senses[DECISIONS] = self._about_left / self.config.about_decisions
-        return Action.TURN_LEFT if turns_about else Action(decision)
+    def did(self, action: int) -> None:
+        """Remember the action that was decided on."""
+        self.senses[:ACTIONS] = 0.0
+        self.senses[action] = 1.0
 
 
 def grey_picture(observation: npt.NDArray[np.uint8], height: int, width: int) -> npt.NDArray[np.uint8]:
@@ -158,11 +143,10 @@ def grey_picture(observation: npt.NDArray[np.uint8], height: int, width: int) ->
 
 
 class PolicyNetwork:
-    """Convolutions and a hidden layer, all with ReLU, of a view and of its mirror image, to the odds of the decisions.
+    """Convolutions and a hidden layer, all with ReLU, of a view and of its mirror image, to the odds of the actions.
 
-    The sum of the two hidden layers gives the odds of going forward, of turning at all and of turning about, their
-    difference those of left against right: what the network decides in a mirror is the mirror image of what it decides,
-    whatever its weights.
+    The sum of the two hidden layers gives the odds of going forward and of turning at all, their difference those of
+    left against right: what the network does in a mirror is the mirror image of what it does, whatever its weights.
 
     tensors: float arrays of the names and shapes of config.tensor_shapes(). Raises ValueError for others.
     """
@@ -185,15 +169,15 @@ class PolicyNetwork:
         self._turn = weights["turn.weight"]
 
     def logits(self, view: PolicyView) -> npt.NDArray[np.float32]:
-        """float32 (4,) of a view: the logarithms of the odds of the decisions, but for a common summand."""
+        """float32 (3,) of a view: the logarithms of the odds of the three actions, but for a common summand."""
         pictures = view.pictures.astype(np.float32) / 255.0
         seen = self._hidden_layer(pictures, view.senses)
         signs = np.array(MIRRORED_SIGNS, dtype=np.float32)
         mirrored = self._hidden_layer(pictures[:, :, ::-1], view.senses[list(MIRRORED_SENSES)] * signs)
         weight, bias = self._common
-        forward, turn, about = weight @ (seen + mirrored) + bias
+        forward, turn = weight @ (seen + mirrored) + bias
         (left,) = self._turn @ (seen - mirrored)
-        return np.array((forward, turn + left, turn - left, about), dtype=np.float32)
+        return np.array((forward, turn + left, turn - left), dtype=np.float32)
 
     def _hidden_layer(
         self, values: npt.NDArray[np.float32], senses: npt.NDArray[np.float32]
