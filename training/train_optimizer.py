@@ -125,9 +125,9 @@ class OptimizerTraining(lightning.LightningModule):
         return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops_of(batch), fixes)
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        result, block = self(batch), self.optimizer.block
+        block = self.optimizer.block
         loss = trajectory_loss(
-            result.meta_relative,
+            self.optimized(batch),
             batch["truth"][:, block - 1 :: block],
             self.optimizer.correction_std,
             self.domain.loss_scale_m,
@@ -135,6 +135,17 @@ class OptimizerTraining(lightning.LightningModule):
         )
         self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
         return loss
+
+    def optimized(self, batch: Batch) -> list[Tensor]:
+        """The relative meta-poses after each of the iterations that are trained in this epoch."""
+        optimizer = self.optimizer
+        single = optimizer.config.loops and self.current_epoch < self.domain.single_epochs
+        steps = optimizer.aggregate(batch["relative"], batch["log_std"], batch["motion"])
+        fixes = fixes_of(batch, optimizer.block, self.domain.block_m)
+        for result in optimizer.iterate(steps, loops_of(batch), fixes):
+            if single:
+                break
+        return result.meta_relative
 
     def validation_step(self, batch: Batch, _: int) -> None:
         for name, poses in (("odometry", se2.r2g(batch["odometry"])), ("corrected", self(batch).poses)):
