@@ -142,10 +142,11 @@ class OptimizerTraining(lightning.LightningModule):
         single = optimizer.config.loops and self.current_epoch < self.domain.single_epochs
         steps = optimizer.aggregate(batch["relative"], batch["log_std"], batch["motion"])
         fixes = fixes_of(batch, optimizer.block, self.domain.block_m)
-        for result in optimizer.iterate(steps, loops_of(batch), fixes):
-            if single:
-                break
-        return result.meta_relative
+        results = optimizer.iterate(steps, loops_of(batch), fixes)
+        if single:
+            return next(results).meta_relative
+        *_, last = results
+        return last.meta_relative
 
     def validation_step(self, batch: Batch, _: int) -> None:
         for name, poses in (("odometry", se2.r2g(batch["odometry"])), ("corrected", self(batch).poses)):
