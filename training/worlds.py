@@ -235,8 +235,9 @@ WORLDS = {
         tables={
             "seen": Table(stretch=1, seen=True),
             "unseen": Table(),
-            # With the driver "learned" in ngo_sim.drivers: the same mazes and starts, driven by it.
-            # "seen_policy": Table(stretch=1, seen=True, driver="learned"), "unseen_policy": Table(driver="learned"),
+            # The same mazes and starts, driven by the network that was trained to travel far.
+            "seen_policy": Table(stretch=1, seen=True, driver="learned"),
+            "unseen_policy": Table(driver="learned"),
         },
     ),
     # The 2D world as any 2D lidar sees it; corridors and paces are drawn, so lengths here are those of the middle.

@@ -25,7 +25,6 @@ from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.maze3d import Maze3D
 from ngo_sim.nodes.parameters import BadParameter, ConfigParameters
-from ngo_sim.policy_network import SHIPPED
 from ngo_sim.simulator_config import SimulatorConfig
 
 from .processes import NodeProcess, Probe, wait_until
@@ -140,7 +139,6 @@ def test_maze3d_publishes_what_the_core_records(probe: Probe) -> None:
     assert right == (0.0, -1.0, 0.0), "x of the picture is right"
 
 
-@pytest.mark.skipif(not SHIPPED.exists(), reason="no weights of the learned driver are shipped")
 def test_the_learned_driver_drives_as_without_ros(probe: Probe) -> None:
     run = Run(probe, "maze3d", CameraInfo, "camera_info", policy="learned")
     env = Maze3D()
