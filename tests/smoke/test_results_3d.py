@@ -1,5 +1,6 @@
 """The tables of the 3D world at toy size: seen and unseen mazes, networks of their own, and what limits the result."""
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from training.worlds import world_named
 
 STEPS = 160
 PREFIXES = (80, STEPS)
+TABLES = ["seen", "unseen", "seen_policy", "unseen_policy"]
 METRICS = (
     "translation_percent",
     "rotation_deg_per_m",
@@ -58,7 +60,7 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
     assert json.loads((folder / "results" / "maze3d.json").read_text()) == result
     assert result["command"].startswith("python -m training.results --world maze3d ")
     assert (result["trajectories"], result["steps"], result["seeds"]) == (2, STEPS, [0])
-    assert list(result["tables"]) == ["seen", "unseen"] == list(result["limits"])
+    assert list(result["tables"]) == TABLES == list(result["limits"])
     assert {"local", "local_no_action", "deepvo", "paper_1", "paper_5", "ngo_1", "ngo_5", "gauss_newton", "gtsam",
             "true_pairs", "oracle", "end_to_end"} < set(rows_of(world_named("maze3d")))  # fmt: skip
     for name, table in result["tables"].items():
@@ -78,24 +80,24 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
 
 def test_networks_of_their_own_saw_the_same_trajectories(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
-    for table in ("seen", "unseen"):
+    for table in TABLES:
         shared = open_store(sources(folder).store_folder("validation", table))
         for row in ("local_no_action", "deepvo"):
             own = open_odometry(sources(folder).of_row(row, 0).store_folder("validation", table))
             np.testing.assert_array_equal(own["truth"], shared["truth"])
             assert not np.allclose(own["relative"], shared["relative"])
-    seen, unseen = (open_store(sources(folder).store_folder("validation", table)) for table in ("seen", "unseen"))
-    assert not np.allclose(seen["truth"], unseen["truth"])
+    driven = [open_store(sources(folder).store_folder("validation", table))["truth"] for table in TABLES]
+    assert all(not np.allclose(a, b) for a, b in itertools.combinations(driven, 2))
 
 
 def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
     page = (folder / "docs" / "results_maze3d.md").read_text()
-    for name in ("seen", "unseen"):
+    for name in TABLES:
         assert f"## Table `{name}`" in page
-    assert page.count("### What limits it") == 2
+    assert page.count("### What limits it") == len(TABLES)
     for name in LIMITS:
-        assert page.count(f"| `{name}` |") == 2
+        assert page.count(f"| `{name}` |") == len(TABLES)
     images = sorted((folder / "docs" / "images").iterdir())
     assert len(images) >= 4
     for image in images:
