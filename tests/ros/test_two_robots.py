@@ -31,6 +31,7 @@ def test_two_robots_drive_at_once(tmp_path: Path) -> None:
     steps = {name: probe.collect(RelativePose, f"/{name}/relative_pose", 5000) for name in ROBOTS}
     poses = {name: probe.collect(PoseWithCovarianceStamped, f"/{name}/ngo/pose", 5000) for name in ROBOTS}
     transforms = probe.collect(TFMessage, "/tf", 5000)
+    mazes: dict[str, dict[str, object]] = {}
     with ExitStack() as stack:
         for seed, name in enumerate(ROBOTS):
             shared = {"world": "maze2d", "weights": str(tmp_path), "frame_prefix": f"{name}/"}
@@ -43,13 +44,14 @@ def test_two_robots_drive_at_once(tmp_path: Path) -> None:
                 "wait_for_subscribers": 1,
                 "wait_for_flow_control": True,
             }
-            for package, executable, parameters in (
-                ("ngo_estimator", "ngo_node", shared),
-                ("ngo_estimator", "local_node", local),
-                ("ngo_sim", "maze2d", maze),
-            ):
-                arguments = ("-r", f"__ns:=/{name}")
-                stack.enter_context(NodeProcess(package, executable, parameters, arguments))
+            for executable, parameters in (("ngo_node", shared), ("local_node", local)):
+                stack.enter_context(NodeProcess("ngo_estimator", executable, parameters, ("-r", f"__ns:=/{name}")))
+            mazes[name] = maze
+        # Simulators wait for their own estimators alone, so that these and the probe must have found each other before.
+        topics = [f"/{name}/{topic}" for name in ROBOTS for topic in ("relative_pose", "ngo/pose")]
+        probe.spin_until(lambda: all(probe.node.count_publishers(topic) for topic in topics), "all estimators")
+        for name, maze in mazes.items():
+            stack.enter_context(NodeProcess("ngo_sim", "maze2d", maze, ("-r", f"__ns:=/{name}")))
         probe.spin_until(lambda: all(len(found) == FRAMES - 1 for found in poses.values()), "every pose of both")
         probe.spin_until(lambda: len(transforms) == 4 * (FRAMES - 1), "every transform of both")
     core = OnlineTrajectory.load(tmp_path, iterations_per_step=1)  # as ngo_node by default
