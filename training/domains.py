@@ -24,7 +24,7 @@ class Domain:
 
     What an optimizer here begins with: ``robust`` says whether the loops' gates start from a robust kernel or from
     nothing, ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart`` meta-poses from each other and
-    ``max_loops`` of a trajectory. It is trained for ``optimizer_epochs``, the first ``single_epochs`` of them with one
+    ``max_loops`` of a trajectory. It is trained for ``optimizer_epochs``, the first ``single_share`` of them with one
     iteration where it closes loops, and errors count by their square below ``loss_scale``: so many corridor widths, and
     as many fifths of a radian.
     """
@@ -48,7 +48,7 @@ class Domain:
     max_loops: int = LoopSearch.most
     loops_apart: int = LoopSearch.min_apart
     optimizer_epochs: int = 6
-    single_epochs: int = 0
+    single_share: float = 0.0
     loss_scale: float = 0.1
 
     @property

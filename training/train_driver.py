@@ -182,7 +182,8 @@ def make_model(arguments: Arguments, config: PolicyConfig, environments: VecMoni
     return PPO(
         MirroredPolicy,
         environments,
-        learning_rate=lambda remaining: arguments.learning_rate * remaining,
+        # The last round goes beyond the last decision, and what remains below zero.
+        learning_rate=lambda remaining: arguments.learning_rate * max(remaining, 0.0),
         n_steps=arguments.steps,
         batch_size=arguments.batch_size,
         n_epochs=arguments.passes,

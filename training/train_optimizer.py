@@ -139,7 +139,7 @@ class OptimizerTraining(lightning.LightningModule):
     def optimized(self, batch: Batch) -> list[Tensor]:
         """The relative meta-poses after each of the iterations that are trained in this epoch."""
         optimizer = self.optimizer
-        single = optimizer.config.loops and self.current_epoch < self.domain.single_epochs
+        single = optimizer.config.loops and self.current_epoch < self.domain.single_share * (self.arguments.epochs or 0)
         steps = optimizer.aggregate(batch["relative"], batch["log_std"], batch["motion"])
         fixes = fixes_of(batch, optimizer.block, self.domain.block_m)
         results = optimizer.iterate(steps, loops_of(batch), fixes)

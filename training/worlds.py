@@ -230,7 +230,7 @@ WORLDS = {
         # With the scale of the 2D world the gates hardly move, with all iterations at once some trainings never do
         # (docs/results.md).
         optimizer_epochs=40,
-        single_epochs=20,
+        single_share=0.5,
         loss_scale=0.3,
         tables={
             "seen": Table(stretch=1, seen=True),

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from ngo_estimator.checkpoint import load_optimizer
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.runs import WEIGHTS
-from training.train_optimizer import Arguments, Choices, choices, config_of
+from training.train_optimizer import Arguments, Choices, OptimizerTraining, choices, config_of
 from training.worlds import WORLDS, world_named
 
 
@@ -25,3 +27,22 @@ def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None
     shipped = load_optimizer(WEIGHTS / world, world)[0].config
     made = config_of(Arguments(world=world), world_named(world), shipped.correction_std)  # type: ignore[arg-type]
     assert replace(made, covariance_scale=shipped.covariance_scale) == shipped
+
+
+@pytest.mark.parametrize(("form", "iterations"), [("learned", (1, 1, 3, 3)), ("paper", (3, 3, 3, 3))])
+def test_where_loops_are_closed_the_first_epochs_have_one_iteration(
+    form: str, iterations: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    optimizer = small_optimizer(form, trained=True)
+    relative, log_std, motion, codes = trajectory_inputs(2, 160)
+    batch = {"relative": relative, "log_std": log_std, "motion": motion}
+    if optimizer.config.loops:
+        batch |= {f"loop_{k}": v for k, v in vars(optimizer.find_loops(relative, codes, small_pair_head())).items()}
+    world = replace(world_named("maze3d"), single_share=0.5)
+    training = OptimizerTraining(Arguments(world="maze3d", epochs=4), optimizer, world)
+    whole = training(batch).meta_relative
+    for epoch, expected in enumerate(iterations):
+        monkeypatch.setattr(OptimizerTraining, "current_epoch", epoch)
+        found = training.optimized(batch)
+        assert len(found) == expected
+        torch.testing.assert_close(found, whole[:expected])
