@@ -47,7 +47,7 @@ class Curves(Callback):
         """
         self._measure_memory()
         figures = {
-            "seconds": round(self.seconds, 1),
+            "seconds": round(self.seconds, 3),
             "datapoints_per_s": round(self.datapoints / max(self.seconds, 1e-9), 1),
             "peak_memory_mb": round(self.peak_memory_mb),
         }
