@@ -14,7 +14,7 @@ from training.curves import rows
 from training.statistics import mean_interval, rms_interval
 from training.streams import PairStream, images_of, loader, simulate
 from training.validation_steps import estimated_steps, odometry_error, step_errors, true_steps, validation_episodes
-from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World
 
 _WARM_UP = 4  # batches: the process that simulates has started
 _LATENCIES, _UNTIMED = 200, 20
@@ -22,9 +22,7 @@ _LATENCIES, _UNTIMED = 200, 20
 
 def pairs_a_second(arguments: train_local.Arguments, seconds: float) -> float:
     """Frame pairs a second of a training with these arguments, simulation included, measured for some seconds."""
-    world = world_named(str(arguments.world))
-    if arguments.picture_height is not None:
-        world = world.with_pictures(arguments.picture_height)
+    world = train_local.simulated_world(arguments)
     steps = train_local.SimulatedSteps(arguments, world)
     network = train_local.initial_network(arguments, world, steps)[0]
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4)

@@ -24,9 +24,18 @@ from ngo_sim.maze3d import Maze3DConfig
 from training import runs
 from training.curves import write_at_once
 from training.hard_frames_page import draw, page
-from training.hard_steps import QUANTITIES, bins_json, drive_of, hard_frames, odometry_json, turning_json
+from training.hard_steps import (
+    QUANTITIES,
+    bins_json,
+    drive_of,
+    hard_frames,
+    odometry_json,
+    travels_m,
+    turning_json,
+    turns_deg,
+)
 from training.statistics import mean_interval, ratio_interval
-from training.validation_steps import estimated_steps, validation_episodes
+from training.validation_steps import estimated_steps, true_steps, validation_episodes
 from training.wall_view import filled_depth_m, wall_view
 from training.worlds import world_named
 
@@ -101,12 +110,12 @@ def corridors_json(block_m: float, driven: Iterable[Episode] | None, arguments: 
         driven = validation_episodes(world, arguments.mazes, arguments.frames)
     cameras = [Maze3DConfig(block_m=block_m, field_of_view_deg=view) for view in arguments.fields_of_view_deg]
     counts: list[list[tuple[float, ...]]] = [[] for _ in cameras]
-    turns_deg, metres = [], []
+    turns, travels = [], []
     for episode in driven:
         assert episode.maze is not None  # worlds are mazes
-        drive = drive_of(episode, None, cameras[0])
-        turns_deg.append(float(np.mean(drive.turn_deg)))
-        metres.append(float(np.mean(drive.travel_m)))
+        steps = true_steps(episode)
+        turns.append(float(turns_deg(steps).mean()))
+        travels.append(float(travels_m(steps).mean()))
         for found, camera in zip(counts, cameras, strict=True):
             view = wall_view(episode.maze, episode.poses_xyyaw, camera)
             hard = hard_frames(view, camera)
@@ -126,8 +135,8 @@ def corridors_json(block_m: float, driven: Iterable[Episode] | None, arguments: 
                 "near_shipped": ratio_interval(near_shipped, frames).as_json(),
                 "filled": ratio_interval(filled, frames).as_json(),
                 "faces": ratio_interval(faces, frames).as_json(),
-                "turn_deg": mean_interval(np.array(turns_deg)).as_json(),
-                "travel_m": mean_interval(np.array(metres)).as_json(),
+                "turn_deg": mean_interval(np.array(turns)).as_json(),
+                "travel_m": mean_interval(np.array(travels)).as_json(),
             }
         )
     return result

@@ -68,7 +68,7 @@ class Drive:
     """The steps of an episode: of the two pictures of each, what the harder one shows of the walls.
 
     ``nearest_m``, ``near_share``, ``filled_share``, ``faces``, ``turn_deg``, ``travel_m`` ``(steps,)`` as in
-    ``QUANTITIES``; ``estimated`` and ``true`` ``(steps, 3)``, the first equal to the second where nobody estimates.
+    ``QUANTITIES``; ``estimated`` and ``true`` ``(steps, 3)``.
     """
 
     nearest_m: np.ndarray
@@ -93,34 +93,53 @@ class Drive:
 
 def hard_frames(view: WallView, camera: Maze3DConfig) -> HardFrames:
     """Which frames of a view are hard, by each of the measures."""
-    near = view.distance_m < camera.block_m / 2.0
-    near_shipped = view.distance_m < Maze3DConfig.block_m / 2.0
-    filled = view.depth_m < filled_depth_m(camera)
+    near = near_share(view, camera.block_m)
     return HardFrames(
-        near=near.mean(axis=1) >= HARD_SHARE,
-        any_near=view.distance_m.min(axis=1) < camera.block_m / 2.0,
-        near_shipped=near_shipped.mean(axis=1) >= HARD_SHARE,
-        filled=filled.mean(axis=1) >= HARD_SHARE,
+        near=near >= HARD_SHARE,
+        any_near=near > 0.0,
+        near_shipped=near_share(view, Maze3DConfig.block_m) >= HARD_SHARE,
+        filled=filled_share(view, camera) >= HARD_SHARE,
     )
 
 
-def drive_of(episode: Episode, estimated: np.ndarray | None, camera: Maze3DConfig) -> Drive:
-    """The steps of an episode seen by a camera, with estimates ``(steps, 3)`` or without."""
+def near_share(view: WallView, corridor_m: float) -> np.ndarray:
+    """``(frames,)`` share of the columns whose wall is nearer than half of a corridor."""
+    share: np.ndarray = (view.distance_m < corridor_m / 2.0).mean(axis=1)
+    return share
+
+
+def filled_share(view: WallView, camera: Maze3DConfig) -> np.ndarray:
+    """``(frames,)`` share of the columns that a wall fills, without floor or ceiling."""
+    share: np.ndarray = (view.depth_m < filled_depth_m(camera)).mean(axis=1)
+    return share
+
+
+def drive_of(episode: Episode, estimated: np.ndarray, camera: Maze3DConfig) -> Drive:
+    """The steps of an episode seen by a camera, with estimates ``(steps, 3)``."""
     assert episode.maze is not None  # worlds are mazes
     view, true = wall_view(episode.maze, episode.poses_xyyaw, camera), true_steps(episode)
-    near = (view.distance_m < camera.block_m / 2.0).mean(axis=1)
-    filled = (view.depth_m < filled_depth_m(camera)).mean(axis=1)
+    near, filled = near_share(view, camera.block_m), filled_share(view, camera)
     nearest = view.distance_m.min(axis=1)
     return Drive(
         nearest_m=np.minimum(nearest[:-1], nearest[1:]),
         near_share=np.maximum(near[:-1], near[1:]),
         filled_share=np.maximum(filled[:-1], filled[1:]),
         faces=np.minimum(view.faces[:-1], view.faces[1:]),
-        turn_deg=np.abs(np.degrees(true[:, 2])),
-        travel_m=np.hypot(true[:, 0], true[:, 1]),
-        estimated=true if estimated is None else estimated,
+        turn_deg=turns_deg(true),
+        travel_m=travels_m(true),
+        estimated=estimated,
         true=true,
     )
+
+
+def turns_deg(steps: np.ndarray) -> np.ndarray:
+    """``(steps,)`` how far steps ``(steps, 3)`` turn, to either side."""
+    return np.abs(np.degrees(steps[:, 2]))
+
+
+def travels_m(steps: np.ndarray) -> np.ndarray:
+    """``(steps,)`` how long steps ``(steps, 3)`` are."""
+    return np.hypot(steps[:, 0], steps[:, 1])
 
 
 def bins_json(drives: Sequence[Drive], quantity: Quantity) -> list[dict[str, Any]]:

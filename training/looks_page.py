@@ -1,10 +1,9 @@
 """The page about training in varied looks in Markdown, made whole from the JSON."""
 
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 from training.looks_scores import METRICS, Metric
-from training.results_page import number
+from training.results_page import interval, markdown
 
 _MEASURED = {
     "plain": "the look of the plain training, in mazes that nothing was trained in",
@@ -29,7 +28,7 @@ def page(result: dict[str, Any]) -> str:
         "part of them. Numbers in full are in "
         "[`training/results/maze3d_looks.json`](../training/results/maze3d_looks.json).",
         "## The looks",
-        _markdown(
+        markdown(
             ("Looks", "Used for", "Textures", "Light", "Width of corridors, m", "Decorations"),
             (
                 *(_look(name, "training", look) for name, look in result["training_looks"].items()),
@@ -42,7 +41,7 @@ def page(result: dict[str, Any]) -> str:
         parts += [f"## Measured in `{name}`", f"{_MEASURED[name][0].upper()}{_MEASURED[name][1:]}.", _table(table)]
     parts += [
         "## Trainings",
-        _markdown(
+        markdown(
             ("Training", "Time, s", "Throughput, datapoints/s", "Command"),
             (
                 (f"`{name}`", f"{found['seconds']:.0f}", f"{found['datapoints_per_s']:.0f}", f"`{found['command']}`")
@@ -64,28 +63,18 @@ def _range(low: float, high: float) -> str:
 
 def _table(table: dict[str, Any]) -> str:
     header = ("", "Unit", "`plain`", "`varied`", "Difference", "Difference, %")
-    return _markdown(header, (_row(METRICS[key], entry) for key, entry in table.items()))
+    return markdown(header, (_row(METRICS[key], entry) for key, entry in table.items()))
 
 
 def _row(metric: Metric, entry: dict[str, Any]) -> tuple[str, ...]:
     paired = entry["varied_vs_plain"]
-    relative = _interval(paired["relative_percent"]) if "relative_percent" in paired else "-"
+    relative = interval(paired["relative_percent"]) if "relative_percent" in paired else "-"
     title = f"{metric.title}, {'less' if metric.is_error else 'more'} is better"
     return (
         title,
         metric.unit,
-        _interval(entry["plain"]),
-        _interval(entry["varied"]),
-        _interval(paired["difference"]),
+        interval(entry["plain"]),
+        interval(entry["varied"]),
+        interval(paired["difference"]),
         relative,
     )
-
-
-def _interval(entry: dict[str, Any]) -> str:
-    low, high = entry["ci95"]
-    return f"{number(entry['mean'])} [{number(low)}, {number(high)}]"
-
-
-def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -130,6 +130,14 @@ class LocalTraining(lightning.LightningModule):
         return runs.one_cycle(optimizer, self.trainer)
 
 
+def simulated_world(arguments: Arguments) -> World:
+    """The world that the arguments name, as they ask for it."""
+    world = world_looking(str(arguments.world), arguments.looks)
+    if arguments.picture_height is not None:
+        world = world.with_pictures(arguments.picture_height)
+    return dataclasses.replace(world, actions=0, mirrored_actions=()) if arguments.without_action else world
+
+
 class Steps(Protocol):
     """Where the pairs of frames come from."""
 
@@ -265,11 +273,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     steps: Steps
     if recorded is None:
-        world = world_looking(str(arguments.world), arguments.looks)
-        if arguments.picture_height is not None:
-            world = world.with_pictures(arguments.picture_height)
-        if arguments.without_action:
-            world = dataclasses.replace(world, actions=0, mirrored_actions=())
+        world = simulated_world(arguments)
         domain: Domain = world
         steps = SimulatedSteps(arguments, world)
     else:

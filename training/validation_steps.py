@@ -12,6 +12,7 @@ from ngo_estimator import se2
 from ngo_estimator.local_pose_network import LocalPoseNetwork
 from training import streams
 from training.metrics import TrajectoryError, trajectory_error
+from training.online_estimate import with_origin
 from training.worlds import VALIDATION_SEEDS, World
 
 if TYPE_CHECKING:
@@ -54,7 +55,5 @@ def step_errors(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def odometry_error(steps: np.ndarray, true: np.ndarray) -> TrajectoryError:
     """The error of the trajectory of steps ``(steps, 3)`` against that of the true ones."""
-    estimate, truth = (
-        np.concatenate((np.zeros((1, 3)), se2.r2g(torch.from_numpy(one[None])).numpy()[0])) for one in (steps, true)
-    )
+    estimate, truth = (with_origin(se2.r2g(torch.from_numpy(one)).numpy()) for one in (steps, true))
     return trajectory_error(estimate, truth)
