@@ -12,7 +12,7 @@ from ngo_estimator.local_pose_network import LocalPoseNetwork
 from training import train_local
 from training.curves import rows
 from training.statistics import mean_interval, rms_interval
-from training.streams import PairStream, images_of, loader, simulate
+from training.streams import PairStream, action_histories, images_of, loader, simulate
 from training.validation_steps import estimated_steps, odometry_error, step_errors, true_steps, validation_episodes
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World
 
@@ -49,7 +49,7 @@ def inference_ms(network: LocalPoseNetwork, world: World) -> float:
     """Median time, ms, in which a network estimates one step on the present number of threads."""
     (episode,) = simulate(world, [VALIDATION_SEEDS[0]], 3)
     images = images_of(world, episode)
-    step = images[:1], images[1:2], torch.from_numpy(episode.actions[:1]).long()
+    step = images[:1], images[1:2], action_histories(episode.actions[:1])
     took = []
     for _ in range(_UNTIMED + _LATENCIES):
         started = time.perf_counter()

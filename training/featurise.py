@@ -37,7 +37,7 @@ from training.metrics import seen_from_first
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import known_to, told, windows
 from training.recorded_tracks import Part, Track
-from training.streams import Batch, images_of, mirrored
+from training.streams import Batch, action_histories, images_of, mirrored
 from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, WorldName, world_named
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def features_of(
     """What the estimator makes of an episode in ``frames - 1`` steps, and the true poses after each of them."""
     local, place = networks or (load_local(weights, world.name)[0], load_place(weights, world.name)[0])
     images = images_of(world, episode)
-    actions = {"action": torch.from_numpy(episode.actions).long()} if world.actions else {}
+    actions = {"action": action_histories(episode.actions)} if world.actions else {}
     return step_features(lambda index: images[index], actions, episode.poses_xyyaw, Networks(local, place))
 
 
@@ -119,7 +119,8 @@ def step_features(
 
     Args:
         frames: gives images of a range of frames ``(n, height, width, channels)``.
-        told_steps: ``action`` ``(steps,)`` and ``twist`` ``(steps, 3)``, where the networks take them.
+        told_steps: ``action`` ``(steps, n)``, the latest ones of each step, and ``twist`` ``(steps, 3)``, where the
+            networks take them.
         poses_xyyaw: ``(steps + 1, 3)``.
     """
     parts: list[tuple[Tensor, ...]] = []

@@ -15,7 +15,7 @@ from training import train_place
 from training.metrics import trajectory_error
 from training.online_estimate import with_origin
 from training.statistics import compare, mean_interval
-from training.streams import PlaceStream, images_of, relative_poses, simulate
+from training.streams import PlaceStream, action_histories, images_of, relative_poses, simulate
 from training.train_local import estimated, step_metrics
 from training.worlds import World
 
@@ -53,7 +53,7 @@ def local_scores(
     for seed in seeds:
         (episode,) = simulate(world, [seed], frames)
         images, truth = images_of(world, episode), relative_poses(episode.poses_xyyaw)
-        pairs = {"earlier": images[:-1], "later": images[1:], "action": torch.from_numpy(episode.actions).long()}
+        pairs = {"earlier": images[:-1], "later": images[1:], "action": action_histories(episode.actions)}
         for name, network in networks.items():
             mean, log_std, _ = estimated(network, pairs)
             steps = step_metrics(mean, log_std, truth)

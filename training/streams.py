@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ngo_estimator import se2
 from ngo_estimator.images import reduced
+from ngo_estimator.local_pose_network import NO_ACTION
 from training.domains import MIRRORED_ACTIONS
 from training.worlds import DRAWN, MazeSize, World
 
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 Batch = dict[str, Tensor]
 
+ACTION_HISTORY = 12
+"""Actions that a batch tells of each step; a network reads as many of the latest ones as it was made for."""
+
+_FORGOTTEN = 0.1  # share of the pairs in training of whose earlier actions nothing, or not all, is known
 _GROUP = 8
 """Episodes simulated in mazes of one size before another size is drawn, and shuffled together."""
 
@@ -60,6 +65,12 @@ def images_of(world: World, episode: Episode) -> Tensor:
     return torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
 
 
+def action_histories(actions: np.ndarray) -> Tensor:
+    """The latest actions ``(..., steps, ACTION_HISTORY)`` of each step, its own last, of ``(..., steps)`` actions."""
+    known = torch.from_numpy(actions).long()
+    return torch.nn.functional.pad(known, (ACTION_HISTORY - 1, 0), value=NO_ACTION).unfold(-1, ACTION_HISTORY, 1)
+
+
 def relative_poses(poses_xyyaw: np.ndarray) -> Tensor:
     """Relative poses ``(frames - 1, 3)``, float32, of ``(frames, 3)`` global poses."""
     poses = torch.from_numpy(poses_xyyaw)
@@ -75,7 +86,7 @@ def mirrored(batch: Batch) -> Batch:
         elif name in ("relative", "poses", "twist"):
             result[name] = value * value.new_tensor([1.0, -1.0, -1.0])
         elif name == "action":
-            result[name] = value.new_tensor(MIRRORED_ACTIONS)[value]
+            result[name] = value.new_tensor((*MIRRORED_ACTIONS, NO_ACTION))[value]
     return result
 
 
@@ -105,7 +116,8 @@ ALL = Share()
 class _Stream(IterableDataset[Batch]):
     """The maze seeds of one epoch, dealt out in groups to the processes that train together and to their workers.
 
-    An epoch has as many groups as it takes for all processes to have the same number of them.
+    An epoch has as many groups as it takes for all processes to have the same number of them. The world's
+    ``training_drivers`` take turns, group by group.
     """
 
     def __init__(self, world: World, seeds: range, epoch: int, groups: int, frames: int, share: Share = ALL) -> None:
@@ -114,6 +126,7 @@ class _Stream(IterableDataset[Batch]):
         first = epoch * mazes
         if first + mazes > len(seeds):
             raise ValueError(f"epoch {epoch} asks for more than the {len(seeds)} maze seeds")
+        self.first_seed = seeds[0]
         dealt = [list(seeds[i : i + _GROUP]) for i in range(first, first + mazes, _GROUP)]
         self.groups = dealt[share.rank :: share.ranks]
 
@@ -122,7 +135,10 @@ class _Stream(IterableDataset[Batch]):
         mine = self.groups if worker is None else self.groups[worker.id :: worker.num_workers]
         for seeds in mine:
             rng = np.random.default_rng([seeds[0], 1])
-            yield from self.batches(list(simulate(self.world, seeds, self.frames)), rng)
+            drivers = self.world.training_drivers or (self.world.driver,)
+            driver = drivers[(seeds[0] - self.first_seed) // _GROUP % len(drivers)]
+            episodes = episodes_in(self.world, seeds, seeds, self.frames, DRAWN, driver)
+            yield from self.batches(list(episodes), rng)
 
     def __len__(self) -> int:
         return len(self.groups) * self.batches_a_group
@@ -141,7 +157,8 @@ class PairStream(_Stream):
     """Batches of consecutive frames, shuffled over a group of mazes; every second batch is mirrored.
 
     A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``, ``relative`` ``(batch, 3)`` and, in a
-    world with actions, ``action`` ``(batch,)``. Where a world ``reverses``, time runs backwards in every fourth batch.
+    world with actions, ``action`` ``(batch, ACTION_HISTORY)``: a few of them as after a restart, when the earlier ones
+    are not known. Where a world ``reverses``, time runs backwards in every fourth batch.
     """
 
     FRAMES = 401
@@ -162,10 +179,11 @@ class PairStream(_Stream):
 
     def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
         images = torch.stack([images_of(self.world, episode) for episode in episodes])
-        actions = torch.stack([torch.from_numpy(episode.actions).long() for episode in episodes]).flatten()
         relative = torch.stack([relative_poses(episode.poses_xyyaw) for episode in episodes]).flatten(0, 1)
         steps = self.frames - 1
-        order = torch.from_numpy(rng.permutation(len(actions)))
+        order = torch.from_numpy(rng.permutation(len(relative)))
+        if self.world.actions:
+            actions = partly_forgotten(action_histories(np.stack([e.actions for e in episodes])).flatten(0, 1), rng)
         for count, chosen in enumerate(order.split(self.batch_size)[: self.batches_a_group]):
             episode, step = chosen // steps, chosen % steps
             batch = {
@@ -178,6 +196,14 @@ class PairStream(_Stream):
             if self.world.reverses and count % 8 in (2, 5):
                 batch = reversed_in_time(batch)
             yield mirrored(batch) if count % 2 else batch
+
+
+def partly_forgotten(actions: Tensor, rng: np.random.Generator) -> Tensor:
+    """Histories of actions ``(n, ACTION_HISTORY)``, a share of which knows a drawn number of the latest alone."""
+    known = rng.integers(1, ACTION_HISTORY, len(actions))
+    known[rng.random(len(actions)) >= _FORGOTTEN] = ACTION_HISTORY
+    age = torch.arange(ACTION_HISTORY - 1, -1, -1)
+    return actions.masked_fill(age >= torch.from_numpy(known).unsqueeze(1), NO_ACTION)
 
 
 class PlaceStream(_Stream):
@@ -234,8 +260,8 @@ class PlaceStream(_Stream):
 class TrajectoryStream(_Stream):
     """Batches of whole short trajectories, each in a maze of its own; every second batch is mirrored.
 
-    A batch holds ``images`` ``(batch, steps + 1, height, width, channels)``, ``action`` ``(batch, steps)`` and
-    ``relative`` ``(batch, steps, 3)``.
+    A batch holds ``images`` ``(batch, steps + 1, height, width, channels)``, ``action`` ``(batch, steps,
+    ACTION_HISTORY)`` and ``relative`` ``(batch, steps, 3)``.
     """
 
     def __init__(
@@ -255,7 +281,7 @@ class TrajectoryStream(_Stream):
             chosen = episodes[count * self.batch_size : (count + 1) * self.batch_size]
             batch = {
                 "images": torch.stack([images_of(self.world, episode) for episode in chosen]),
-                "action": torch.stack([torch.from_numpy(episode.actions).long() for episode in chosen]),
+                "action": action_histories(np.stack([episode.actions for episode in chosen])),
                 "relative": torch.stack([relative_poses(episode.poses_xyyaw) for episode in chosen]),
             }
             yield mirrored(batch) if count % 2 else batch

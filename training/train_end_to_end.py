@@ -95,9 +95,9 @@ class EndToEndTraining(lightning.LightningModule):
         """Relative poses and logarithms of their deviations ``(batch, steps, 3)``, and the corrected trajectories."""
         # As they will be used: the local network's estimate is another one while it is trained alone.
         self.local.eval()
-        shape = batch["action"].shape
+        shape = batch["relative"].shape[:2]
         earlier, later = batch["images"][:, :-1].flatten(0, 1), batch["images"][:, 1:].flatten(0, 1)
-        estimates = self.local(earlier, later, batch["action"].flatten())
+        estimates = self.local(earlier, later, batch["action"].flatten(0, 1))
         relative, log_std, motion = (value.float().unflatten(0, shape) for value in estimates)
         has_loops = self.optimizer.config.loops
         codes = self.place.encoder(later).float().unflatten(0, shape) if has_loops else relative
@@ -206,7 +206,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments,
         arguments.epochs,
         arguments.seed,
-        datapoints=lambda batch: batch["action"].numel(),
+        datapoints=lambda batch: batch["relative"][..., 0].numel(),
     )
     training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad)
     data = _Data(arguments, world)

@@ -32,7 +32,7 @@ from training.domains import Domain
 from training.looks import LooksName, check_looks
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedSteps
-from training.streams import Batch, PairStream, Share, images_of, loader, relative_poses, simulate
+from training.streams import Batch, PairStream, Share, action_histories, images_of, loader, relative_poses, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
 HEADING_WEIGHT = 3.0
@@ -203,7 +203,7 @@ def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
         images = images_of(world, episode)
         pairs = {"earlier": images[:-1], "later": images[1:], "relative": relative_poses(episode.poses_xyyaw)}
         if world.actions:
-            pairs["action"] = torch.from_numpy(episode.actions).long()
+            pairs["action"] = action_histories(episode.actions)
         result.append(pairs)
     return result
 
@@ -336,6 +336,7 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         mirrored_actions=domain.mirrored_actions,
         twist=domain.twist,
         twist_scale=domain.twist_scale,
+        action_history=domain.action_history if domain.actions else 1,
     )
     return LocalPoseNetwork(config), {}
 

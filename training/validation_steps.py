@@ -34,7 +34,7 @@ def validation_episodes(world: World, mazes: int, frames: int) -> Iterator[Episo
 def estimated_steps(network: LocalPoseNetwork, world: World, episode: Episode) -> np.ndarray:
     """Relative poses ``(frames - 1, 3)``, float64, that a network of the world estimates along an episode."""
     images = streams.images_of(world, episode)
-    actions = torch.from_numpy(episode.actions).long().split(_TOGETHER)
+    actions = streams.action_histories(episode.actions).split(_TOGETHER)
     pairs = zip(images[:-1].split(_TOGETHER), images[1:].split(_TOGETHER), actions, strict=True)
     told = bool(network.config.actions)
     steps = [network(earlier, later, action if told else None)[0] for earlier, later, action in pairs]

@@ -18,7 +18,7 @@ from ngo_estimator.local_odometry import (
     RejectedFrame,
     UnusableImage,
 )
-from ngo_estimator.local_pose_network import LocalPoseNetwork
+from ngo_estimator.local_pose_network import NO_ACTION, LocalPoseNetwork
 from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations, place_config
 
 PERIOD_NS = 100_000_000
@@ -229,6 +229,26 @@ def test_a_network_without_actions_needs_none() -> None:
     assert not odometry.uses_action
     odometry.update(0, images[0], None)
     assert odometry.update(PERIOD_NS, images[1], None) is not None
+
+
+def test_the_network_is_told_the_latest_actions_until_the_odometry_begins_anew() -> None:
+    config, images = local_config("maze2d", action_history=3), frames(6)
+    odometry = LocalOdometry(LocalPoseNetwork(config), PlaceNetworks(place_config("maze2d")), "maze2d")
+    told: list[list[int]] = []
+    odometry._network.register_forward_pre_hook(lambda _, inputs: told.append(inputs[2][0].tolist()))
+    stamps = iter(range(0, 1000 * PERIOD_NS, PERIOD_NS))
+    odometry.update(next(stamps), images[0], 2)  # nobody knows what led to the first frame
+    for action in (0, 1):
+        odometry.update(next(stamps), images[1], action)
+    with pytest.raises(UnusableImage):
+        odometry.update(next(stamps), images[2], 3)
+    for action in (2, 0):
+        odometry.update(next(stamps), images[3], action)
+    assert told == [[NO_ACTION, NO_ACTION, 0], [NO_ACTION, 0, 1], [0, 1, 2], [1, 2, 0]]
+    odometry.reset()
+    odometry.update(next(stamps), images[4], 1)
+    odometry.update(next(stamps), images[5], 2)
+    assert told[-1] == [NO_ACTION, NO_ACTION, 2]
 
 
 @pytest.mark.parametrize("twist", [None, np.zeros(2), np.array([0.1, np.nan, 0.0]), 0.3])

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from ngo_estimator.local_pose_network import LocalPoseNetwork
+from ngo_estimator.local_pose_network import NO_ACTION, LocalPoseNetwork
 from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations
 
 
@@ -57,19 +57,42 @@ def test_the_action_matters_and_must_be_given_exactly_when_it_was_in_training() 
         without(images[:1], images[1:], torch.tensor([1]))
 
 
+def test_a_network_is_told_as_many_of_the_latest_actions_as_it_was_made_for() -> None:
+    torch.manual_seed(0)
+    images = observations("maze2d", 2).repeat_interleave(2, dim=0)
+    network = LocalPoseNetwork(local_config("maze2d", action_history=3)).eval()
+
+    def of(*actions: int) -> torch.Tensor:
+        return network(images[:1], images[3:], torch.tensor([actions]))[0]
+
+    now = of(NO_ACTION, NO_ACTION, 1)
+    assert not torch.equal(now, of(NO_ACTION, 1, 1)) and not torch.equal(now, of(NO_ACTION, NO_ACTION, 2))
+    assert not torch.equal(of(0, 1, 1), of(1, 0, 1))
+    assert torch.equal(of(2, 2, 0, 1, 1), of(0, 1, 1))
+    for wrong in (torch.tensor([1]), torch.tensor([[1, 1]]), torch.zeros(1, 3, 1).long()):
+        with pytest.raises(ValueError, match="expected the latest 3 of each"):
+            network(images[:1], images[3:], wrong)
+
+
+def test_of_one_action_the_history_is_that_action() -> None:
+    images, network = observations("maze2d", 3), LocalPoseNetwork(local_config("maze2d")).eval()
+    alone, latest = torch.tensor([1, 2]), torch.tensor([[0, 0, 1], [1, NO_ACTION, 2]])
+    assert torch.equal(network(images[:2], images[1:], alone)[0], network(images[:2], images[1:], latest)[0])
+
+
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_symmetric_network_sees_the_mirror_image_as_the_mirrored_motion(world: str) -> None:
     torch.manual_seed(0)
-    config = local_config(world, symmetric=True, mirrored_actions=(0, 2, 1))
+    config = local_config(world, symmetric=True, mirrored_actions=(0, 2, 1), action_history=2)
     network = LocalPoseNetwork(config).eval()
-    images, actions = observations(world, 4), torch.tensor([0, 1, 2])
+    images, actions = observations(world, 4), torch.tensor([[1, 0], [NO_ACTION, 1], [2, 2]])
     mean, log_std, feature = network(images[:3], images[1:], actions)
     mirrored = images.flip(-2)
-    other, other_log_std, _ = network(mirrored[:3], mirrored[1:], torch.tensor([0, 2, 1]))
+    other, other_log_std, _ = network(mirrored[:3], mirrored[1:], torch.tensor([[2, 0], [NO_ACTION, 2], [1, 1]]))
     assert torch.allclose(other, mean * torch.tensor([1.0, -1.0, -1.0]), atol=1e-6)
     assert torch.allclose(other_log_std, log_std, atol=1e-6)
     # Training sees each picture once: there the network is the plain one.
-    plain = LocalPoseNetwork(local_config(world)).eval()
+    plain = LocalPoseNetwork(local_config(world, action_history=2)).eval()
     plain.load_state_dict(network.state_dict())
     once = plain(images[:3], images[1:], actions)
     trained = network.train()(images[:3], images[1:], actions)
@@ -92,7 +115,7 @@ def test_the_scale_of_deviations_is_a_factor() -> None:
 @pytest.mark.parametrize(
     "change",
     [{"width": 0.0}, {"width": 2.1}, {"actions": -1}, {"feature_size": 0}, {"hidden_size": 0}, {"period_s": 0.0}]
-    + [{"period_s": float("nan")}, {"relative_std": (1.0, 0.0, 1.0)}]
+    + [{"action_history": 0}, {"period_s": float("nan")}, {"relative_std": (1.0, 0.0, 1.0)}]
     + [{"deviation_scale": (1.0, 1.0, 0.0)}, {"symmetric": True}, {"symmetric": True, "mirrored_actions": (0, 1, 1)}],
 )
 def test_impossible_local_configurations_are_refused(change: dict[str, object]) -> None:

@@ -1,28 +1,35 @@
 """Training data: a function of the epoch's number, dealt out once, mirrored as physics would have it."""
 
 import dataclasses
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from ngo_estimator import se2
+from ngo_estimator.local_pose_network import NO_ACTION
 from ngo_sim.drivers import Action
+from ngo_sim.episodes import Episode
 from training import streams
 from training.streams import (
+    ACTION_HISTORY,
     Batch,
     PairStream,
     PlaceStream,
     Share,
     TrajectoryStream,
+    action_histories,
     images_of,
     loader,
     mirrored,
+    partly_forgotten,
     relative_poses,
     revisits,
     simulate,
 )
-from training.worlds import TRAIN_SEEDS, WORLDS
+from training.worlds import TRAIN_SEEDS, WORLDS, World
 
 WORLD = WORLDS["maze2d"]
 
@@ -103,19 +110,22 @@ def test_pairs_are_consecutive_frames_with_their_action_and_motion() -> None:
     for episode in episodes:
         images, relative = images_of(WORLD, episode), relative_poses(episode.poses_xyyaw)
         for k in range(40):
-            known[images[k].numpy().tobytes()] = (images[k + 1], int(episode.actions[k]), relative[k])
+            known[images[k].numpy().tobytes()] = (images[k + 1], episode.actions[: k + 1].tolist(), relative[k])
     batches = list(pair_stream(groups=1))
     assert batches[0]["earlier"].shape == (16, 1, 241, 4) and batches[0]["relative"].dtype == torch.float32
-    seen = 0
+    seen = forgotten = 0
     for count, batch in enumerate(batches):
         plain = mirrored(batch) if count % 2 else batch  # every second batch is a mirror image
         for k in range(16):
-            later, action, relative_pose = known.pop(plain["earlier"][k].numpy().tobytes())
+            later, actions, relative_pose = known.pop(plain["earlier"][k].numpy().tobytes())
             assert torch.equal(plain["later"][k], later)
-            assert plain["action"][k] == action
+            told = [action for action in plain["action"][k].tolist() if action != NO_ACTION]
+            assert told == actions[-len(told) :] and plain["action"][k][-1] != NO_ACTION
+            forgotten += len(told) < min(len(actions), ACTION_HISTORY)
             assert torch.equal(plain["relative"][k], relative_pose)
             seen += 1
     assert seen == 80 and not known  # every pair once
+    assert 0 < forgotten < 20
 
 
 def test_mirroring_twice_is_nothing() -> None:
@@ -232,7 +242,7 @@ def test_each_trajectory_is_met_once_whole_and_every_second_batch_in_a_mirror(mo
         episodes = list(simulate(WORLD, group, 61))[number % 2 * 2 :][:2]
         for k, episode in enumerate(episodes):
             assert torch.equal(plain["images"][k], images_of(WORLD, episode))
-            assert plain["action"][k].tolist() == episode.actions.tolist()
+            assert torch.equal(plain["action"][k], action_histories(episode.actions))
             again = se2.compose(torch.from_numpy(episode.poses_xyyaw[0]), se2.r2g(plain["relative"][k].double()))
             assert torch.allclose(again[:, :2], torch.from_numpy(episode.poses_xyyaw[1:, :2]), atol=1e-4)
 
@@ -242,3 +252,43 @@ def test_a_batch_that_no_group_holds_is_refused() -> None:
         pair_stream(batch_size=81)
     with pytest.raises(ValueError, match="batch_size is 3; expected 1 to 2"):
         TrajectoryStream(WORLD, TRAIN_SEEDS, 0, 4, 3, 60)
+
+
+def test_a_history_ends_with_the_steps_own_action_and_begins_with_nothing() -> None:
+    histories = action_histories(np.array([[1, 2, 0], [0, 0, 1]], np.uint8))
+    assert histories.shape == (2, 3, ACTION_HISTORY)
+    for episode, actions in enumerate(([1, 2, 0], [0, 0, 1])):
+        for step in range(3):
+            unknown = [NO_ACTION] * (ACTION_HISTORY - step - 1)
+            assert histories[episode, step].tolist() == unknown + actions[: step + 1]
+    in_the_mirror = mirrored({"action": histories})["action"]
+    assert in_the_mirror[0, 2].tolist()[-4:] == [NO_ACTION, 2, 1, 0]
+
+
+def test_of_a_tenth_of_the_histories_the_earlier_part_is_forgotten() -> None:
+    whole = torch.ones(10_000, ACTION_HISTORY).long()
+    partly = partly_forgotten(whole, np.random.default_rng(0))
+    known = (partly != NO_ACTION).sum(1)
+    assert 0.08 < float((known < ACTION_HISTORY).float().mean()) < 0.12
+    assert sorted(set(known.tolist())) == list(range(1, ACTION_HISTORY + 1))
+    assert all((row[-count:] == 1).all() for row, count in zip(partly, known.tolist(), strict=True))
+
+
+def test_the_training_drivers_take_turns_group_by_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    drove: list[tuple[int, str]] = []
+    real = streams.episodes_in
+
+    def noted(world: World, mazes: list[int], *rest: Any) -> Iterator[Episode]:
+        drove.append((mazes[0], rest[-1]))
+        return real(world, mazes, *rest)
+
+    monkeypatch.setattr(streams, "episodes_in", noted)
+    world = dataclasses.replace(WORLD, training_drivers=("corners", "random", "random_goals"))
+    for rank in range(2):  # which process simulates a group does not matter
+        list(PairStream(world, TRAIN_SEEDS, 1, 6 * 2 * 40, 16, Share(rank, 2)))
+    first = TRAIN_SEEDS[0] + 6 * 2
+    drivers = ["corners", "random", "random_goals"] * 2
+    assert sorted(drove) == [(first + 2 * group, driver) for group, driver in enumerate(drivers)]
+    drove.clear()
+    list(pair_stream(groups=3))
+    assert {driver for _, driver in drove} == {WORLD.driver}

@@ -9,7 +9,7 @@ import torch
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local, load_place
 from ngo_estimator.images import ImageFormat
-from ngo_estimator.local_pose_network import LocalPoseNetwork
+from ngo_estimator.local_pose_network import NO_ACTION, LocalPoseNetwork
 from ngo_estimator.relative_step import RelativeStep
 
 RESTART_AFTER_NS = 1_000_000_000
@@ -98,6 +98,7 @@ class LocalOdometry:
         self._last_image = torch.empty(0)
         self._origin_code: np.ndarray | None = None
         self._odom = torch.zeros(3, dtype=torch.float64)
+        self._actions = [NO_ACTION] * self._network.config.action_history
 
     def update(
         self, stamp_ns: int, image: np.ndarray, action: int | None, twist: np.ndarray | None = None
@@ -140,7 +141,7 @@ class LocalOdometry:
         if self.uses_action:
             if action is None or not 0 <= action < self._network.config.actions:
                 raise UnusableImage(f"action is {action}; expected 0 to {self._network.config.actions - 1}")
-            actions = torch.tensor([action])
+            actions = torch.tensor([[*self._actions[1:], action]])
         twists = None
         if self.uses_twist:
             if twist is None or np.shape(twist) != (3,) or not np.isfinite(twist).all():
@@ -155,6 +156,7 @@ class LocalOdometry:
         # missing frame is added to it.
         variance = variance + (missed * self._network.relative_std.double()) ** 2
         self._odom = se2.compose(self._odom, relative[0].double())
+        self._actions = [] if actions is None else actions[0].tolist()
         self._last_stamp_ns, self._last_image = stamp_ns, frame
         origin_code, self._origin_code = self._origin_code, None
         return LocalEstimate(

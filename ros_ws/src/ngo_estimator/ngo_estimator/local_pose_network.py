@@ -9,15 +9,19 @@ from torch.nn.functional import one_hot
 from ngo_estimator.flownet import FlowNetConvolutions
 from ngo_estimator.images import ImageFormat, to_network
 
+NO_ACTION = -1
+"""In place of an action that was not taken, or that nobody knows."""
+
 
 @dataclass(frozen=True)
 class LocalPoseConfig:
     """What a local pose network is made of.
 
     ``relative_mean`` and ``relative_std`` (m, m, rad) normalise the output: the network works on poses of mean 0 and
-    deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of
-    discrete actions, 0 for none; with ``twist`` the network is told the mean velocity between the frames, which it
-    divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between frames in training.
+    deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of discrete
+    actions, 0 for none, and ``action_history`` how many of the latest ones the network is told: in how a robot with
+    momentum moves, what it did before goes on. With ``twist`` the network is told the mean velocity between the frames,
+    which it divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between frames in training.
     With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror images, in which action
     ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard deviations that the heads give.
     """
@@ -35,6 +39,7 @@ class LocalPoseConfig:
     deviation_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     twist: bool = False
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    action_history: int = 1
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -44,6 +49,8 @@ class LocalPoseConfig:
                 f"actions, feature_size, hidden_size are {self.actions}, {self.feature_size}, {self.hidden_size}; "
                 "expected at least 0, 1, 1"
             )
+        if self.action_history < 1:
+            raise ValueError(f"action_history is {self.action_history}; expected at least 1, the latest action")
         if not self.period_s > 0.0:
             raise ValueError(f"period_s is {self.period_s}; expected a positive time")
         if min(self.relative_std) <= 0.0:
@@ -62,10 +69,10 @@ class LocalPoseNetwork(nn.Module):
     """Relative pose of a frame with respect to the one before, from the two and what is known of the step between.
 
     Two frames are stacked and passed through the convolutions of FlowNetS; one fully connected layer takes these and
-    the action or velocity; a translational and a rotational head read it. Beyond the paper each head also gives the
-    logarithm of its standard deviation, and the input of the heads is the motion feature that the pose aggregation
-    reads. A symmetric network estimates both the frames and their mirror image, in evaluation mode: errors to the left
-    and to the right then cancel wherever the two differ.
+    the actions or the velocity; a translational and a rotational head read it. Beyond the paper the network may be told
+    several of the latest actions, each head also gives the logarithm of its standard deviation, and the input of the
+    heads is the motion feature that the pose aggregation reads. A symmetric network estimates both the frames and their
+    mirror image, in evaluation mode: errors to the left and to the right then cancel wherever the two differ.
     """
 
     def __init__(self, config: LocalPoseConfig) -> None:
@@ -73,7 +80,7 @@ class LocalPoseNetwork(nn.Module):
         self.config = config
         image = config.image
         self.convolutions = FlowNetConvolutions(2 * image.channels, (image.height, image.width), config.width)
-        told = config.actions + 3 * config.twist
+        told = config.actions * config.action_history + 3 * config.twist
         self.hidden = nn.Linear(self.convolutions.output_size + told, config.hidden_size)
         self.feature = nn.Linear(config.hidden_size, config.feature_size)
         self.translation = nn.Linear(config.feature_size + told, 4)
@@ -81,7 +88,7 @@ class LocalPoseNetwork(nn.Module):
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
         self.register_buffer("log_deviation_scale", torch.tensor(config.deviation_scale).log(), persistent=False)
-        self.register_buffer("mirrored_actions", torch.tensor(config.mirrored_actions).long(), persistent=False)
+        self.register_buffer("mirrored_actions", torch.tensor((*config.mirrored_actions, NO_ACTION)), persistent=False)
         self.register_buffer("twist_scale", torch.tensor(config.twist_scale), persistent=False)
         self.relative_mean: Tensor
         self.relative_std: Tensor
@@ -96,7 +103,9 @@ class LocalPoseNetwork(nn.Module):
 
         Args:
             earlier, later: observations ``(batch, height, width, channels)`` as the sensor gives them.
-            actions: ``(batch,)`` int64, the action between the two, or None for a network without actions.
+            actions: ``(batch, n)`` int64, the latest actions, last the one between the two; ``NO_ACTION`` where the
+                robot stood or nobody knows. A network reads as many as its configuration says, the others are of no
+                account. ``(batch,)`` where it reads one; None for a network without actions.
             twist: ``(batch, 3)`` mean velocity (m/s, m/s, rad/s) between the two, or None for a network without.
 
         Returns:
@@ -106,6 +115,8 @@ class LocalPoseNetwork(nn.Module):
         if (actions is None) != (self.config.actions == 0):
             given = "no actions were given" if actions is None else "actions were given"
             raise ValueError(f"{given} to a network trained with {self.config.actions} actions")
+        if actions is not None:
+            actions = self._latest(actions)
         if (twist is None) == self.config.twist:
             raise ValueError(f"twist is {'not ' * (twist is None)}given to a network with twist={self.config.twist}")
         if self.training or not self.config.symmetric:
@@ -117,6 +128,15 @@ class LocalPoseNetwork(nn.Module):
         mean, log_std, feature = (values.chunk(2) for values in self._estimate(both[0], both[1], actions, twist))
         return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
 
+    def _latest(self, actions: Tensor) -> Tensor:
+        """The actions ``(batch, action_history)`` that the network reads."""
+        given = actions.unsqueeze(1) if actions.ndim == 1 else actions
+        if given.ndim != 2 or given.shape[1] < self.config.action_history:
+            raise ValueError(
+                f"actions are of shape {tuple(actions.shape)}; expected the latest {self.config.action_history} of each"
+            )
+        return given[:, -self.config.action_history :]
+
     def _estimate(
         self, earlier: Tensor, later: Tensor, actions: Tensor | None, twist: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,7 +144,9 @@ class LocalPoseNetwork(nn.Module):
         inputs = [self.convolutions(frames)]
         told = []
         if actions is not None:
-            told.append(one_hot(actions, self.config.actions).to(frames.dtype))
+            # NO_ACTION becomes zeros.
+            one_of_each = one_hot(actions - NO_ACTION, self.config.actions + 1)[..., 1:]
+            told.append(one_of_each.flatten(1).to(frames.dtype))
         if twist is not None:
             told.append(twist.to(frames.dtype) / self.twist_scale)
         hidden = torch.relu(self.hidden(torch.cat(inputs + told, dim=1)))
