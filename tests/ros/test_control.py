@@ -16,8 +16,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Path as PathMessage
 from ngo_msgs.msg import Trajectory
 from ngo_msgs.srv import SaveTrajectory
-from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.parameter import Parameter
+from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
@@ -54,13 +53,6 @@ def optimizer(weights: Path, parameters: dict[str, Any]) -> Iterator[Optimizer]:
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log
     probe.close()
-
-
-def set_parameter(probe: Probe, node: str, name: str, value: Any) -> str:
-    """Set a parameter of a running node; returns why it was refused, or nothing."""
-    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-    (result,) = probe.call(SetParameters, f"{node}/set_parameters", request).results
-    return "" if result.successful else str(result.reason)
 
 
 def xyyaw(pose: Any) -> np.ndarray:
@@ -166,21 +158,21 @@ def test_an_initial_pose_moves_pose_path_and_transform(optimizer: Optimizer) -> 
 
 
 def test_the_parameter_initial_pose_is_where_the_next_trajectory_begins(optimizer: Optimizer) -> None:
-    assert set_parameter(optimizer.probe, "ngo_node", "initial_pose", [1.0, 2.0, 1.5]) == ""
+    assert optimizer.probe.set_parameter("ngo_node", "initial_pose", [1.0, 2.0, 1.5]) == ""
     drive = optimizer.drive()
     pose = optimizer.pose_after(drive.step(1))
     step = optimizer.expected([drive.step(1)]).pose_xyyaw
     expected = MapOrigin.of_first_pose(np.array([1.0, 2.0, 1.5])).poses(step)
     np.testing.assert_allclose(xyyaw(pose.pose.pose), expected, atol=1e-6)
-    assert set_parameter(optimizer.probe, "ngo_node", "initial_pose", [0.0, 0.0, 0.0]) == ""
-    assert "three numbers" in set_parameter(optimizer.probe, "ngo_node", "initial_pose", [0.0, 0.0])
+    assert optimizer.probe.set_parameter("ngo_node", "initial_pose", [0.0, 0.0, 0.0]) == ""
+    assert "three numbers" in optimizer.probe.set_parameter("ngo_node", "initial_pose", [0.0, 0.0])
 
 
 def test_smoothed_corrections_reach_the_transform_little_by_little(optimizer: Optimizer) -> None:
     """As many steps as leave no optimisation unfinished, which would end by a transform of its own."""
     probe = optimizer.probe
     transforms = probe.collect(TFMessage, "/tf")
-    assert set_parameter(probe, "ngo_node", "tf_smoothing_s", 1.0) == ""
+    assert probe.set_parameter("ngo_node", "tf_smoothing_s", 1.0) == ""
     drive = optimizer.drive()
     steps = drive.steps(1, 45)
     optimizer.pose_after(*steps)
@@ -195,7 +187,7 @@ def test_smoothed_corrections_reach_the_transform_little_by_little(optimizer: Op
         np.testing.assert_allclose(xyyaw(message.transforms[0].transform), expected, atol=1e-5)
         jumps = max(jumps, float(np.abs(newest - expected).max()))
     assert jumps > 1e-4, "there was nothing to smooth"
-    assert set_parameter(probe, "ngo_node", "tf_smoothing_s", 0.0) == ""
+    assert probe.set_parameter("ngo_node", "tf_smoothing_s", 0.0) == ""
 
 
 # ---- parameters
@@ -203,7 +195,7 @@ def test_smoothed_corrections_reach_the_transform_little_by_little(optimizer: Op
 
 def test_the_path_comes_at_its_rate_and_only_to_those_who_listen(optimizer: Optimizer) -> None:
     probe = optimizer.probe
-    assert set_parameter(probe, "ngo_node", "path_rate_hz", 0.0) == ""
+    assert probe.set_parameter("ngo_node", "path_rate_hz", 0.0) == ""
     paths = probe.collect(PathMessage, "ngo/path")
     probe.spin_until(lambda: paths, "the newest path, for who comes late")
     drive = optimizer.drive()
@@ -212,19 +204,19 @@ def test_the_path_comes_at_its_rate_and_only_to_those_who_listen(optimizer: Opti
     probe.spin_until(lambda: paths and len(paths[-1].poses) == 31, "a path for each step")
     own = [path for path in paths if to_ns(path.header.stamp) <= drive.stamp_ns(30)]  # of this drive, not the last one
     assert [len(path.poses) for path in own] == list(range(2, 32))
-    assert set_parameter(probe, "ngo_node", "path_rate_hz", 2.0) == ""
+    assert probe.set_parameter("ngo_node", "path_rate_hz", 2.0) == ""
     paths.clear()
     optimizer.pose_after(*drive.steps(31, 100))
     probe.spin_until(lambda: paths and len(paths[-1].poses) == 101, "the newest path when it is time")
     assert len(paths) <= 4
-    assert set_parameter(probe, "ngo_node", "path_rate_hz", 10.0) == ""
+    assert probe.set_parameter("ngo_node", "path_rate_hz", 10.0) == ""
 
 
 def test_what_cannot_change_is_refused_in_one_line(optimizer: Optimizer) -> None:
     for name, value in (("window_frames", 100), ("map_frame", "world"), ("publish_tf", False)):
-        reason = set_parameter(optimizer.probe, "ngo_node", name, value)
+        reason = optimizer.probe.set_parameter("ngo_node", name, value)
         assert reason == f"parameter '{name}' cannot change now: start or configure the node with it"
-    assert "path_rate_hz" in set_parameter(optimizer.probe, "ngo_node", "path_rate_hz", -1.0)
+    assert "path_rate_hz" in optimizer.probe.set_parameter("ngo_node", "path_rate_hz", -1.0)
     described = optimizer.probe.call(
         DescribeParameters, "ngo_node/describe_parameters", DescribeParameters.Request(names=["path_rate_hz"])
     ).descriptors
@@ -283,9 +275,9 @@ def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: di
         assert node.state() == "unconfigured"
         process.wait_for_log("ERROR.*there is no folder '/nowhere'")
         # Unconfigured, everything may change: it takes part when the node is configured.
-        assert set_parameter(probe, name, "weights", str(weights)) == ""
+        assert probe.set_parameter(name, "weights", str(weights)) == ""
         assert node.change(Transition.TRANSITION_CONFIGURE) and node.state() == "inactive"
-        assert "cannot change now" in set_parameter(probe, name, "weights", "")
+        assert "cannot change now" in probe.set_parameter(name, "weights", "")
         assert probe.node.count_subscribers("/managed/relative_pose") == 0
         assert node.change(Transition.TRANSITION_ACTIVATE) and node.state() == "active"
         optimizer = Optimizer(process, weights, probe, "/managed")

@@ -142,10 +142,11 @@ def test_of_two_cameras_on_one_topic_the_first_is_held_and_both_are_named(graph:
     images = second.node.create_publisher(Image, "image", 100)
     try:
         second.spin_until(lambda: images.get_subscription_count() == 1, "a match")
-        for step in range(3, 20):
-            graph.play(step)
-            images.publish(image_message(scan(1000 + step), graph.stamp_ns(step) + 1 - RUN_NS * (step % 2)))
-            graph.wait_for_step(step)
+        with graph.probe.patient("local_node", SOURCE_TIMEOUT_S):
+            for step in range(3, 20):
+                graph.play(step)
+                images.publish(image_message(scan(1000 + step), graph.stamp_ns(step) + 1 - RUN_NS * (step % 2)))
+                graph.wait_for_step(step)
         assert graph.steps() == [(step, step + 1) for step in range(19)]
         for estimate, message in zip(graph.expected(*range(20)), graph.out.relative_poses, strict=True):
             np.testing.assert_allclose(message.odom_x, estimate.odom_xyyaw[0], atol=1e-6)
@@ -194,7 +195,8 @@ def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, p
             step += 1
             return "/local_node and /twin publish on '/relative_pose'" in graph.ngo.log
 
-        graph.probe.spin_until(refused, "a warning that names both")
+        with graph.probe.patient("ngo_node", SOURCE_TIMEOUT_S):
+            graph.probe.spin_until(refused, "a warning that names both")
         wait_for_problem(graph.probe, "/ngo_node", diagnostics, "/local_node and /twin publish on '/relative_pose'")
     assert graph.ngo.log.count("restarted, so") == restarts
     assert [to_ns(pose.header.stamp) for pose in graph.out.poses] == [graph.stamp_ns(k) for k in range(1, step)]
