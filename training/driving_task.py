@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from ngo_sim.mazes import Maze
 from ngo_sim.policy_network import ACTIONS, SENSES, PolicyConfig, PolicyView
 from training.worlds import TRAIN_SEEDS, World
 
@@ -29,7 +30,7 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
     """
 
     def __init__(self, world: World, config: PolicyConfig, stream: tuple[int, ...], frames: int, mazes: int) -> None:
-        self._world, self._config, self._frames, self._mazes = world, config, frames, mazes
+        self._world, self.config, self._frames, self._mazes = world, config, frames, mazes
         self._rng = np.random.default_rng(stream)
         self._env: Any = None
         self._seeds: list[int] = []
@@ -51,11 +52,11 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
             openings, most_openings = self._world.extra_openings
             size = int(self._rng.integers(rows, most_rows + 1))
             extra = int(self._rng.integers(openings, most_openings + 1))
-            self._env = Maze3D(held(Maze3DConfig(size, size, extra), self._config.hold_frames))
+            self._env = Maze3D(held(Maze3DConfig(size, size, extra), self.config.hold_frames))
             self._seeds = self._rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop, self._mazes).tolist()
             self._env.preload(self._seeds)
         observation, info = self._env.reset(seed=self._seeds.pop())
-        self._view, self._decisions = PolicyView(self._config), 0
+        self._view, self._decisions = PolicyView(self.config), 0
         self._view.see(observation, info["pose_xyyaw"])
         return self._look(), info
 
@@ -65,8 +66,13 @@ class DrivingTask(gymnasium.Env[Look, np.int64]):
         self._view.did(int(action))
         self._view.see(observation, info["pose_xyyaw"])
         self._decisions += 1
-        over = self._decisions * self._config.hold_frames >= self._frames
+        over = self._decisions * self.config.hold_frames >= self._frames
         return self._look(), REWARD_PER_M * travelled, False, over, info
+
+    @property
+    def maze(self) -> Maze | None:
+        """The maze that is driven through; None before a reset."""
+        return None if self._env is None else self._env.maze
 
     def close(self) -> None:
         """End the world's engine."""

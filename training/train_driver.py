@@ -2,7 +2,9 @@
 
     python -m training.train_driver
 
-The reward is the distance travelled (paper, section 4.2). Run again, it goes on after its last checkpoint, in mazes
+The reward is the distance travelled (paper, section 4.2). It begins with lessons of a teacher that knows the maze and
+drives for distance: turning about at the end of a long corridor costs before it pays, and was not found without them.
+Run again, it goes on after its last checkpoint, in mazes
 that it has not met. It ends with the weights written into the simulator's package. Progress goes to `metrics.csv` in
 its folder below `runs/`, beside `run.json`.
 """
@@ -30,7 +32,8 @@ from training import runs
 from training.curves import write_at_once
 from training.driver_network import Features, MirroredPolicy, export
 from training.driving_task import REWARD_PER_M, DrivingTask
-from training.worlds import world_named
+from training.imitation import Lessons, imitate
+from training.worlds import World, world_named
 
 CHECKPOINT = "last.pt"
 
@@ -39,8 +42,16 @@ CHECKPOINT = "last.pt"
 class Arguments:
     """Settings of a training of the driver."""
 
+    lessons: int = 12
+    """Rounds in which a teacher says what it would do, before it trains by itself."""
+    lesson_decisions: int = 500
+    """Decisions of each environment in a lesson."""
+    lesson_updates: int = 300
+    """Updates after a lesson, of as many decisions each as those of the training."""
+    lesson_learning_rate: float = 1e-3
+    """Learning rate of the first lesson; it falls along a line."""
     decisions: int = 500_000
-    """Decisions to train on, of all environments together; each holds its action for three frames."""
+    """Decisions to train on by itself, of all environments together; each holds its action for three frames."""
     environments: int = 16
     """Mazes that are driven through side by side."""
     steps: int = 128
@@ -53,11 +64,11 @@ class Arguments:
     """Frames in one maze."""
     mazes: int = 16
     """Mazes of one size that an environment makes at a time."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 3e-4
     """At the beginning; it falls to zero along a line."""
     discount: float = 0.98
     """Worth of a reward one decision later."""
-    entropy: float = 0.02
+    entropy: float = 0.005
     """Weight of the entropy of the actions in the loss, at the beginning; it falls to zero as well."""
     checkpoint_decisions: int = 50_000
     """Decisions between two checkpoints."""
@@ -73,10 +84,12 @@ class Arguments:
     def __post_init__(self) -> None:
         for name in (
             "decisions", "environments", "steps", "batch_size", "passes", "episode_frames", "mazes",
-            "checkpoint_decisions", "threads",
+            "checkpoint_decisions", "threads", "lesson_decisions", "lesson_updates",
         ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if self.lessons < 0:
+            raise ValueError(f"lessons is {self.lessons}; it must be at least 0")
 
 
 class Progress(BaseCallback):
@@ -101,7 +114,7 @@ class Progress(BaseCallback):
             self.keep()
 
     def keep(self) -> None:
-        """Write both now."""
+        """Write a row and a checkpoint now."""
         values = self.model.logger.name_to_value
         row = {
             "decisions": self.num_timesteps,
@@ -116,6 +129,10 @@ class Progress(BaseCallback):
                 writer.writeheader()
             writer.writerow(row)
         print(", ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+        self.save()
+
+    def save(self) -> None:
+        """Write a checkpoint now."""
         state = {
             "decisions": self.num_timesteps,
             "wall_s": self.wall_s,
@@ -166,6 +183,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
         model.num_timesteps = done
     progress = Progress(folder, arguments, 0.0 if state is None else float(state["wall_s"]))
     try:
+        if state is None:
+            teach(model, arguments, world, config)
+            progress.init_callback(model)
+            progress.save()
         if done < arguments.decisions:
             model.learn(arguments.decisions - done, progress, log_interval=10**9, reset_num_timesteps=False)
             progress.keep()
@@ -175,6 +196,31 @@ def main(arguments: Arguments) -> dict[str, Any]:
     description = export(arguments.out, model.policy.state_dict(), config, {"training": {**record, **figures}})
     write_at_once(folder / "run.json", json.dumps({**record, **figures, "state": "complete"}, indent=2) + "\n")
     return description
+
+
+def teach(model: PPO, arguments: Arguments, world: World, config: PolicyConfig) -> None:
+    """Give the networks their lessons."""
+    if not arguments.lessons:
+        return
+    lessons = Lessons(
+        arguments.lessons,
+        arguments.lesson_decisions,
+        arguments.lesson_updates,
+        arguments.batch_size,
+        arguments.lesson_learning_rate,
+    )
+    # Other mazes than those that it is to train in by itself.
+    streams = [(arguments.seed, arguments.environments + index, 0) for index in range(arguments.environments)]
+    tasks = [DrivingTask(world, config, stream, arguments.episode_frames, arguments.mazes) for stream in streams]
+
+    def tell(figures: dict[str, float]) -> None:
+        print("lesson: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()), flush=True)
+
+    try:
+        imitate(model.policy, tasks, lessons, arguments.discount, arguments.seed, tell)
+    finally:
+        for task in tasks:
+            task.close()
 
 
 def make_model(arguments: Arguments, config: PolicyConfig, environments: VecMonitor) -> PPO:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,24 +13,18 @@ from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.policy_network import PolicyConfig, PolicyView, load_policy
 from training.driver_network import Features
 from training.driving_task import REWARD_PER_M, DrivingTask, held
+from training.driving_teacher import DistanceDriver
 from training.runs import RunError
 from training.train_driver import Arguments, main
 from training.worlds import TRAIN_SEEDS, world_named
 
 
-def arguments(folder: Path, decisions: int = 16, **changes: int) -> Arguments:
-    return Arguments(
-        decisions=decisions,
-        environments=2,
-        steps=4,
-        batch_size=8,
-        episode_frames=12,
-        mazes=2,
-        checkpoint_decisions=8,
-        out=folder / "driver.safetensors",
-        runs=folder / "runs",
-        **changes,
-    )
+def arguments(folder: Path, **changes: Any) -> Arguments:
+    toy: dict[str, Any] = {
+        "lessons": 1, "lesson_decisions": 4, "lesson_updates": 2, "decisions": 16, "environments": 2, "steps": 4,
+        "batch_size": 8, "episode_frames": 12, "mazes": 2, "checkpoint_decisions": 8,
+    }  # fmt: skip
+    return Arguments(**{**toy, **changes}, out=folder / "driver.safetensors", runs=folder / "runs")
 
 
 def test_a_training_ends_with_weights_that_drive(tmp_path: Path) -> None:
@@ -37,7 +32,7 @@ def test_a_training_ends_with_weights_that_drive(tmp_path: Path) -> None:
     assert json.loads(json.dumps(description)) == json.loads((tmp_path / "driver.json").read_text())
     training = description["training"]
     assert training["decisions"] == 16 and training["arguments"]["seed"] == 0
-    assert training["command"].startswith("python -m training.train_driver --decisions 16") and training["revision"]
+    assert training["command"].startswith("python -m training.train_driver --lessons 1") and training["revision"]
     assert (tmp_path / "driver.safetensors").stat().st_size < 300_000
     folder = tmp_path / "runs" / "maze3d" / "driver"
     rows = (folder / "metrics.csv").read_text().splitlines()
@@ -134,3 +129,48 @@ def test_a_held_step_is_about_as_many_steps_with_one_action() -> None:
         env.close()
     np.testing.assert_allclose(ends[0][-1], ends[1][-1], atol=1.0)
     np.testing.assert_allclose(ends[0], ends[1], atol=8.0)
+
+
+@pytest.mark.parametrize("hold_frames", [1, 3])
+def test_the_teacher_drives_far_at_any_rate_of_decisions(hold_frames: int) -> None:
+    task = DrivingTask(world_named("maze3d"), PolicyConfig(hold_frames=hold_frames), (5,), frames=450, mazes=2)
+    paid = 0.0
+    for _ in range(2):
+        _, info = task.reset()
+        assert task.maze is not None
+        teacher, over = DistanceDriver(task.maze, np.random.default_rng(0), hold_frames), False
+        while not over:
+            _, reward, _, over, info = task.step(int(teacher.action(info["pose_xyyaw"])))
+            paid += reward
+        assert len(teacher.goals_reached) >= 3
+    task.close()
+    assert paid / REWARD_PER_M > 0.22 * 900, "a planner with random goals comes to 0.24 m a frame"
+
+
+def test_lessons_make_it_drive_as_the_teacher_would(tmp_path: Path) -> None:
+    """A few seconds of them: more often than before it decides as the teacher does."""
+
+    def agreement(lessons: int) -> float:
+        folder = tmp_path / str(lessons)
+        main(arguments(folder, decisions=8, lessons=lessons, lesson_decisions=200, lesson_updates=60, batch_size=64))
+        network, config = load_policy(folder / "driver.safetensors"), PolicyConfig()
+        task = DrivingTask(world_named("maze3d"), config, (9,), frames=300, mazes=1)
+        look, info = task.reset()
+        assert task.maze is not None
+        teacher, agreed = DistanceDriver(task.maze, np.random.default_rng(0), config.hold_frames), []
+        for _ in range(90):
+            said = int(teacher.action(info["pose_xyyaw"]))
+            view = PolicyView(config)
+            view.pictures, view.senses = look["pictures"], look["senses"]
+            agreed.append(int(network.logits(view).argmax()) == said)
+            look, _, _, _, info = task.step(said)
+        task.close()
+        return float(np.mean(agreed))
+
+    assert agreement(lessons=2) > agreement(lessons=0) + 0.1
+
+
+def test_impossible_lessons_are_refused(tmp_path: Path) -> None:
+    for name, value in (("lessons", -1), ("lesson_decisions", 0), ("lesson_updates", 0)):
+        with pytest.raises(ValueError, match=f"{name} is {value}; it must be at least"):
+            arguments(tmp_path, **{name: value})

@@ -1,0 +1,66 @@
+"""The driver that the learned one imitates at first: it knows the maze, and drives for distance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ngo_sim.drivers import PathDriver
+from ngo_sim.mazes import Maze
+
+_TURN_A_FRAME_RAD = math.radians(12.0)  # more than it is: with less it turns to and fro where a decision is held
+_TURN_COAST_FRAMES, _TRAVEL_COAST_FRAMES = 1.8, 4.2
+_STRAIGHT_M_A_FRAME = 0.5
+_FRAMES_A_BEND = 10
+_FRAMES_ABOUT = 21
+_STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))
+
+
+class DistanceDriver(PathDriver):
+    """Drives on as long as a corridor is straight; at its end it takes the way that promises most metres a frame.
+
+    The ways are those to both sides and the one back. What each promises is its straight length over the time that the
+    turn and the length take. It decides in every ``hold_frames`` frames. No more of the maze enters than what a robot
+    sees at a corridor's end and remembers of it.
+    """
+
+    def __init__(self, maze: Maze, rng: np.random.Generator, hold_frames: int) -> None:
+        super().__init__(
+            maze,
+            rng,
+            random_action_probability=0.0,
+            turn_per_action_rad=hold_frames * _TURN_A_FRAME_RAD,
+            turn_coast_steps=_TURN_COAST_FRAMES / hold_frames,
+            travel_coast_steps=_TRAVEL_COAST_FRAMES / hold_frames,
+        )
+        self._free = {(int(row), int(col)) for row, col in maze.free_blocks()}
+
+    def _follow(self, block: tuple[int, int]) -> None:
+        """Choose the next straight way where this one ends, or where block is not on it."""
+        if self.goal is not None and block != self.goal and block in self._path_index:
+            return
+        if self.goal is not None and block == self.goal:
+            self.goals_reached.append(self.goal)
+        assert self._last_pose is not None
+        yaw = self._last_pose[2]
+        best, best_rate = [block], -1.0
+        for step in _STEPS:
+            way = self._straight(block, step)
+            if len(way) == 1:
+                continue
+            turn_rad = abs(math.remainder(math.atan2(step[0], step[1]) - yaw, math.tau))
+            # One that is to be taken about, or nearly, turns about; a bend is half of it.
+            frames = 0 if turn_rad < math.pi / 4 else _FRAMES_A_BEND if turn_rad < 0.75 * math.pi else _FRAMES_ABOUT
+            length_m = (len(way) - 1) * self.maze.block_m
+            rate = length_m / (length_m / _STRAIGHT_M_A_FRAME + frames)
+            if rate > best_rate:
+                best, best_rate = way, rate
+        self._path, self.goal = best, best[-1]
+        self._path_index = {on_path: index for index, on_path in enumerate(best)}
+
+    def _straight(self, block: tuple[int, int], step: tuple[int, int]) -> list[tuple[int, int]]:
+        way = [block]
+        while (ahead := (way[-1][0] + step[0], way[-1][1] + step[1])) in self._free:
+            way.append(ahead)
+        return way
