@@ -3,13 +3,15 @@
     python -m training.compare_drivers --world maze3d --trajectories 20
 
 Way is the length of the true path. Ground is what was covered of the maze, however often: the different squares of 1 m
-that the robot's middle was in, and the different blocks of corridor. The last line is the table as JSON.
+that the robot's middle was in, and the different blocks of corridor. The last line is the table as JSON, which goes to
+training/results/ as well.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -17,6 +19,8 @@ import tyro
 
 from ngo_sim.driver_choice import DRIVER_NAMES
 from ngo_sim.episodes import Episode, record_episode
+from training import runs
+from training.curves import write_at_once
 from training.statistics import compare, mean_interval
 from training.worlds import VALIDATION_SEEDS, world_named
 
@@ -36,6 +40,8 @@ class Arguments:
     """Length of a trajectory."""
     drivers: tuple[str, ...] = ("random_goals", "corners", "learned", "explorer")
     """Drivers beside the random one."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets WORLD_drivers.json."""
 
     def __post_init__(self) -> None:
         if not 2 <= self.trajectories <= len(VALIDATION_SEEDS):
@@ -56,7 +62,7 @@ def measure(episode: Episode) -> tuple[float, int, int]:
 
 
 def main(arguments: Arguments) -> dict[str, dict[str, dict[str, object]]]:
-    """Drive, print the table and return it: of each driver and measure the mean, and how many times the baseline's."""
+    """Drive, print the table, write and return it: of each driver and measure the mean and how often the baseline's."""
     env = world_named(arguments.world).make()
     drivers = tuple(dict.fromkeys((*arguments.drivers, BASELINE)))
     seeds = list(VALIDATION_SEEDS[: arguments.trajectories])
@@ -81,7 +87,9 @@ def main(arguments: Arguments) -> dict[str, dict[str, dict[str, object]]]:
             cells.append(f"{mean.mean:10.1f} ({mean.low:.1f}, {mean.high:.1f})".rjust(24))
             cells.append(f"{times[0]:.2f} ({times[1]:.2f}, {times[2]:.2f})".rjust(22))
         print(f"{driver:14}" + "".join(cells))
-    print(json.dumps({"world": arguments.world, "frames": arguments.frames, "drivers": table}))
+    result = {**json.loads(json.dumps(runs.record("compare_drivers", arguments))), "drivers": table}
+    write_at_once(arguments.out / f"{arguments.world}_drivers.json", json.dumps(result, indent=2) + "\n")
+    print(json.dumps(result))
     return table
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import shlex
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -125,10 +125,10 @@ class Run:
     Begun again with the same arguments, it goes on after its last whole epoch and ends as if it had not been stopped.
     Several processes hold the same run; only the one that ``is_first`` writes. With ``best``, the name of something
     that is logged, the weights of the epoch in which that was lowest are kept, not the last ones. ``data`` identifies
-    recordings, which count as arguments.
+    recordings, which count as arguments, and ``settings`` are those of the world that the training depends on.
 
     Raises:
-        ValueError: the folder holds a run that was begun with other arguments.
+        ValueError: the folder holds a run that was begun with other arguments or settings.
     """
 
     def __init__(
@@ -141,11 +141,14 @@ class Run:
         datapoints: Callable[[Batch], int] = rows,
         best: str | None = None,
         data: str | None = None,
+        settings: Mapping[str, Any] | None = None,
     ) -> None:
         self.folder = folder
         self.record = record(script, arguments)
         if data is not None:
             self.record["arguments"]["data_sha256"] = data
+        if settings is not None:
+            self.record["settings"] = dict(settings)
         self._description = {**self.record, "started": _now(), "resumed": [], "state": "running"}
         self._check_arguments()
         self.curves = Curves(folder / "metrics.csv", datapoints)
@@ -167,8 +170,9 @@ class Run:
         if not path.exists() or resume_from(self.folder) is None:
             return
         begun = json.loads(path.read_text())
-        now = json.loads(json.dumps(self.record["arguments"]))
-        then = begun["arguments"]
+        now, then = (
+            {**of["arguments"], **of.get("settings", {})} for of in (json.loads(json.dumps(self.record)), begun)
+        )
         differing = sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name))
         if differing:
             given = ", ".join(f"{name} {now.get(name)}" for name in differing)

@@ -288,6 +288,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
+        settings=domain.frame_settings,
     )
     network, begun = initial_network(arguments, domain, steps)
     training = LocalTraining(arguments, network)

@@ -273,6 +273,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "corrected_m",
         data=None if recorded is None else recorded.sha256,
+        settings={"single_share": domain.single_share, "loss_scale": domain.loss_scale},
     )
     if optimizer is None:
         optimizer = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train)))

@@ -97,6 +97,11 @@ class World(Domain):
         check_looks(self.name, self.looks)
 
     @property
+    def frame_settings(self) -> dict[str, Any]:
+        """As in any domain, and who drove."""
+        return {**super().frame_settings, "training_drivers": list(self.training_drivers or (self.driver,))}
+
+    @property
     def unseen_tables(self) -> tuple[str, ...]:
         """The tables with the world's driver in mazes that nothing was trained in: designs are chosen on these."""
         return tuple(name for name, table in self.tables.items() if not table.seen and table.driver is None)
@@ -145,9 +150,10 @@ class World(Domain):
             return dataclasses.replace(
                 self, image=larger, simulator={**self.simulator, "width": width, "height": height}
             )
-        if height < 1 or own.height % height:
+        if height < 1 or own.height % height or own.width % (own.height // height):
             raise ValueError(
-                f"height of pictures is {height}; expected a whole part of {own.height}, or more than that"
+                f"height of pictures is {height}; expected a whole part of {own.height} that leaves one of the width of"
+                f" {own.width}, or more than that"
             )
         factor = own.height // height
         smaller = ImageFormat(height, own.width // factor, own.channels, own.dtype, reduction=factor)

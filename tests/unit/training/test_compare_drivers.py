@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,13 +19,14 @@ def test_way_and_ground_of_a_known_path() -> None:
     assert measure(episode) == (6.0, 4, 2)
 
 
-def test_the_table_has_every_driver_beside_the_random_one(capsys: pytest.CaptureFixture[str]) -> None:
-    table = main(Arguments(world="maze2d", trajectories=2, frames=150, drivers=("corners",)))
+def test_the_table_has_every_driver_beside_the_random_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = main(Arguments(world="maze2d", trajectories=2, frames=150, drivers=("corners",), out=tmp_path))
     assert list(table) == ["corners", "random"]
     assert table["random"]["way_m"]["times_random"] == 1.0
     assert table["corners"]["way_m"]["times_random"] > 1.5
     last = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert last["drivers"] == table
+    assert json.loads((tmp_path / "maze2d_drivers.json").read_text()) == last
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -39,6 +39,8 @@ def test_larger_pictures_are_simulated() -> None:
         WORLD.with_pictures(90).make()
     with pytest.raises(ValueError, match="height of pictures is 45; expected a whole part of 60"):
         WORLD.with_pictures(45)
+    with pytest.raises(ValueError, match="expected a whole part of 60 that leaves one of the width of 80"):
+        WORLD.with_pictures(20)
     with pytest.raises(ValueError, match="asked of maze2d"):
         world_named("maze2d").with_pictures(30)
 
