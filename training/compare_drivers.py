@@ -38,7 +38,7 @@ class Arguments:
     """Mazes, each driven through once by each driver."""
     frames: int = 1000
     """Length of a trajectory."""
-    drivers: tuple[str, ...] = ("random_goals", "corners", "learned", "explorer")
+    drivers: tuple[str, ...] = ("random_goals", "corners", "distance", "learned", "explorer")
     """Drivers beside the random one."""
     out: Path = runs.ROOT / "training" / "results"
     """Folder that gets WORLD_drivers.json."""

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy, mse_loss
 
+from ngo_sim.distance_driver import DistanceDriver
 from training.driving_task import REWARD_PER_M, DrivingTask, Look
-from training.driving_teacher import DistanceDriver
 
 _LONGEST_TAUGHT = 4
 """Rounds in which the teacher drives a part of the way: all of it in the first, half as much in each one after."""
@@ -76,7 +76,7 @@ class Lesson:
     def _begun(self, task: DrivingTask) -> tuple[Look, np.ndarray, DistanceDriver]:
         look, info = task.reset()
         assert task.maze is not None
-        return look, info["pose_xyyaw"], DistanceDriver(task.maze, self.rng, task.config.hold_frames)
+        return look, info["pose_xyyaw"], DistanceDriver(task.maze, self.rng, task.config.hold_frames, 0.0)
 
     def drive(
         self, decide: Callable[[Look], np.ndarray], teachers_share: float, decisions: int, memory: Memory

@@ -271,9 +271,15 @@ def declare(*arguments: str) -> SimulatorConfig:
         ("rows:=many", "rows is 'many'; allowed: a whole number"),
         ("rows:=3.0", "rows is 3.0; allowed: a whole number"),
         ("rate:=-1.0", "rate is -1.0; allowed: a number from 0 to 10000"),
-        ("driver:=fast", "driver is 'fast'; allowed: one of auto, corners, random_goals, learned, explorer, random, "),
+        (
+            "driver:=fast",
+            "driver is 'fast'; allowed: one of auto, corners, random_goals, distance, learned, explorer, ",
+        ),
         ("policy:=5", "policy is 5; allowed: a string"),
-        ("policy:=fast", "driver is 'fast'; allowed: one of auto, corners, random_goals, learned, explorer, random, "),
+        (
+            "policy:=fast",
+            "driver is 'fast'; allowed: one of auto, corners, random_goals, distance, learned, explorer, ",
+        ),
         ("driver:=5", "driver is 5; allowed: a string"),
         ("extra_openings:=99", "extra_openings is 99"),
         ("flow_control_topics:=odom", "flow_control_topics is 'odom'; allowed: a list of strings"),

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from ngo_sim.distance_driver import DistanceDriver
 from ngo_sim.learned_driver import LearnedDriver
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.policy_network import PolicyConfig, PolicyView, load_policy
 from training.driver_network import Features
 from training.driving_task import REWARD_PER_M, DrivingTask, held
-from training.driving_teacher import DistanceDriver
 from training.runs import RunError
 from training.train_driver import Arguments, main
 from training.worlds import TRAIN_SEEDS, world_named
@@ -138,7 +138,7 @@ def test_the_teacher_drives_far_at_any_rate_of_decisions(hold_frames: int) -> No
     for _ in range(2):
         _, info = task.reset()
         assert task.maze is not None
-        teacher, over = DistanceDriver(task.maze, np.random.default_rng(0), hold_frames), False
+        teacher, over = DistanceDriver(task.maze, np.random.default_rng(0), hold_frames, 0.0), False
         while not over:
             _, reward, _, over, info = task.step(int(teacher.action(info["pose_xyyaw"])))
             paid += reward
@@ -157,7 +157,7 @@ def test_lessons_make_it_drive_as_the_teacher_would(tmp_path: Path) -> None:
         task = DrivingTask(world_named("maze3d"), config, (9,), frames=300, mazes=1)
         look, info = task.reset()
         assert task.maze is not None
-        teacher, agreed = DistanceDriver(task.maze, np.random.default_rng(0), config.hold_frames), []
+        teacher, agreed = DistanceDriver(task.maze, np.random.default_rng(0), config.hold_frames, 0.0), []
         for _ in range(90):
             said = int(teacher.action(info["pose_xyyaw"]))
             view = PolicyView(config)

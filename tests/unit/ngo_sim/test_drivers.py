@@ -177,7 +177,7 @@ def test_a_driver_is_a_function_of_its_generator_and_the_poses(name: str) -> Non
 
 def test_unknown_names_and_values_are_refused() -> None:
     rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match="driver is 'walls'; it must be one of corners, random_goals, lea"):
+    with pytest.raises(ValueError, match="driver is 'walls'; it must be one of corners, random_goals, dis"):
         make_driver("walls", HOOK, rng)
     with pytest.raises(ValueError, match="goals is 'walls'; it must be 'corners' or 'random'"):
         PathDriver(HOOK, rng, "walls")

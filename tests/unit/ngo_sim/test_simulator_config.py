@@ -19,7 +19,7 @@ from ngo_sim.simulator_config import SimulatorConfig, field_descriptions, field_
         ("rate", -0.1, "a number from 0 to 10000"),
         ("rate", math.nan, "a number"),
         ("rate", True, "a number"),
-        ("driver", "fast", "one of auto, corners, random_goals, learned, explorer, random, none"),
+        ("driver", "fast", "one of auto, corners, random_goals, distance, learned, explorer, random, none"),
         ("frames", -1, "a whole number from 0"),
         ("wait_for_flow_control", 1, "true or false"),
         ("flow_control_topics", "odom", "a list of topic names"),

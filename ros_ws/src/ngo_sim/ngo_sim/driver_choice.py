@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ngo_sim.distance_driver import DistanceDriver
 from ngo_sim.drivers import Driver, PathDriver, RandomDriver
 from ngo_sim.explorer import ExploringDriver
 from ngo_sim.learned_driver import LearnedDriver
 from ngo_sim.mazes import Maze
 
-PLANNERS = {"corners": "corners", "random_goals": "random"}
-"""Drivers that need a plan of the maze, and the goals of their paths."""
+_GOALS = {"corners": "corners", "random_goals": "random"}
+PLANNERS = (*_GOALS, "distance")
+"""Drivers that need a plan of the maze."""
 
 DRIVER_NAMES = (*PLANNERS, "learned", "explorer", "random")
 """What make_driver knows."""
@@ -24,14 +26,15 @@ def driver_generator(seed: int) -> np.random.Generator:
 def make_driver(name: str, maze: Maze | None, rng: np.random.Generator) -> Driver:
     """The driver called name; maze is None where there is no plan, as of a Doom map.
 
-    "corners" and "random_goals" follow paths, "learned" looks at the pictures of the 3D world, "explorer" finds its way
-    by bumping, "random" acts at random. Raises ValueError for another name, or where a plan is needed and missing.
+    "corners" and "random_goals" follow paths, "distance" drives for distance, "learned" looks at the pictures of the 3D
+    world, "explorer" finds its way by bumping, "random" acts at random. Raises ValueError for another name, or where a
+    plan is needed and missing.
     """
     if name in PLANNERS:
         if maze is None:
             others = ", ".join(one for one in DRIVER_NAMES if one not in PLANNERS)
             raise ValueError(f"driver is {name!r}, which needs a maze's plan; on a Doom map it must be one of {others}")
-        return PathDriver(maze, rng, goals=PLANNERS[name])
+        return DistanceDriver(maze, rng) if name == "distance" else PathDriver(maze, rng, goals=_GOALS[name])
     if name == "learned":
         return LearnedDriver(rng)
     if name == "explorer":

@@ -48,9 +48,9 @@ class SimulatorConfig:
     )
     driver: str = _setting(
         "auto",
-        "Who chooses the actions: paths to the corners, paths to random goals, a network trained to travel far, an "
-        "explorer without a plan, chance, or nobody but action_command; auto: corners in 2D, random_goals in 3D, "
-        "explorer on a Doom map. It may also be given as policy.",
+        "Who chooses the actions: paths to the corners, paths to random goals, the straights that promise most "
+        "distance, a network trained to travel far, an explorer without a plan, chance, or nobody but action_command; "
+        "auto: corners in 2D, random_goals in 3D, explorer on a Doom map. It may also be given as policy.",
         choices=("auto", *DRIVER_NAMES, "none"),
         alias="policy",
     )

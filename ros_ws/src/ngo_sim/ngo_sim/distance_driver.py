@@ -1,4 +1,4 @@
-"""The driver that the learned one imitates at first: it knows the maze, and drives for distance."""
+"""A driver with a plan of the maze that drives for distance; the learned driver has its first lessons from it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from ngo_sim.drivers import PathDriver
 from ngo_sim.mazes import Maze
 
-_TURN_A_FRAME_RAD = math.radians(12.0)  # more than it is: with less it turns to and fro where a decision is held
+# Of the 3D world; a turn counts for more than the 9 degrees that it is: with these, a driver that holds its actions
+# turns to and fro.
+_TURN_A_FRAME_RAD = math.radians(12.0)
 _TURN_COAST_FRAMES, _TRAVEL_COAST_FRAMES = 1.8, 4.2
 _STRAIGHT_M_A_FRAME = 0.5
-_FRAMES_A_BEND = 10
-_FRAMES_ABOUT = 21
+_TURNING_FRAMES = (0, 10, 21)  # straight on, through a bend, about
 _STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
 
@@ -21,15 +22,20 @@ class DistanceDriver(PathDriver):
     """Drives on as long as a corridor is straight; at its end it takes the way that promises most metres a frame.
 
     The ways are those to both sides and the one back. What each promises is its straight length over the time that the
-    turn and the length take. It decides in every ``hold_frames`` frames. No more of the maze enters than what a robot
-    sees at a corridor's end and remembers of it.
+    turn and the length take, in the 3D world. No more of the maze enters than what a robot sees at a corridor's end and
+    remembers of it.
+
+    hold_frames: in how many frames it is asked once, and its action held meanwhile.
+    random_action_probability: as of any PathDriver.
     """
 
-    def __init__(self, maze: Maze, rng: np.random.Generator, hold_frames: int) -> None:
+    def __init__(
+        self, maze: Maze, rng: np.random.Generator, hold_frames: int = 1, random_action_probability: float = 0.05
+    ) -> None:
         super().__init__(
             maze,
             rng,
-            random_action_probability=0.0,
+            random_action_probability=random_action_probability,
             turn_per_action_rad=hold_frames * _TURN_A_FRAME_RAD,
             turn_coast_steps=_TURN_COAST_FRAMES / hold_frames,
             travel_coast_steps=_TRAVEL_COAST_FRAMES / hold_frames,
@@ -50,10 +56,9 @@ class DistanceDriver(PathDriver):
             if len(way) == 1:
                 continue
             turn_rad = abs(math.remainder(math.atan2(step[0], step[1]) - yaw, math.tau))
-            # One that is to be taken about, or nearly, turns about; a bend is half of it.
-            frames = 0 if turn_rad < math.pi / 4 else _FRAMES_A_BEND if turn_rad < 0.75 * math.pi else _FRAMES_ABOUT
+            turning = _TURNING_FRAMES[round(turn_rad / (math.pi / 2))]
             length_m = (len(way) - 1) * self.maze.block_m
-            rate = length_m / (length_m / _STRAIGHT_M_A_FRAME + frames)
+            rate = length_m / (length_m / _STRAIGHT_M_A_FRAME + turning)
             if rate > best_rate:
                 best, best_rate = way, rate
         self._path, self.goal = best, best[-1]
