@@ -16,14 +16,14 @@ import numpy as np
 import torch
 import tyro
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from ngo_estimator.checkpoint import save_checkpoint
 from ngo_estimator.compass import COMPASS, Compass, CompassConfig
 from ngo_estimator.lattice import snapped
 from ngo_sim.episodes import Episode
 from training import runs, streams
-from training.streams import ALL, Batch, Share, images_of, loader, mirrored, simulate
+from training.data_module import StreamedData
+from training.streams import ALL, Batch, Share, images_of, mirrored, simulate
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 
 
@@ -152,32 +152,14 @@ def reading_metrics(errors: Tensor, log_scale: Tensor) -> dict[str, float]:
     return result
 
 
-class _Data(lightning.LightningDataModule):
-    def __init__(self, arguments: Arguments, world: World) -> None:
-        super().__init__()
-        self.arguments, self.world = arguments, world
-        self.fixed: list[Batch] = []
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        a = self.arguments
-        # A stream of its own: those of the local network and the place encoder start elsewhere in the range.
-        seeds = TRAIN_SEEDS[len(TRAIN_SEEDS) // 4 :]
-        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
-        return loader(CompassStream(self.world, seeds, epoch, a.datapoints, a.batch_size, share), a.workers)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
-
-    def validation(self) -> list[Batch]:
-        """Every fifth frame of an episode in each maze of the validation split, made when they are first needed."""
-        if not self.fixed:
-            seeds = list(VALIDATION_SEEDS[: self.arguments.validation_mazes])
-            for first in range(0, len(seeds), 4):  # four mazes of one size
-                for episode in simulate(self.world, seeds[first : first + 4], 1000):
-                    poses = torch.from_numpy(episode.poses_xyyaw[::5]).float()
-                    self.fixed.append({"images": images_of(self.world, episode)[::5], "poses": poses})
-        return self.fixed
+def validation_frames(world: World, mazes: int) -> list[Batch]:
+    """Every fifth frame of an episode in each of so many mazes of the validation split."""
+    frames = []
+    for first in range(0, mazes, 4):  # four mazes of one size
+        for episode in simulate(world, list(VALIDATION_SEEDS[first : min(first + 4, mazes)]), 1000):
+            poses = torch.from_numpy(episode.poses_xyyaw[::5]).float()
+            frames.append({"images": images_of(world, episode)[::5], "poses": poses})
+    return frames
 
 
 def main(arguments: Arguments) -> dict[str, float]:
@@ -187,13 +169,19 @@ def main(arguments: Arguments) -> dict[str, float]:
     run = runs.Run(folder, "train_compass", arguments, arguments.epochs, arguments.seed)
     config = CompassConfig(image=world.image, block_m=world.block_m, width=arguments.width)
     training = CompassTraining(arguments, Compass(config))
-    data = _Data(arguments, world)
+    # A stream of its own: those of the local network and the place encoder start elsewhere in the range.
+    seeds = TRAIN_SEEDS[len(TRAIN_SEEDS) // 4 :]
+
+    def stream(epoch: int, share: Share) -> CompassStream:
+        return CompassStream(world, seeds, epoch, arguments.datapoints, arguments.batch_size, share)
+
+    data = StreamedData(stream, lambda: validation_frames(world, arguments.validation_mazes), arguments.workers)
     run.fit(training, data)
     if not run.is_first:
         return {}
     network = training.cpu().network.eval()
     with torch.no_grad():
-        parts = [(network(batch["images"]), batch["poses"]) for batch in data.validation()]
+        parts = [(network(batch["images"]), batch["poses"]) for batch in data.validation]
     errors = torch.cat([lattice_errors(reading, poses, world.block_m) for (reading, _), poses in parts])
     metrics = reading_metrics(errors, torch.cat([log_scale for (_, log_scale), _ in parts]))
     details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}

@@ -18,14 +18,14 @@ import numpy as np
 import torch
 import tyro
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import save_checkpoint
 from training import runs, streams
+from training.data_module import StreamedData
 from training.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
 from training.metrics import seen_from_first
-from training.streams import ALL, Batch, PairStream, Share, images_of, loader, mirrored, relative_poses, simulate
+from training.streams import ALL, Batch, PairStream, Share, images_of, mirrored, relative_poses, simulate
 from training.train_local import episode_pairs, step_losses, step_metrics
 from training.tune_pose_graph import fit_calibration
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
@@ -128,29 +128,12 @@ class DeepVOTraining(lightning.LightningModule):
         return runs.one_cycle(optimizer, self.trainer)
 
 
-class _Data(lightning.LightningDataModule):
-    def __init__(self, arguments: Arguments, world: World) -> None:
-        super().__init__()
-        self.arguments, self.world = arguments, world
-        self.fixed: list[Batch] = []
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        a = self.arguments
-        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
-        stream = StretchStream(self.world, TRAIN_SEEDS, epoch, a.datapoints, a.batch_size, a.steps, share)
-        return loader(stream, a.workers)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
-
-    def validation(self) -> list[Batch]:
-        """Whole episodes of the validation split, made when they are first needed."""
-        if not self.fixed:
-            for episode in simulate(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]), 1000):
-                images, relative = images_of(self.world, episode), relative_poses(episode.poses_xyyaw)
-                self.fixed.append({"images": images, "relative": relative})
-        return self.fixed
+def validation_episodes(world: World, mazes: int) -> list[Batch]:
+    """Whole episodes of the validation split."""
+    return [
+        {"images": images_of(world, episode), "relative": relative_poses(episode.poses_xyyaw)}
+        for episode in simulate(world, list(VALIDATION_SEEDS[:mazes]), 1000)
+    ]
 
 
 def _metrics(relative: Tensor, truth: Tensor) -> dict[str, float]:
@@ -196,7 +179,12 @@ def main(arguments: Arguments) -> dict[str, float]:
         symmetric=world.mirrors,
     )
     training = DeepVOTraining(arguments, DeepVO(config))
-    data = _Data(arguments, world)
+
+    def stream(epoch: int, share: Share) -> StretchStream:
+        a = arguments
+        return StretchStream(world, TRAIN_SEEDS, epoch, a.datapoints, a.batch_size, a.steps, share)
+
+    data = StreamedData(stream, lambda: validation_episodes(world, arguments.validation_mazes), arguments.workers)
     run.fit(training, data)
     if not run.is_first:
         return {}
@@ -204,7 +192,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     unseen = list(OPTIMIZER_TRAIN_SEEDS[-arguments.calibration_mazes :])
     final = DeepVO(calibrated(network, world, unseen)).eval()
     final.load_state_dict(network.state_dict())
-    parts = [(trajectory_steps(final, batch["images"]), batch["relative"]) for batch in data.validation()]
+    parts = [(trajectory_steps(final, batch["images"]), batch["relative"]) for batch in data.validation]
     metrics = _metrics(*(torch.cat(column) for column in zip(*parts, strict=True)))
     details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / world.name / f"{DEEPVO}.safetensors", final, DEEPVO, world.name, details)

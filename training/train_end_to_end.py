@@ -15,7 +15,6 @@ import lightning
 import torch
 import tyro
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import (
@@ -33,10 +32,11 @@ from ngo_estimator.checkpoint import (
 from ngo_estimator.local_pose_network import LocalPoseNetwork
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
 from training import runs
-from training.streams import Batch, Share, TrajectoryStream, loader
+from training.data_module import StreamedData
+from training.streams import Batch, Share, TrajectoryStream
 from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics
 from training.train_optimizer import trajectory_loss
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
 
 
 @dataclass(frozen=True)
@@ -152,32 +152,6 @@ class EndToEndTraining(lightning.LightningModule):
         return runs.one_cycle(torch.optim.AdamW(groups, weight_decay=1e-4), self.trainer)
 
 
-class _Data(lightning.LightningDataModule):
-    def __init__(self, arguments: Arguments, world: World) -> None:
-        super().__init__()
-        self.arguments, self.world = arguments, world
-        self.fixed: list[Batch] = []
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        a = self.arguments
-        # Mazes that neither the local network nor the feature store has seen.
-        seeds = OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 2 :]
-        epoch, share = self.trainer.current_epoch, Share(self.trainer.global_rank, self.trainer.world_size)
-        return loader(TrajectoryStream(self.world, seeds, epoch, a.batches, a.batch_size, a.steps, share), a.workers)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
-
-    def validation(self) -> list[Batch]:
-        """The trajectories of the validation split, made when they are first needed."""
-        if not self.fixed:
-            a = self.arguments
-            batches = max(1, a.validation_trajectories // a.batch_size)
-            self.fixed = list(TrajectoryStream(self.world, VALIDATION_SEEDS, 0, batches, a.batch_size, a.steps))
-        return self.fixed
-
-
 @torch.no_grad()
 def measure(training: EndToEndTraining, batches: list[Batch]) -> dict[str, float]:
     """Means of the figures over batches, on the CPU."""
@@ -209,12 +183,22 @@ def main(arguments: Arguments) -> dict[str, float]:
         datapoints=lambda batch: batch["relative"][..., 0].numel(),
     )
     training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad)
-    data = _Data(arguments, world)
-    before = measure(training, data.validation())
+    # Mazes that neither the local network nor the feature store has seen.
+    seeds = OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 2 :]
+
+    def stream(epoch: int, share: Share) -> TrajectoryStream:
+        return TrajectoryStream(world, seeds, epoch, arguments.batches, arguments.batch_size, arguments.steps, share)
+
+    def validation() -> list[Batch]:
+        batches = max(1, arguments.validation_trajectories // arguments.batch_size)
+        return list(TrajectoryStream(world, VALIDATION_SEEDS, 0, batches, arguments.batch_size, arguments.steps))
+
+    data = StreamedData(stream, validation, arguments.workers)
+    before = measure(training, data.validation)
     run.fit(training, data)
     if not run.is_first:
         return {}
-    metrics = measure(training, data.validation())
+    metrics = measure(training, data.validation)
     details = {
         "training": run.finish(metrics),
         "metrics": {"validation": metrics, "validation_of_stages": before},

@@ -21,18 +21,19 @@ import torch
 import tyro
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import IterableDataset
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from training import runs
+from training.data_module import StreamedData
 from training.domains import Domain
 from training.looks import LooksName, check_looks
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedSteps
-from training.streams import Batch, PairStream, Share, action_histories, images_of, loader, relative_poses, simulate
+from training.streams import Batch, PairStream, Share, action_histories, images_of, relative_poses, simulate
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
 HEADING_WEIGHT = 3.0
@@ -159,39 +160,18 @@ class SimulatedSteps:
 
     def __init__(self, arguments: Arguments, world: World) -> None:
         self.arguments, self.world = arguments, world
-        self.fixed: list[Batch] = []
 
     def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
         return PairStream(self.world, TRAIN_SEEDS, epoch, self.arguments.datapoints, self.arguments.batch_size, share)
 
     def validation(self) -> list[Batch]:
-        if not self.fixed:
-            self.fixed = episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
-        return self.fixed
+        return episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
 
     def unseen(self) -> list[Batch]:
         return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-(self.arguments.calibration_mazes or 64) :]))
 
     def typical(self) -> Tensor:
         return torch.cat([p["relative"] for p in episode_pairs(self.world, list(TRAIN_SEEDS[:8]))])
-
-
-class _Data(lightning.LightningDataModule):
-    def __init__(self, arguments: Arguments, steps: Steps) -> None:
-        super().__init__()
-        self.arguments, self.steps = arguments, steps
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        share = Share(self.trainer.global_rank, self.trainer.world_size)
-        return loader(self.steps.pairs(self.trainer.current_epoch, share), self.arguments.workers)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
-
-    def validation(self) -> list[Batch]:
-        """The batches of the validation split, made when they are first needed."""
-        return self.steps.validation()
 
 
 def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
@@ -292,14 +272,14 @@ def main(arguments: Arguments) -> dict[str, float]:
     )
     network, begun = initial_network(arguments, domain, steps)
     training = LocalTraining(arguments, network)
-    data = _Data(arguments, steps)
+    data = StreamedData(steps.pairs, steps.validation, arguments.workers)
     run.fit(training, data)
     if not run.is_first:
         return {}
     training.cpu()
     final = LocalPoseNetwork(calibrated(training.network, steps.unseen())).eval()
     final.load_state_dict(training.network.state_dict())
-    metrics = measure(final, data.validation())
+    metrics = measure(final, data.validation)
     about = {} if recorded is None else {"data": recorded.about}
     details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", final, LOCAL, domain.name, details)

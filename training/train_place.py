@@ -17,17 +17,18 @@ import torch
 import tyro
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import IterableDataset
 
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
 from ngo_estimator.place_encoder import PlaceConfig
 from training import runs
+from training.data_module import StreamedData
 from training.domains import Domain
 from training.looks import LooksName, check_looks
 from training.recorded import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedPlaces
-from training.streams import Batch, PlaceStream, Share, loader
+from training.streams import Batch, PlaceStream, Share
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
 
@@ -164,7 +165,6 @@ class SimulatedPlaces:
 
     def __init__(self, arguments: Arguments, world: World) -> None:
         self.arguments, self.world = arguments, world
-        self.fixed: list[Batch] = []
 
     def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
         # A stream of its own: the local network's mazes come from the front of the range.
@@ -172,28 +172,8 @@ class SimulatedPlaces:
         return PlaceStream(self.world, seeds, epoch, self.arguments.batches, self.arguments.pairs_a_maze, share)
 
     def validation(self) -> list[Batch]:
-        if not self.fixed:
-            a = self.arguments
-            self.fixed = list(PlaceStream(self.world, VALIDATION_SEEDS, 0, a.validation_batches, a.pairs_a_maze))
-        return self.fixed
-
-
-class _Data(lightning.LightningDataModule):
-    def __init__(self, arguments: Arguments, places: Places) -> None:
-        super().__init__()
-        self.arguments, self.places = arguments, places
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        share = Share(self.trainer.global_rank, self.trainer.world_size)
-        return loader(self.places.pairs(self.trainer.current_epoch, share), self.arguments.workers)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation(), batch_size=None)  # type: ignore[arg-type]
-
-    def validation(self) -> list[Batch]:
-        """The batches of the validation split, made when they are first needed."""
-        return self.places.validation()
+        a = self.arguments
+        return list(PlaceStream(self.world, VALIDATION_SEEDS, 0, a.validation_batches, a.pairs_a_maze))
 
 
 def main(arguments: Arguments) -> dict[str, float]:
@@ -226,13 +206,13 @@ def main(arguments: Arguments) -> dict[str, float]:
     )
     networks, begun = initial_networks(arguments, domain)
     training = PlaceTraining(arguments, domain, networks)
-    data = _Data(arguments, places)
+    data = StreamedData(places.pairs, places.validation, arguments.workers)
     run.fit(training, data)
     if not run.is_first:
         return {}
     training.cpu().eval()
     with torch.no_grad():
-        figures = [training(batch, augment=False) for batch in data.validation()]
+        figures = [training(batch, augment=False) for batch in data.validation]
     metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]} if figures else {}
     about = {} if recorded is None else {"data": recorded.about}
     details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}

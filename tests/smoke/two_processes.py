@@ -13,22 +13,21 @@ from typing import Any
 import pytest
 from safetensors.torch import save
 
-from ngo_sim.episodes import Episode
 from tests.smoke import toy
-from training import streams, train_local
-from training.worlds import World
+from training import train_local
+from training.streams import Batch, PairStream
 
 
 def main(folder: Path) -> None:
     patch = pytest.MonkeyPatch()
     toy.shrink(patch, 97, 300)
-    simulate = streams.simulate
+    made = PairStream.__iter__
     mazes: list[int] = []
     at_first: list[str] = []
 
-    def noted(world: World, seeds: list[int], frames: int) -> Iterator[Episode]:
-        mazes.extend(seeds)
-        return simulate(world, seeds, frames)
+    def noted(stream: PairStream) -> Iterator[Batch]:
+        mazes.extend(seed for group in stream.groups for seed in group)
+        yield from made(stream)
 
     def digest(self: Any) -> str:
         return hashlib.sha256(save(self.network.state_dict())).hexdigest()
@@ -42,11 +41,11 @@ def main(folder: Path) -> None:
             "weights": digest(self),
             "weights_at_first": at_first[0],
             "logged_rmse_m": float(self.trainer.callback_metrics["validation_rmse_m"]),
-            "rmse_m": train_local.measure(self.network.eval(), self.trainer.datamodule.validation())["rmse_m"],
+            "rmse_m": train_local.measure(self.network.eval(), self.trainer.datamodule.validation)["rmse_m"],
         }
         (folder / f"rank{self.global_rank}.json").write_text(json.dumps(result))
 
-    patch.setattr(streams, "simulate", noted)
+    patch.setattr(PairStream, "__iter__", noted)
     patch.setattr(train_local.LocalTraining, "on_train_start", note)
     patch.setattr(train_local.LocalTraining, "on_train_end", write)
     train_local.main(toy.local("maze2d", folder, epochs=2, accelerator="cpu", devices="2", strategy="ddp"))
