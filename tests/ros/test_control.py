@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from evo.tools import file_interface
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
@@ -26,17 +25,9 @@ from ngo_estimator.nodes.messages import planar_estimate, pose_message, relative
 from ngo_estimator.tf_smoothing import SmoothedCorrection
 
 from .processes import NodeProcess, Probe
-from .relative_poses import Optimizer, assert_pose_is, write_weights
+from .relative_poses import Optimizer, assert_pose_is
 
 pytestmark = pytest.mark.processes
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("weights")
-    write_weights(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path as PathMessage
 from ngo_msgs.msg import RelativePose
@@ -24,19 +23,11 @@ from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe, wait_until
-from .relative_poses import Optimizer, assert_pose_is, write_weights
+from .relative_poses import Optimizer, assert_pose_is
 
 pytestmark = pytest.mark.processes
 
 SOURCE_TIMEOUT_S = 0.3
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("weights")
-    write_weights(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -16,24 +16,7 @@ from training.featurise import check_networks, features_of, open_store
 from training.streams import simulate
 from training.worlds import WORLDS
 
-SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "origin_code": 12, "truth": 3}
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
-    """Ten trajectories of 40 steps, of a robot that turns round and round, and an odometry that turns too little."""
-    rng = np.random.default_rng(0)
-    truth_steps = torch.tensor([0.1, 0.0, 0.3], dtype=torch.float64).expand(10, 40, 3)
-    truth = se2.r2g(truth_steps)
-    truth[..., 2] = se2.wrap(truth[..., 2])
-    arrays = {name: rng.random((10, 40, size)).astype(np.float16) for name, size in SHAPES.items()}
-    arrays["relative"] = (truth_steps - torch.tensor([0.0, 0.0, 0.01])).numpy().astype(np.float32)
-    arrays["truth"] = truth.numpy()
-    for name, array in arrays.items():
-        np.save(tmp_path / f"{name}.npy", array)
-    (tmp_path / "done.0of2.json").write_text("[0]")
-    (tmp_path / "done.1of2.json").write_text("[8]")
-    return tmp_path
+from .stores import SHAPES
 
 
 def test_a_store_that_lacks_an_array_or_a_trajectory_is_refused(store: Path) -> None:
