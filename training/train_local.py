@@ -33,7 +33,16 @@ from training.domains import Domain
 from training.looks import LooksName, check_looks
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.recorded_streams import RecordedSteps
-from training.streams import Batch, PairStream, Share, action_histories, images_of, relative_poses, simulate
+from training.streams import (
+    ACTION_HISTORY,
+    Batch,
+    PairStream,
+    Share,
+    action_histories,
+    images_of,
+    relative_poses,
+    simulate,
+)
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
 HEADING_WEIGHT = 3.0
@@ -52,6 +61,8 @@ class Arguments(runs.TrainerArguments):
     """Recordings to train on instead."""
     without_action: bool = False
     """Whether the network of a world is to do without the actions, from the images alone."""
+    action_history: int | None = None
+    """How many of the latest actions a network is told, if any; none: the number of the world, one of recordings."""
     looks: LooksName | None = None
     """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.25
@@ -89,6 +100,8 @@ class Arguments(runs.TrainerArguments):
             raise ValueError(
                 "picture_height is given with recordings; expected --reduction, which makes theirs smaller"
             )
+        if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
+            raise ValueError(f"action_history is {self.action_history}; expected 1 to {ACTION_HISTORY}")
         if self.calibration_mazes is not None and self.calibration_mazes < 1:
             raise ValueError(f"calibration_mazes is {self.calibration_mazes}; expected at least 1")
 
@@ -259,6 +272,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     else:
         domain = recorded.domain
         steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
+    if arguments.action_history is not None:
+        domain = dataclasses.replace(domain, action_history=arguments.action_history)
     kind = "local-no_action" if arguments.without_action else "local"
     run = runs.Run(
         arguments.runs / domain.name / (kind if arguments.looks is None else f"{kind}-{arguments.looks}"),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from training.streams import Batch
-from training.train_local import calibrated, measure, step_metrics
+from training.train_local import Arguments, calibrated, measure, step_metrics
 from training.worlds import WORLDS
 
 
@@ -76,3 +76,9 @@ def test_a_component_that_was_not_learned_keeps_a_positive_deviation(network: Lo
     better = LocalPoseNetwork(config).eval()
     better.load_state_dict(network.state_dict())
     assert abs(measure(better, pairs)["bias_forward_m"]) < 1e-4
+
+
+@pytest.mark.parametrize("count", [0, 13])
+def test_a_history_that_no_batch_tells_is_refused(count: int) -> None:
+    with pytest.raises(ValueError, match=f"action_history is {count}; expected 1 to 12"):
+        Arguments(world="maze3d", action_history=count)
