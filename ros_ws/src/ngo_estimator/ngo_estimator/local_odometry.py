@@ -156,6 +156,7 @@ class LocalOdometry:
         # missing frame is added to it.
         variance = variance + (missed * self._network.relative_std.double()) ** 2
         self._odom = se2.compose(self._odom, relative[0].double())
+        # The action of a frame that was missed is not known, and is not among them.
         self._actions = [] if actions is None else actions[0].tolist()
         self._last_stamp_ns, self._last_image = stamp_ns, frame
         origin_code, self._origin_code = self._origin_code, None
