@@ -23,7 +23,7 @@ from training.domains import MIRRORED_ACTIONS, Domain
 from training.recorded_store import StoredRecording, make_store
 from training.recorded_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
 from training.runs import RunError
-from training.streams import relative_poses
+from training.streams import ACTION_HISTORY, relative_poses
 
 NO_LOOPS = "no_loops"
 """Key in the JSON beside a place encoder or an optimizer with which no loops are closed; its value says why."""
@@ -217,6 +217,8 @@ def domain_of(
         reverses=not with_actions and float((steps[:, 0] < -0.1 * fast).mean()) > 0.01,
         actions=3 if with_actions else 0,
         mirrored_actions=MIRRORED_ACTIONS if with_actions else (),
+        # Where a robot has no momentum, the earlier ones are soon found to say nothing.
+        action_history=ACTION_HISTORY if with_actions else 1,
         twist=with_twist,
         twist_scale=twist_scale,
         mirrors=arguments.mirror,

@@ -62,7 +62,7 @@ class Arguments(runs.TrainerArguments):
     without_action: bool = False
     """Whether the network of a world is to do without the actions, from the images alone."""
     action_history: int | None = None
-    """How many of the latest actions a network is told, if any; none: the number of the world, one of recordings."""
+    """How many of the latest actions a network is told, if any; none: the world's number, twelve of recordings."""
     looks: LooksName | None = None
     """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.25
@@ -283,7 +283,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
-        settings=domain.frame_settings,
+        settings=domain.frame_settings if recorded is None else None,
     )
     network, begun = initial_network(arguments, domain, steps)
     training = LocalTraining(arguments, network)
