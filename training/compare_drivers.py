@@ -1,6 +1,6 @@
 """How far each driver gets in mazes of the validation split: way, ground covered, and both beside the random driver's.
 
-    python -m training.compare_drivers --world maze3d --trajectories 20
+    python -m training.compare_drivers --world maze3d --trajectories 64
 
 Way is the length of the true path. Ground is what was covered of the maze, however often: the different squares of 1 m
 that the robot's middle was in, and the different blocks of corridor. The last line is the table as JSON, which goes to
@@ -87,7 +87,7 @@ def main(arguments: Arguments) -> dict[str, dict[str, dict[str, object]]]:
             cells.append(f"{mean.mean:10.1f} ({mean.low:.1f}, {mean.high:.1f})".rjust(24))
             cells.append(f"{times[0]:.2f} ({times[1]:.2f}, {times[2]:.2f})".rjust(22))
         print(f"{driver:14}" + "".join(cells))
-    result = {**json.loads(json.dumps(runs.record("compare_drivers", arguments))), "drivers": table}
+    result = {**runs.record("compare_drivers", arguments), "drivers": table}
     write_at_once(arguments.out / f"{arguments.world}_drivers.json", json.dumps(result, indent=2) + "\n")
     print(json.dumps(result))
     return table

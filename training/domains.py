@@ -1,7 +1,6 @@
 """What a training must know of where its data come from, a simulated world or a robot's recordings."""
 
 from dataclasses import dataclass
-from typing import Any
 
 from ngo_estimator.images import ImageFormat
 from ngo_estimator.loop_closure import LoopSearch
@@ -53,11 +52,6 @@ class Domain:
     optimizer_epochs: int = 6
     single_share: float = 0.0
     loss_scale: float = 0.1
-
-    @property
-    def frame_settings(self) -> dict[str, Any]:
-        """What the networks that see frames depend on, beside the arguments of their training: part of its record."""
-        return {"action_history": self.action_history}
 
     @property
     def loss_scale_m(self) -> float:

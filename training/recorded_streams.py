@@ -16,7 +16,7 @@ from ngo_recordings.errors import RecordingError
 from training.domains import Domain
 from training.recorded import RecordedData
 from training.recorded_tracks import Track
-from training.streams import ALL, Batch, Share, action_histories, mirrored, relative_poses, reversed_in_time
+from training.streams import ALL, Batch, Share, mirrored, relative_poses, reversed_in_time
 
 REPEATS = 2
 """How often an epoch shows each pair of frames, at most."""
@@ -33,8 +33,8 @@ _EACH_RAD = math.radians(5.0)
 def told(track: Track, index: np.ndarray | slice) -> Batch:
     """Actions, with those before them, or velocities of some steps."""
     result = {}
-    if track.actions is not None:
-        result["action"] = action_histories(np.array(track.actions))[index]
+    if track.histories is not None:
+        result["action"] = track.histories[index]
     if track.twists is not None:
         result["twist"] = torch.from_numpy(np.array(track.twists[index]))
     return result

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from training.recorded_store import StoredRecording
+from training.streams import action_histories
 
 Part = Literal["train", "optimizer", "validation", "test"]
 PARTS: tuple[Part, ...] = ("train", "optimizer", "validation", "test")
@@ -46,6 +48,11 @@ class Track:
     def frames(self, index: np.ndarray | slice) -> Tensor:
         """Images of some frames."""
         return torch.from_numpy(np.array(self.images[index]))
+
+    @cached_property
+    def histories(self) -> Tensor | None:
+        """The latest actions of each step, as ``streams.action_histories`` gives them: every batch asks for them."""
+        return None if self.actions is None else action_histories(np.array(self.actions))
 
     def cut(self, start: int, stop: int) -> Track:
         """The frames from ``start`` to before ``stop``."""

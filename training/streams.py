@@ -135,7 +135,7 @@ class _Stream(IterableDataset[Batch]):
         mine = self.groups if worker is None else self.groups[worker.id :: worker.num_workers]
         for seeds in mine:
             rng = np.random.default_rng([seeds[0], 1])
-            drivers = self.world.training_drivers or (self.world.driver,)
+            drivers = self.world.stream_drivers
             driver = drivers[(seeds[0] - self.first_seed) // _GROUP % len(drivers)]
             episodes = episodes_in(self.world, seeds, seeds, self.frames, DRAWN, driver)
             yield from self.batches(list(episodes), rng)

@@ -166,7 +166,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
     world = world_named(arguments.world)
     folder = arguments.runs / world.name / "compass"
-    run = runs.Run(folder, "train_compass", arguments, arguments.epochs, arguments.seed)
+    run = runs.Run(folder, "train_compass", arguments, arguments.epochs, arguments.seed, settings=world.stream_settings)
     config = CompassConfig(image=world.image, block_m=world.block_m, width=arguments.width)
     training = CompassTraining(arguments, Compass(config))
     # A stream of its own: those of the local network and the place encoder start elsewhere in the range.

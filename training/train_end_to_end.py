@@ -180,7 +180,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments,
         arguments.epochs,
         arguments.seed,
-        datapoints=lambda batch: batch["relative"][..., 0].numel(),
+        datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
+        settings=world.stream_settings,
     )
     training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad)
     # Mazes that neither the local network nor the feature store has seen.

@@ -149,6 +149,8 @@ def simulated_world(arguments: Arguments) -> World:
     world = world_looking(str(arguments.world), arguments.looks)
     if arguments.picture_height is not None:
         world = world.with_pictures(arguments.picture_height)
+    if arguments.action_history is not None:
+        world = dataclasses.replace(world, action_history=arguments.action_history)
     return dataclasses.replace(world, actions=0, mirrored_actions=()) if arguments.without_action else world
 
 
@@ -271,9 +273,9 @@ def main(arguments: Arguments) -> dict[str, float]:
         steps = SimulatedSteps(arguments, world)
     else:
         domain = recorded.domain
+        if arguments.action_history is not None:
+            domain = dataclasses.replace(domain, action_history=arguments.action_history)
         steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
-    if arguments.action_history is not None:
-        domain = dataclasses.replace(domain, action_history=arguments.action_history)
     kind = "local-no_action" if arguments.without_action else "local"
     run = runs.Run(
         arguments.runs / domain.name / (kind if arguments.looks is None else f"{kind}-{arguments.looks}"),
@@ -283,7 +285,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
-        settings=domain.frame_settings if recorded is None else None,
+        settings={"action_history": world.action_history, **world.stream_settings} if recorded is None else None,
     )
     network, begun = initial_network(arguments, domain, steps)
     training = LocalTraining(arguments, network)

@@ -202,7 +202,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
-        settings=domain.frame_settings if recorded is None else None,
+        settings=world.stream_settings if recorded is None else None,
     )
     networks, begun = initial_networks(arguments, domain)
     training = PlaceTraining(arguments, domain, networks)

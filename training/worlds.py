@@ -72,13 +72,13 @@ class Table:
 class World(Domain):
     """A simulated world.
 
-    ``driver`` drives wherever no other is named, ``training_drivers`` take turns in what the local and the place
-    network learn from (none: ``driver``). ``block_m`` is the corridor width, ``episode_frames`` the length of the
-    paper's trajectories, ``rows`` and ``extra_openings`` the ranges (both ends included) that training mazes are drawn
-    from. ``tables`` names the kinds of trajectories that results are given for, ``table_trajectories`` says how many a
-    table has and ``prefixes`` after how many steps their errors are given. ``simulator`` holds its settings that are
-    not its own defaults. ``looks`` is what ``make_random`` draws beside a size, None: nothing, the simulator's own
-    looks. No driver here drives backwards,
+    ``driver`` drives wherever no other is named, ``training_drivers`` take turns in the streams of training data, from
+    which all but the optimizer learn (none: ``driver``). ``block_m`` is the corridor width, ``episode_frames`` the
+    length of the paper's trajectories, ``rows`` and ``extra_openings`` the ranges (both ends included) that training
+    mazes are drawn from. ``tables`` names the kinds of trajectories that results are given for, ``table_trajectories``
+    says how many a table has and ``prefixes`` after how many steps their errors are given. ``simulator`` holds its
+    settings that are not its own defaults. ``looks`` is what ``make_random`` draws beside a size, None: nothing, the
+    simulator's own looks. No driver here drives backwards,
     whether the world ``reverses`` or not.
     """
 
@@ -97,9 +97,14 @@ class World(Domain):
         check_looks(self.name, self.looks)
 
     @property
-    def frame_settings(self) -> dict[str, Any]:
-        """As in any domain, and who drove."""
-        return {**super().frame_settings, "training_drivers": list(self.training_drivers or (self.driver,))}
+    def stream_drivers(self) -> tuple[str, ...]:
+        """The names of the drivers that take turns in streams of training data."""
+        return self.training_drivers or (self.driver,)
+
+    @property
+    def stream_settings(self) -> dict[str, Any]:
+        """What a training on a stream depends on beside its arguments, for its record."""
+        return {"training_drivers": list(self.stream_drivers)}
 
     @property
     def unseen_tables(self) -> tuple[str, ...]:

@@ -40,7 +40,6 @@ class DistanceDriver(PathDriver):
             turn_coast_steps=_TURN_COAST_FRAMES / hold_frames,
             travel_coast_steps=_TRAVEL_COAST_FRAMES / hold_frames,
         )
-        self._free = {(int(row), int(col)) for row, col in maze.free_blocks()}
 
     def _follow(self, block: tuple[int, int]) -> None:
         """Choose the next straight way where this one ends, or where block is not on it."""
@@ -66,6 +65,6 @@ class DistanceDriver(PathDriver):
 
     def _straight(self, block: tuple[int, int], step: tuple[int, int]) -> list[tuple[int, int]]:
         way = [block]
-        while (ahead := (way[-1][0] + step[0], way[-1][1] + step[1])) in self._free:
+        while (ahead := (way[-1][0] + step[0], way[-1][1] + step[1])) in self.maze.graph:
             way.append(ahead)
         return way
