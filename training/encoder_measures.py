@@ -33,8 +33,7 @@ def pairs_a_second(arguments: train_local.Arguments, seconds: float) -> float:
         if k == _WARM_UP:
             count, started = 0, time.monotonic()
         with torch.autocast("cpu", torch.bfloat16, enabled=arguments.precision == "bf16-mixed"):
-            mean, log_std = train_local.estimated(network, batch)[:2]
-            pose, likelihood = train_local.step_losses(mean, log_std, batch["relative"], network.relative_std)
+            pose, likelihood = train_local.stretch_losses(network, batch, world.error_windows)
         optimizer.zero_grad()
         (pose + likelihood).backward()
         optimizer.step()

@@ -156,9 +156,11 @@ class _Stream(IterableDataset[Batch]):
 class PairStream(_Stream):
     """Batches of consecutive frames, shuffled over a group of mazes; every second batch is mirrored.
 
-    A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``, ``relative`` ``(batch, 3)`` and, in a
-    world with actions, ``action`` ``(batch, ACTION_HISTORY)``: a few of them as after a restart, when the earlier ones
-    are not known. Where a world ``reverses``, time runs backwards in every fourth batch.
+    What is shuffled are stretches of steps that follow each other, as many as the longest of the world's
+    ``error_windows`` has (mostly one). A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``,
+    ``relative`` ``(batch, 3)`` and, in a world with actions, ``action`` ``(batch, ACTION_HISTORY)``: a few of them as
+    after a restart, when the earlier ones are not known. Where a world ``reverses``, time runs backwards in every
+    fourth batch.
     """
 
     FRAMES = 401
@@ -166,22 +168,33 @@ class PairStream(_Stream):
     def __init__(
         self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int, share: Share = ALL
     ) -> None:
+        self.stretch = self.stretch_of(world)
         pairs = _GROUP * (self.FRAMES - 1)
-        if not 1 <= batch_size <= pairs:
-            raise ValueError(f"batch_size is {batch_size}; expected 1 to {pairs}, the frame pairs of a group of mazes")
+        if not self.stretch <= batch_size <= pairs or batch_size % self.stretch:
+            raise ValueError(
+                f"batch_size is {batch_size}; expected {self.stretch} to {pairs}, the frame pairs of a group of mazes"
+                + (f", in stretches of {self.stretch}" if self.stretch > 1 else "")
+            )
         groups = max(1, round(datapoints / pairs))
         super().__init__(world, seeds, epoch, groups, self.FRAMES, share)
         self.batch_size = batch_size
 
+    @staticmethod
+    def stretch_of(world: World) -> int:
+        """Steps that stay together."""
+        return max(world.error_windows)
+
     @property
     def batches_a_group(self) -> int:
-        return _GROUP * (self.FRAMES - 1) // self.batch_size
+        return _GROUP * ((self.FRAMES - 1) // self.stretch) // (self.batch_size // self.stretch)
 
     def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
         images = torch.stack([images_of(self.world, episode) for episode in episodes])
         relative = torch.stack([relative_poses(episode.poses_xyyaw) for episode in episodes]).flatten(0, 1)
-        steps = self.frames - 1
-        order = torch.from_numpy(rng.permutation(len(relative)))
+        steps, stretch = self.frames - 1, self.stretch
+        whole = torch.arange(len(relative)).unflatten(0, (-1, steps))[:, : steps // stretch * stretch]
+        stretches = whole.reshape(-1, stretch)
+        order = stretches[torch.from_numpy(rng.permutation(len(stretches)))].flatten()
         if self.world.actions:
             actions = partly_forgotten(action_histories(np.stack([e.actions for e in episodes])).flatten(0, 1), rng)
         for count, chosen in enumerate(order.split(self.batch_size)[: self.batches_a_group]):

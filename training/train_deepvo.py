@@ -26,7 +26,7 @@ from training.data_module import StreamedData
 from training.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
 from training.metrics import seen_from_first
 from training.streams import ALL, Batch, PairStream, Share, images_of, mirrored, relative_poses, simulate
-from training.train_local import episode_pairs, step_losses, step_metrics
+from training.train_local import episode_pairs, step_losses, step_metrics, windows_within
 from training.tune_pose_graph import fit_calibration
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 
@@ -80,6 +80,10 @@ class StretchStream(PairStream):
         super().__init__(world, seeds, epoch, datapoints, batch_size, share)
         self.steps, self.stretches_a_maze = steps, (self.FRAMES - 1) // steps
 
+    @staticmethod
+    def stretch_of(world: World) -> int:
+        return 1  # stretches are cut by `batches`, whatever the windows
+
     @property
     def batches_a_group(self) -> int:
         return streams._GROUP * self.stretches_a_maze // self.batch_size
@@ -99,17 +103,19 @@ class StretchStream(PairStream):
 
 
 class DeepVOTraining(lightning.LightningModule):
-    """The local network's loss of single steps, over stretches; on the validation split, errors of whole episodes."""
+    """The local network's loss, over stretches; on the validation split, errors of whole episodes."""
 
-    def __init__(self, arguments: Arguments, network: DeepVO) -> None:
+    def __init__(self, arguments: Arguments, network: DeepVO, error_windows: tuple[int, ...]) -> None:
         super().__init__()
-        self.arguments, self.network = arguments, network
+        self.arguments, self.network, self.error_windows = arguments, network, error_windows
         self.validation: list[tuple[Tensor, Tensor]] = []
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         relative, _state = self.network(batch["images"])
         std = self.network.relative_std
-        loss, _likelihood = step_losses(relative, std.log().expand_as(relative), batch["relative"], std)
+        loss, _likelihood = step_losses(
+            relative, std.log().expand_as(relative), batch["relative"], std, self.error_windows
+        )
         self.log("pose_loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
         return loss
 
@@ -179,7 +185,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
         symmetric=world.mirrors,
     )
-    training = DeepVOTraining(arguments, DeepVO(config))
+    training = DeepVOTraining(arguments, DeepVO(config), windows_within(arguments.steps, world))
 
     def stream(epoch: int, share: Share) -> StretchStream:
         a = arguments

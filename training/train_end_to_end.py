@@ -34,7 +34,7 @@ from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, Optimized
 from training import runs
 from training.data_module import StreamedData
 from training.streams import Batch, Share, TrajectoryStream
-from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics
+from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.train_optimizer import trajectory_loss
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
 
@@ -84,9 +84,10 @@ class EndToEndTraining(lightning.LightningModule):
         optimizer: NeuralGraphOptimizer,
         scale_m: float,
         scale_rad: float,
+        error_windows: tuple[int, ...] = (1,),
     ) -> None:
         super().__init__()
-        self.arguments, self.scale_m, self.scale_rad = arguments, scale_m, scale_rad
+        self.arguments, self.scale_m, self.scale_rad, self.error_windows = arguments, scale_m, scale_rad, error_windows
         self.local, self.place, self.optimizer = local, place, optimizer
         self.requires_grad_(True)
         self.place.requires_grad_(optimizer.config.loops)  # the paper's form has no use for them
@@ -118,7 +119,9 @@ class EndToEndTraining(lightning.LightningModule):
         truth = se2.r2g(batch["relative"])[:, block - 1 :: block]
         std = self.optimizer.correction_std
         corrected = trajectory_loss(result.meta_relative, truth, std, self.scale_m, self.scale_rad)
-        pose_loss, likelihood = step_losses(relative, log_std, batch["relative"], self.local.relative_std)
+        pose_loss, likelihood = step_losses(
+            relative, log_std, batch["relative"], self.local.relative_std, self.error_windows
+        )
         loss = corrected + self.arguments.local_weight * (pose_loss + LIKELIHOOD_WEIGHT * likelihood)
         figures = {"loss": loss, "trajectory_loss": corrected, "pose_loss": pose_loss, "likelihood": likelihood}
         self.log_dict(
@@ -183,7 +186,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
         settings=world.stream_settings,
     )
-    training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad)
+    windows = windows_within(arguments.steps, world)
+    training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad, windows)
     # Mazes that neither the local network nor the feature store has seen.
     seeds = OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 2 :]
 

@@ -107,16 +107,15 @@ class Arguments(runs.TrainerArguments):
 
 
 class LocalTraining(lightning.LightningModule):
-    """The losses of single steps, ``step_losses``."""
+    """The losses of steps and of the windows of some consecutive ones, ``step_losses``."""
 
-    def __init__(self, arguments: Arguments, network: LocalPoseNetwork) -> None:
+    def __init__(self, arguments: Arguments, network: LocalPoseNetwork, error_windows: tuple[int, ...] = (1,)) -> None:
         super().__init__()
-        self.arguments, self.network = arguments, network
+        self.arguments, self.network, self.error_windows = arguments, network, error_windows
         self.validation: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
-        mean, log_std = estimated(self.network, batch)[:2]
-        pose_loss, likelihood = step_losses(mean, log_std, batch["relative"], self.network.relative_std)
+        pose_loss, likelihood = stretch_losses(self.network, batch, self.error_windows)
         self.log_dict(
             {"pose_loss": pose_loss, "likelihood": likelihood},
             on_step=False,
@@ -211,11 +210,35 @@ def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, 
     return estimate
 
 
-def step_losses(mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-    """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says."""
+def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """``step_losses`` of a network on a batch in which as many steps as the longest window has follow each other."""
+    mean, log_std = estimated(network, batch)[:2]
+    mean, log_std, truth = (values.unflatten(0, (-1, max(windows))) for values in (mean, log_std, batch["relative"]))
+    return step_losses(mean, log_std, truth, network.relative_std, windows)
+
+
+def windows_within(steps: int, world: World) -> tuple[int, ...]:
+    """The world's ``error_windows`` that so many steps which follow each other have room for."""
+    return tuple(window for window in world.error_windows if window <= steps)
+
+
+def step_losses(
+    mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor, windows: tuple[int, ...] = (1,)
+) -> tuple[Tensor, Tensor]:
+    """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says.
+
+    The first is the sum over ``windows``: of ``k`` steps that follow each other along the last axis but one, the errors
+    are added up and divided by the root of ``k``, so that all windows weigh the same where errors are independent.
+    Where they last, as what a robot with momentum does beside its actions, the longer windows weigh more. The sum of
+    the steps' errors is the drift in heading, and nearly that in position while the robot turns little.
+    """
     error = (mean - truth) / std
     weight = error.new_tensor([1.0, 1.0, HEADING_WEIGHT])
-    pose_loss = (smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.1) * weight).mean()
+    pose_loss = error.new_zeros(())
+    for window in windows:
+        drift = error if window == 1 else error.unfold(-2, window, 1).sum(-1) / math.sqrt(window)
+        loss = smooth_l1_loss(drift, torch.zeros_like(drift), reduction="none", beta=0.1)
+        pose_loss = pose_loss + (loss * weight).mean()
     log_scale = log_std - std.log()
     # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
     likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
@@ -288,7 +311,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         settings={"action_history": world.action_history, **world.stream_settings} if recorded is None else None,
     )
     network, begun = initial_network(arguments, domain, steps)
-    training = LocalTraining(arguments, network)
+    training = LocalTraining(arguments, network, domain.error_windows)
     data = StreamedData(steps.pairs, steps.validation, arguments.workers)
     run.fit(training, data)
     if not run.is_first:

@@ -104,7 +104,7 @@ class World(Domain):
     @property
     def stream_settings(self) -> dict[str, Any]:
         """What a training on a stream depends on beside its arguments, for its record."""
-        return {"training_drivers": list(self.stream_drivers)}
+        return {"training_drivers": list(self.stream_drivers), "error_windows": list(self.error_windows)}
 
     @property
     def unseen_tables(self) -> tuple[str, ...]:
@@ -250,6 +250,8 @@ WORLDS = {
         loss_scale=0.3,
         # The robot's turn rate falls by a quarter a step: after twelve 3 % of it is left.
         action_history=12,
+        # What actions do not tell has momentum too: where errors of steps alone count, they add up (docs/results.md).
+        error_windows=(1, 4, 16),
         tables={
             "seen": Table(stretch=1, seen=True),
             "unseen": Table(),
