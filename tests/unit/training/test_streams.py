@@ -292,3 +292,33 @@ def test_the_training_drivers_take_turns_group_by_group(monkeypatch: pytest.Monk
     drove.clear()
     list(pair_stream(groups=3))
     assert {driver for _, driver in drove} == {WORLD.driver}
+
+
+def test_where_errors_over_windows_count_steps_of_the_longest_stay_together() -> None:
+    world = dataclasses.replace(WORLD, error_windows=(1, 3, 7))
+    stream = PairStream(world, TRAIN_SEEDS, 3, 2 * 40, 14)
+    batches = list(stream)
+    assert len(batches) == len(stream) == 2 * 5 * 7 // 14  # of 40 steps in each of two mazes, five stretches of seven
+    episodes = list(simulate(world, stream.groups[0], 41))
+    kept = [images_of(world, episode) for episode in episodes]
+    met, starts = [], []
+    for count, batch in enumerate(batches):
+        shown = mirrored(batch) if count % 2 else batch
+        for first in range(0, 14, 7):
+            earlier, later = shown["earlier"][first : first + 7], shown["later"][first : first + 7]
+            assert torch.equal(earlier[1:], later[:-1])
+            (place,) = [
+                (maze, step) for maze in range(2) for step in range(40) if torch.equal(kept[maze][step], earlier[0])
+            ]
+            starts.append(place)
+            met += [(place[0], place[1] + k) for k in range(7)]
+            relative = relative_poses(episodes[place[0]].poses_xyyaw)[place[1] : place[1] + 7]
+            torch.testing.assert_close(shown["relative"][first : first + 7], relative)
+    assert sorted(met) == [(maze, step) for maze in range(2) for step in range(35)]
+    assert starts != sorted(starts)
+
+
+def test_a_batch_of_broken_stretches_is_refused() -> None:
+    world = dataclasses.replace(WORLD, error_windows=(1, 4))
+    with pytest.raises(ValueError, match=r"batch_size is 18; expected 4 to 80, .* in stretches of 4"):
+        PairStream(world, TRAIN_SEEDS, 0, 80, 18)

@@ -9,7 +9,16 @@ from torch import Tensor
 
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from training.streams import Batch
-from training.train_local import Arguments, calibrated, measure, step_metrics
+from training.train_local import (
+    HEADING_WEIGHT,
+    Arguments,
+    calibrated,
+    measure,
+    step_losses,
+    step_metrics,
+    stretch_losses,
+    windows_within,
+)
 from training.worlds import WORLDS
 
 
@@ -45,6 +54,40 @@ def test_metrics_on_paper() -> None:
 def test_heading_errors_are_wrapped() -> None:
     metrics = step_metrics(torch.tensor([[0.0, 0.0, 3.1]]), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, -3.1]]))
     assert metrics["rmse_deg"] == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-4)
+
+
+def heading_loss(errors: list[float], windows: tuple[int, ...]) -> float:
+    """The loss of steps whose headings are so many deviations off, by the weight that headings have."""
+    mean = torch.zeros(1, len(errors), 3)
+    mean[0, :, 2] = torch.tensor(errors) * 0.5
+    truth, std = torch.zeros_like(mean), torch.tensor([1.0, 1.0, 0.5])
+    return float(step_losses(mean, torch.zeros_like(mean), truth, std, windows)[0]) * 3 / HEADING_WEIGHT
+
+
+def test_errors_that_last_cost_more_over_windows_and_errors_that_cancel_less() -> None:
+    # Smooth-L1 is |e| - 0.05 from 0.1 on.
+    assert heading_loss([1.0, 1.0, 1.0, 1.0], (1,)) == heading_loss([1.0, -1.0, 1.0, -1.0], (1,)) == pytest.approx(0.95)
+    assert heading_loss([1.0, 1.0, 1.0, 1.0], (4,)) == pytest.approx(4 / 2 - 0.05)
+    assert heading_loss([1.0, -1.0, 1.0, -1.0], (4,)) == 0.0
+    # Of windows of two there are three, whose sums are 2, 1 and 0.
+    two = np.array([2.0, 1.0]) / np.sqrt(2.0) - 0.05
+    assert heading_loss([1.0, 1.0, 0.0, 0.0], (2,)) == pytest.approx(two.sum() / 3)
+    assert heading_loss([1.0, 1.0, 0.0, 0.0], (1, 2)) == pytest.approx(two.sum() / 3 + 0.95 / 2)
+
+
+def test_windows_do_not_reach_from_one_stretch_of_a_batch_into_the_next(network: LocalPoseNetwork) -> None:
+    (pairs,) = pairs_with_truth(network, torch.ones(3), torch.zeros(3))
+    pairs = {name: values[:8] for name, values in pairs.items()}
+    # The first stretch is off to one side, the second to the other: across the border they would cancel.
+    pairs["relative"] += torch.tensor([[0.0, 0.0, 0.4]] * 4 + [[0.0, 0.0, -0.4]] * 4)
+    with torch.no_grad():
+        loss, _ = stretch_losses(network, pairs, (4,))
+    assert float(loss) == pytest.approx((2 * 0.4 - 0.05) * HEADING_WEIGHT / 3, rel=1e-4)
+
+
+def test_windows_that_do_not_fit_are_left_out() -> None:
+    world = dataclasses.replace(WORLDS["maze3d"], error_windows=(1, 4, 16))
+    assert windows_within(40, world) == (1, 4, 16) and windows_within(15, world) == (1, 4)
 
 
 def test_calibration_removes_bias_and_scale(network: LocalPoseNetwork) -> None:
