@@ -45,6 +45,7 @@ from training.streams import (
 )
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
+DRIFT_STEPS = 100
 HEADING_WEIGHT = 3.0
 LIKELIHOOD_WEIGHT = 0.1
 _ONE_LOOK = 4
@@ -63,6 +64,8 @@ class Arguments(runs.TrainerArguments):
     """Whether the network of a world is to do without the actions, from the images alone."""
     action_history: int | None = None
     """How many of the latest actions a network is told, if any; none: the world's number, twelve of recordings."""
+    error_windows: tuple[int, ...] | None = None
+    """Numbers of consecutive steps whose errors count added up; none: the world's."""
     looks: LooksName | None = None
     """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.25
@@ -102,6 +105,9 @@ class Arguments(runs.TrainerArguments):
             )
         if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
             raise ValueError(f"action_history is {self.action_history}; expected 1 to {ACTION_HISTORY}")
+        if self.error_windows is not None and (self.world is None or min(self.error_windows, default=0) < 1):
+            given = f"{self.error_windows}{' with recordings' if self.world is None else ''}"
+            raise ValueError(f"error_windows is {given}; expected numbers of steps, each at least 1, of a world")
         if self.calibration_mazes is not None and self.calibration_mazes < 1:
             raise ValueError(f"calibration_mazes is {self.calibration_mazes}; expected at least 1")
 
@@ -150,6 +156,8 @@ def simulated_world(arguments: Arguments) -> World:
         world = world.with_pictures(arguments.picture_height)
     if arguments.action_history is not None:
         world = dataclasses.replace(world, action_history=arguments.action_history)
+    if arguments.error_windows is not None:
+        world = dataclasses.replace(world, error_windows=arguments.error_windows)
     return dataclasses.replace(world, actions=0, mirrored_actions=()) if arguments.without_action else world
 
 
@@ -320,6 +328,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     final = LocalPoseNetwork(calibrated(training.network, steps.unseen())).eval()
     final.load_state_dict(training.network.state_dict())
     metrics = measure(final, data.validation)
+    if recorded is None:
+        metrics["drift_deg"] = heading_drift(final, data.validation)
     about = {} if recorded is None else {"data": recorded.about}
     details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", final, LOCAL, domain.name, details)
@@ -372,6 +382,18 @@ def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
     parts = [estimated(network, p)[:2] for p in pairs]
     truth = torch.cat([p["relative"] for p in pairs])
     return step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
+
+
+@torch.no_grad()
+def heading_drift(network: LocalPoseNetwork, episodes: list[Batch], steps: int = DRIFT_STEPS) -> float:
+    """What a network's headings drift in so many steps (RMS, deg), over all windows of that length in episodes.
+
+    Shorter episodes are one window each. Where errors of single steps are independent, it is theirs by the root of the
+    number of steps.
+    """
+    errors = [estimated(network, episode)[0][:, 2] - episode["relative"][:, 2] for episode in episodes]
+    drifts = [se2.wrap(error).double().unfold(0, min(steps, len(error)), 1).sum(-1) for error in errors]
+    return float(torch.cat(drifts).square().mean().sqrt().rad2deg())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """The local network's training: metrics on paper, and a calibration that removes bias and scale."""
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,11 +10,13 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from training.recorded import RecordedArguments
 from training.streams import Batch
 from training.train_local import (
     HEADING_WEIGHT,
     Arguments,
     calibrated,
+    heading_drift,
     measure,
     step_losses,
     step_metrics,
@@ -119,6 +123,31 @@ def test_a_component_that_was_not_learned_keeps_a_positive_deviation(network: Lo
     better = LocalPoseNetwork(config).eval()
     better.load_state_dict(network.state_dict())
     assert abs(measure(better, pairs)["bias_forward_m"]) < 1e-4
+
+
+def test_drift_adds_up_errors_that_last_and_not_those_that_cancel(network: LocalPoseNetwork) -> None:
+    (pairs,) = pairs_with_truth(network, torch.ones(3), torch.zeros(3))
+    lasting = {**pairs, "relative": pairs["relative"] - torch.tensor([0.0, 0.0, 0.01])}
+    assert heading_drift(network, [lasting, lasting], 50) == pytest.approx(np.degrees(0.5), rel=1e-4)
+    sign = torch.tensor([1.0, -1.0]).repeat(100)[:, None]
+    cancelling = {**pairs, "relative": pairs["relative"] + sign * torch.tensor([0.0, 0.0, 0.01])}
+    assert heading_drift(network, [cancelling], 50) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"world": "maze3d", "error_windows": (1, 0)}, r"error_windows is \(1, 0\); expected numbers of steps"),
+        ({"world": "maze3d", "error_windows": ()}, r"error_windows is \(\)"),
+        (
+            {"recordings": RecordedArguments(data=(Path("a.mcap"),), name="robot"), "error_windows": (1, 4)},
+            "with recordings; expected",
+        ),
+    ],
+)
+def test_windows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Arguments(**arguments)
 
 
 @pytest.mark.parametrize("count", [0, 13])
