@@ -169,13 +169,13 @@ class PairStream(_Stream):
         self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int, share: Share = ALL
     ) -> None:
         self.stretch = self.stretch_of(world)
-        pairs = _GROUP * (self.FRAMES - 1)
+        pairs = _GROUP * ((self.FRAMES - 1) // self.stretch) * self.stretch
         if not self.stretch <= batch_size <= pairs or batch_size % self.stretch:
             raise ValueError(
                 f"batch_size is {batch_size}; expected {self.stretch} to {pairs}, the frame pairs of a group of mazes"
                 + (f", in stretches of {self.stretch}" if self.stretch > 1 else "")
             )
-        groups = max(1, round(datapoints / pairs))
+        groups = max(1, round(datapoints / (_GROUP * (self.FRAMES - 1))))
         super().__init__(world, seeds, epoch, groups, self.FRAMES, share)
         self.batch_size = batch_size
 
@@ -196,7 +196,8 @@ class PairStream(_Stream):
         stretches = whole.reshape(-1, stretch)
         order = stretches[torch.from_numpy(rng.permutation(len(stretches)))].flatten()
         if self.world.actions:
-            actions = partly_forgotten(action_histories(np.stack([e.actions for e in episodes])).flatten(0, 1), rng)
+            actions = action_histories(np.stack([e.actions for e in episodes])).flatten(0, 1)
+            actions[stretches] = partly_forgotten(actions[stretches], rng)
         for count, chosen in enumerate(order.split(self.batch_size)[: self.batches_a_group]):
             episode, step = chosen // steps, chosen % steps
             batch = {
@@ -212,11 +213,15 @@ class PairStream(_Stream):
 
 
 def partly_forgotten(actions: Tensor, rng: np.random.Generator) -> Tensor:
-    """Histories of actions ``(n, ACTION_HISTORY)``, a share of which knows a drawn number of the latest alone."""
+    """Histories of actions ``(n, steps, ACTION_HISTORY)`` of stretches, a share of them as after a restart.
+
+    There the first step knows a drawn number of the latest actions alone, and each one after it one more.
+    """
     known = rng.integers(1, ACTION_HISTORY, len(actions))
     known[rng.random(len(actions)) >= _FORGOTTEN] = ACTION_HISTORY
+    known_then = torch.from_numpy(known).unsqueeze(1) + torch.arange(actions.shape[1])
     age = torch.arange(ACTION_HISTORY - 1, -1, -1)
-    return actions.masked_fill(age >= torch.from_numpy(known).unsqueeze(1), NO_ACTION)
+    return actions.masked_fill(age >= known_then.unsqueeze(-1), NO_ACTION)
 
 
 class PlaceStream(_Stream):

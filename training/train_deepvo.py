@@ -175,7 +175,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.epochs,
         arguments.seed,
         datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
-        settings=world.stream_settings,
+        settings={"error_windows": list(windows_within(arguments.steps, world)), **world.stream_settings},
     )
     some = torch.cat([pairs["relative"] for pairs in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
     config = DeepVOConfig(

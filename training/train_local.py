@@ -219,10 +219,20 @@ def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, 
 
 
 def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """``step_losses`` of a network on a batch in which as many steps as the longest window has follow each other."""
-    mean, log_std = estimated(network, batch)[:2]
-    mean, log_std, truth = (values.unflatten(0, (-1, max(windows))) for values in (mean, log_std, batch["relative"]))
-    return step_losses(mean, log_std, truth, network.relative_std, windows)
+    """The losses of a network on a batch in which as many steps as the longest of ``windows`` has follow each other.
+
+    Of what it makes of the frames alone ``step_losses`` of single steps; where it is told of earlier actions too, also
+    those of all windows of what it makes of both, which leave the first part of it alone.
+    """
+    estimates = network.estimates(batch["earlier"], batch["later"], batch.get("action"), batch.get("twist"))
+    truth, std = batch["relative"], network.relative_std
+    pose_loss, likelihood = step_losses(estimates.visual.mean, estimates.visual.log_std, truth, std)
+    if estimates.fused is estimates.visual:
+        return pose_loss, likelihood
+    fused = (estimates.fused.mean, estimates.fused.log_std, truth)
+    mean, log_std, truth = (values.unflatten(0, (-1, max(windows))) for values in fused)
+    of_fused = step_losses(mean, log_std, truth, std, windows)
+    return pose_loss + of_fused[0], likelihood + of_fused[1]
 
 
 def windows_within(steps: int, world: World) -> tuple[int, ...]:
@@ -235,8 +245,8 @@ def step_losses(
 ) -> tuple[Tensor, Tensor]:
     """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says.
 
-    The first is the sum over ``windows``: of ``k`` steps that follow each other along the last axis but one, the errors
-    are added up and divided by the root of ``k``, so that all windows weigh the same where errors are independent.
+    The first is the mean over ``windows``: of ``k`` steps that follow each other along the last axis but one, the
+    errors are added up and divided by the root of ``k``, so that windows weigh the same where errors are independent.
     Where they last, as what a robot with momentum does beside its actions, the longer windows weigh more. The sum of
     the steps' errors is the drift in heading, and nearly that in position while the robot turns little.
     """
@@ -246,7 +256,7 @@ def step_losses(
     for window in windows:
         drift = error if window == 1 else error.unfold(-2, window, 1).sum(-1) / math.sqrt(window)
         loss = smooth_l1_loss(drift, torch.zeros_like(drift), reduction="none", beta=0.1)
-        pose_loss = pose_loss + (loss * weight).mean()
+        pose_loss = pose_loss + (loss * weight).mean() / len(windows)
     log_scale = log_std - std.log()
     # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
     likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
@@ -316,7 +326,13 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
-        settings={"action_history": world.action_history, **world.stream_settings} if recorded is None else None,
+        settings=None
+        if recorded is not None
+        else {
+            "action_history": world.action_history,
+            "error_windows": list(world.error_windows),
+            **world.stream_settings,
+        },
     )
     network, begun = initial_network(arguments, domain, steps)
     training = LocalTraining(arguments, network, domain.error_windows)
@@ -351,8 +367,17 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
                 f"{folder} takes {_told(config.actions, config.twist)}, the recordings have "
                 f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave them out)"
             )
-        changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s))
-        changed.load_state_dict(network.state_dict())
+        if config.image != domain.image:
+            raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")
+        wanted = domain.action_history if domain.actions else 1
+        if config.action_history not in (1, wanted):
+            raise RecordingError(f"{folder} is told the latest {config.action_history} actions; expected 1 or {wanted}")
+        changes: dict[str, Any] = {"action_history": wanted, "deviation_scale": (1.0, 1.0, 1.0)}
+        if domain.mirrors:
+            changes |= {"symmetric": True, "mirrored_actions": domain.mirrored_actions}
+        changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s, **changes))
+        # What takes earlier actions into account is new where the weights know none.
+        changed.load_state_dict(changed.state_dict() | network.state_dict())
         return changed, {"began_with_sha256": description["sha256"]}
     some = steps.typical()
     config = LocalPoseConfig(

@@ -104,7 +104,7 @@ class World(Domain):
     @property
     def stream_settings(self) -> dict[str, Any]:
         """What a training on a stream depends on beside its arguments, for its record."""
-        return {"training_drivers": list(self.stream_drivers), "error_windows": list(self.error_windows)}
+        return {"training_drivers": list(self.stream_drivers)}
 
     @property
     def unseen_tables(self) -> tuple[str, ...]:

@@ -61,6 +61,7 @@ def test_a_network_is_told_as_many_of_the_latest_actions_as_it_was_made_for() ->
     torch.manual_seed(0)
     images = observations("maze2d", 2).repeat_interleave(2, dim=0)
     network = LocalPoseNetwork(local_config("maze2d", action_history=3)).eval()
+    torch.nn.init.normal_(network.fusion[-1].weight)  # untrained, it has no say
 
     def of(*actions: int) -> torch.Tensor:
         return network(images[:1], images[3:], torch.tensor([actions]))[0]

@@ -266,12 +266,14 @@ def test_a_history_ends_with_the_steps_own_action_and_begins_with_nothing() -> N
 
 
 def test_of_a_tenth_of_the_histories_the_earlier_part_is_forgotten() -> None:
-    whole = torch.ones(10_000, ACTION_HISTORY).long()
+    whole = torch.ones(10_000, 3, ACTION_HISTORY).long()
     partly = partly_forgotten(whole, np.random.default_rng(0))
-    known = (partly != NO_ACTION).sum(1)
-    assert 0.08 < float((known < ACTION_HISTORY).float().mean()) < 0.12
-    assert sorted(set(known.tolist())) == list(range(1, ACTION_HISTORY + 1))
-    assert all((row[-count:] == 1).all() for row, count in zip(partly, known.tolist(), strict=True))
+    known = (partly != NO_ACTION).sum(-1)
+    assert 0.08 < float((known[:, 0] < ACTION_HISTORY).float().mean()) < 0.12
+    assert sorted(set(known[:, 0].tolist())) == list(range(1, ACTION_HISTORY + 1))
+    assert all((row[-count:] == 1).all() for row, count in zip(partly[:, 0], known[:, 0].tolist(), strict=True))
+    # As after a restart, each step knows one more.
+    assert torch.equal(known, (known[:, :1] + torch.arange(3)).clamp(max=ACTION_HISTORY))
 
 
 def test_the_training_drivers_take_turns_group_by_group(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -312,6 +314,8 @@ def test_where_errors_over_windows_count_steps_of_the_longest_stay_together() ->
             ]
             starts.append(place)
             met += [(place[0], place[1] + k) for k in range(7)]
+            own = torch.from_numpy(episodes[place[0]].actions[place[1] : place[1] + 7]).long()
+            assert torch.equal(shown["action"][first : first + 7, -1], own)
             relative = relative_poses(episodes[place[0]].poses_xyyaw)[place[1] : place[1] + 7]
             torch.testing.assert_close(shown["relative"][first : first + 7], relative)
     assert sorted(met) == [(maze, step) for maze in range(2) for step in range(35)]
@@ -322,3 +326,8 @@ def test_a_batch_of_broken_stretches_is_refused() -> None:
     world = dataclasses.replace(WORLD, error_windows=(1, 4))
     with pytest.raises(ValueError, match=r"batch_size is 18; expected 4 to 80, .* in stretches of 4"):
         PairStream(world, TRAIN_SEEDS, 0, 80, 18)
+    long = dataclasses.replace(WORLD, error_windows=(1, 30))
+    with pytest.raises(ValueError, match="batch_size is 90; expected 30 to 60"):
+        PairStream(long, TRAIN_SEEDS, 0, 80, 90)
+    with pytest.raises(ValueError, match="batch_size is 41; expected 41 to 0"):
+        PairStream(dataclasses.replace(WORLD, error_windows=(41,)), TRAIN_SEEDS, 0, 80, 41)

@@ -76,7 +76,7 @@ def test_errors_that_last_cost_more_over_windows_and_errors_that_cancel_less() -
     # Of windows of two there are three, whose sums are 2, 1 and 0.
     two = np.array([2.0, 1.0]) / np.sqrt(2.0) - 0.05
     assert heading_loss([1.0, 1.0, 0.0, 0.0], (2,)) == pytest.approx(two.sum() / 3)
-    assert heading_loss([1.0, 1.0, 0.0, 0.0], (1, 2)) == pytest.approx(two.sum() / 3 + 0.95 / 2)
+    assert heading_loss([1.0, 1.0, 0.0, 0.0], (1, 2)) == pytest.approx((two.sum() / 3 + 0.95 / 2) / 2)
 
 
 def test_windows_do_not_reach_from_one_stretch_of_a_batch_into_the_next(network: LocalPoseNetwork) -> None:
@@ -84,9 +84,34 @@ def test_windows_do_not_reach_from_one_stretch_of_a_batch_into_the_next(network:
     pairs = {name: values[:8] for name, values in pairs.items()}
     # The first stretch is off to one side, the second to the other: across the border they would cancel.
     pairs["relative"] += torch.tensor([[0.0, 0.0, 0.4]] * 4 + [[0.0, 0.0, -0.4]] * 4)
+    told = LocalPoseNetwork(dataclasses.replace(network.config, action_history=2))
+    told.load_state_dict(told.state_dict() | network.state_dict())
+    pairs["action"] = pairs["action"].unsqueeze(1).expand(8, 2)
     with torch.no_grad():
-        loss, _ = stretch_losses(network, pairs, (4,))
-    assert float(loss) == pytest.approx((2 * 0.4 - 0.05) * HEADING_WEIGHT / 3, rel=1e-4)
+        alone, both = (float(stretch_losses(told, pairs, windows)[0]) for windows in ((1,), (4,)))
+    each = (0.4 - 0.05) * HEADING_WEIGHT / 3  # of what is seen, and as long as it is what is said
+    assert alone == pytest.approx(2 * each, rel=1e-4)
+    assert both == pytest.approx(each + (2 * 0.4 - 0.05) * HEADING_WEIGHT / 3, rel=1e-4)
+
+
+def test_what_earlier_actions_tell_leaves_alone_what_is_seen() -> None:
+    torch.manual_seed(0)
+    config = LocalPoseConfig(WORLDS["maze2d"].image, 0.03, 3, period_s=0.1, action_history=4)
+    network = LocalPoseNetwork(config)
+    generator = torch.Generator().manual_seed(1)
+    images = torch.rand(9, 1, 241, 4, generator=generator)
+    batch = {"earlier": images[:-1], "later": images[1:], "relative": torch.rand(8, 3, generator=generator)}
+    batch["action"] = torch.randint(0, 3, (8, 4), generator=generator)
+
+    def gradients(windows: tuple[int, ...]) -> dict[str, Tensor]:
+        network.zero_grad()
+        sum(stretch_losses(network, batch, windows)).backward()  # type: ignore[union-attr]
+        return {name: value.grad.clone() for name, value in network.named_parameters() if value.grad is not None}
+
+    of_steps, of_windows = gradients((1,)), gradients((1, 4))
+    seeing = {name for name in of_steps if not name.startswith("fusion")}
+    assert all(torch.equal(of_steps[name], of_windows[name]) for name in seeing) and len(seeing) > 10
+    assert not torch.equal(of_steps["fusion.4.weight"], of_windows["fusion.4.weight"])
 
 
 def test_windows_that_do_not_fit_are_left_out() -> None:

@@ -20,7 +20,8 @@ class LocalPoseConfig:
     ``relative_mean`` and ``relative_std`` (m, m, rad) normalise the output: the network works on poses of mean 0 and
     deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of discrete
     actions, 0 for none, and ``action_history`` how many of the latest ones the network is told: in how a robot with
-    momentum moves, what it did before goes on. With ``twist`` the network is told the mean velocity between the frames,
+    momentum moves, what it did before goes on. More than one of them pass through ``fusion_size`` hidden units. With
+    ``twist`` the network is told the mean velocity between the frames,
     which it divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between frames in training.
     With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror images, in which action
     ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard deviations that the heads give.
@@ -40,6 +41,7 @@ class LocalPoseConfig:
     twist: bool = False
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     action_history: int = 1
+    fusion_size: int = 128
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -49,8 +51,11 @@ class LocalPoseConfig:
                 f"actions, feature_size, hidden_size are {self.actions}, {self.feature_size}, {self.hidden_size}; "
                 "expected at least 0, 1, 1"
             )
-        if self.action_history < 1:
-            raise ValueError(f"action_history is {self.action_history}; expected at least 1, the latest action")
+        if self.action_history < 1 or self.fusion_size < 1:
+            raise ValueError(
+                f"action_history, fusion_size are {self.action_history}, {self.fusion_size}; expected at least 1 (the "
+                "latest action), 1"
+            )
         if not self.period_s > 0.0:
             raise ValueError(f"period_s is {self.period_s}; expected a positive time")
         if min(self.relative_std) <= 0.0:
@@ -65,14 +70,37 @@ class LocalPoseConfig:
             )
 
 
+@dataclass(frozen=True)
+class StepEstimate:
+    """Relative poses ``(batch, 3)`` (m, m, rad), ``mean``, and the logarithm of their standard deviations."""
+
+    mean: Tensor
+    log_std: Tensor
+
+
+@dataclass(frozen=True)
+class StepEstimates:
+    """What a network makes of steps, ``fused``, and before its earlier actions are taken into account, ``visual``.
+
+    The two are one where it is told none. ``feature`` ``(batch, feature_size)`` is the motion feature.
+    """
+
+    visual: StepEstimate
+    fused: StepEstimate
+    feature: Tensor
+
+
 class LocalPoseNetwork(nn.Module):
     """Relative pose of a frame with respect to the one before, from the two and what is known of the step between.
 
     Two frames are stacked and passed through the convolutions of FlowNetS; one fully connected layer takes these and
-    the actions or the velocity; a translational and a rotational head read it. Beyond the paper the network may be told
-    several of the latest actions, each head also gives the logarithm of its standard deviation, and the input of the
-    heads is the motion feature that the pose aggregation reads. A symmetric network estimates both the frames and their
-    mirror image, in evaluation mode: errors to the left and to the right then cancel wherever the two differ.
+    the action or the velocity; a translational and a rotational head read it. Beyond the paper each head also gives the
+    logarithm of its standard deviation, and the input of the heads is the motion feature that the pose aggregation
+    reads. A network that is told several of the latest actions corrects what the heads say: two layers see it, the
+    feature and the actions. No gradient passes from there into the rest, which learns to see as if it knew nothing of
+    earlier actions: told at once, they explain so much that little is learned from the frames. A symmetric network
+    estimates both the frames and their mirror image, in evaluation mode: errors to the left and to the right then
+    cancel wherever the two differ.
     """
 
     def __init__(self, config: LocalPoseConfig) -> None:
@@ -80,11 +108,22 @@ class LocalPoseNetwork(nn.Module):
         self.config = config
         image = config.image
         self.convolutions = FlowNetConvolutions(2 * image.channels, (image.height, image.width), config.width)
-        told = config.actions * config.action_history + 3 * config.twist
+        told = config.actions + 3 * config.twist
         self.hidden = nn.Linear(self.convolutions.output_size + told, config.hidden_size)
         self.feature = nn.Linear(config.hidden_size, config.feature_size)
         self.translation = nn.Linear(config.feature_size + told, 4)
         self.rotation = nn.Linear(config.feature_size + told, 2)
+        if config.action_history > 1:
+            known = 6 + config.feature_size + told - config.actions + config.actions * config.action_history
+            self.fusion = nn.Sequential(
+                nn.Linear(known, config.fusion_size),
+                nn.ReLU(),
+                nn.Linear(config.fusion_size, config.fusion_size),
+                nn.ReLU(),
+                nn.Linear(config.fusion_size, 6),
+            )
+            for parameter in self.fusion[-1].parameters():
+                nn.init.zeros_(parameter)  # it begins with what is seen
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
         self.register_buffer("log_deviation_scale", torch.tensor(config.deviation_scale).log(), persistent=False)
@@ -112,6 +151,27 @@ class LocalPoseNetwork(nn.Module):
             Relative pose ``(batch, 3)`` of the later frame in the earlier one (m, m, rad), the logarithm of its
             standard deviations ``(batch, 3)``, and the motion feature ``(batch, feature_size)``.
         """
+        actions = self._checked(actions, twist)
+        if self.training or not self.config.symmetric:
+            estimates = self._estimates(earlier, later, actions, twist)
+            return estimates.fused.mean, estimates.fused.log_std, estimates.feature
+        both = [torch.cat((frames, frames.flip(-2))) for frames in (earlier, later)]
+        actions = actions if actions is None else torch.cat((actions, self.mirrored_actions[actions]))
+        flip = self.relative_std.new_tensor([1.0, -1.0, -1.0])
+        twist = twist if twist is None else torch.cat((twist, twist * flip))
+        estimates = self._estimates(both[0], both[1], actions, twist)
+        of_both = (estimates.fused.mean, estimates.fused.log_std, estimates.feature)
+        mean, log_std, feature = (values.chunk(2) for values in of_both)
+        return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
+
+    def estimates(
+        self, earlier: Tensor, later: Tensor, actions: Tensor | None = None, twist: Tensor | None = None
+    ) -> StepEstimates:
+        """What is estimated with and without the earlier actions, of the frames as they are; arguments as above."""
+        return self._estimates(earlier, later, self._checked(actions, twist), twist)
+
+    def _checked(self, actions: Tensor | None, twist: Tensor | None) -> Tensor | None:
+        """The actions that the network reads, where it is given what it wants."""
         if (actions is None) != (self.config.actions == 0):
             given = "no actions were given" if actions is None else "actions were given"
             raise ValueError(f"{given} to a network trained with {self.config.actions} actions")
@@ -119,14 +179,7 @@ class LocalPoseNetwork(nn.Module):
             actions = self._latest(actions)
         if (twist is None) == self.config.twist:
             raise ValueError(f"twist is {'not ' * (twist is None)}given to a network with twist={self.config.twist}")
-        if self.training or not self.config.symmetric:
-            return self._estimate(earlier, later, actions, twist)
-        both = [torch.cat((frames, frames.flip(-2))) for frames in (earlier, later)]
-        actions = actions if actions is None else torch.cat((actions, self.mirrored_actions[actions]))
-        flip = self.relative_std.new_tensor([1.0, -1.0, -1.0])
-        twist = twist if twist is None else torch.cat((twist, twist * flip))
-        mean, log_std, feature = (values.chunk(2) for values in self._estimate(both[0], both[1], actions, twist))
-        return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
+        return actions
 
     def _latest(self, actions: Tensor) -> Tensor:
         """The actions ``(batch, action_history)`` that the network reads."""
@@ -137,22 +190,33 @@ class LocalPoseNetwork(nn.Module):
             )
         return given[:, -self.config.action_history :]
 
-    def _estimate(
-        self, earlier: Tensor, later: Tensor, actions: Tensor | None, twist: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _estimates(self, earlier: Tensor, later: Tensor, actions: Tensor | None, twist: Tensor | None) -> StepEstimates:
         frames = torch.cat([to_network(frame, self.config.image) for frame in (earlier, later)], dim=1)
         inputs = [self.convolutions(frames)]
-        told = []
+        told, history = [], []
         if actions is not None:
             # NO_ACTION becomes zeros.
-            one_of_each = one_hot(actions - NO_ACTION, self.config.actions + 1)[..., 1:]
-            told.append(one_of_each.flatten(1).to(frames.dtype))
+            one_of_each = one_hot(actions - NO_ACTION, self.config.actions + 1)[..., 1:].to(frames.dtype)
+            told.append(one_of_each[:, -1])
+            history.append(one_of_each.flatten(1))
         if twist is not None:
             told.append(twist.to(frames.dtype) / self.twist_scale)
+            history.append(told[-1])
         hidden = torch.relu(self.hidden(torch.cat(inputs + told, dim=1)))
         feature = torch.relu(self.feature(hidden)).float()
         heads_input = torch.cat([feature, *told], dim=1)
         translation, rotation = self.translation(heads_input).float(), self.rotation(heads_input).float()
-        mean = torch.cat((translation[:, :2], rotation[:, :1]), dim=1) * self.relative_std + self.relative_mean
-        log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1).clamp(-7.0, 3.0)
-        return mean, log_std + self.relative_std.log() + self.log_deviation_scale, feature
+        mean = torch.cat((translation[:, :2], rotation[:, :1]), dim=1)
+        log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1)
+        visual = fused = self._in_units(mean, log_std)
+        if self.config.action_history > 1:
+            seen = torch.cat((mean, log_std), dim=1).detach()
+            correction = self.fusion(torch.cat([seen, feature.detach(), *history], dim=1)).float()
+            corrected, corrected_log_std = (seen + correction).split(3, dim=1)
+            fused = self._in_units(corrected, corrected_log_std)
+        return StepEstimates(visual, fused, feature)
+
+    def _in_units(self, mean: Tensor, log_std: Tensor) -> StepEstimate:
+        """Normalised relative poses and logarithms of their deviations ``(batch, 3)`` in SI units."""
+        scale = self.relative_std.log() + self.log_deviation_scale
+        return StepEstimate(mean * self.relative_std + self.relative_mean, log_std.clamp(-7.0, 3.0) + scale)
