@@ -137,11 +137,14 @@ class LocalOdometry:
             raise DuplicateFrame(f"frame at {stamp_ns} ns came twice")
         if stamp_ns < last:
             raise LateFrame(f"frame at {stamp_ns} ns is {(last - stamp_ns) / 1e9:.3f} s older than the last one")
+        missed = max(0, round((stamp_ns - last) * 1e-9 / self.period_s) - 1)
         actions = None
         if self.uses_action:
             if action is None or not 0 <= action < self._network.config.actions:
                 raise UnusableImage(f"action is {action}; expected 0 to {self._network.config.actions - 1}")
-            actions = torch.tensor([[*self._actions[1:], action]])
+            # Of frames that were missed nobody says what the robot did, and what it did before them is longer ago.
+            before = [NO_ACTION] * (len(self._actions) - 1) if missed else self._actions[1:]
+            actions = torch.tensor([[*before, action]])
         twists = None
         if self.uses_twist:
             if twist is None or np.shape(twist) != (3,) or not np.isfinite(twist).all():
@@ -150,13 +153,11 @@ class LocalOdometry:
         with torch.inference_mode():
             relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
             code = self._encoder(frame)
-        missed = max(0, round((stamp_ns - last) * 1e-9 / self.period_s) - 1)
         variance = torch.exp(2.0 * log_std[0].double())
         # A pair further apart than in training: the network's own belief holds no longer, so a typical step for every
         # missing frame is added to it.
         variance = variance + (missed * self._network.relative_std.double()) ** 2
         self._odom = se2.compose(self._odom, relative[0].double())
-        # The action of a frame that was missed is not known, and is not among them.
         self._actions = [] if actions is None else actions[0].tolist()
         self._last_stamp_ns, self._last_image = stamp_ns, frame
         origin_code, self._origin_code = self._origin_code, None
