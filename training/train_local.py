@@ -356,7 +356,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple[LocalPoseNetwork, dict[str, str]]:
     """A fresh network, or that of the weights to begin with, and what is to be said of them in the JSON.
 
-    Raises ``RecordingError`` where those weights are told other things of a step than the recordings tell.
+    Raises ``RecordingError`` where those weights take other images, or are told other things of a step.
     """
     folder = arguments.recordings.from_weights
     if folder is not None:
@@ -364,8 +364,9 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         config = network.config
         if (config.actions, config.twist) != (domain.actions, domain.twist):
             raise RecordingError(
-                f"{folder} takes {_told(config.actions, config.twist)}, the recordings have "
-                f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave them out)"
+                f"{folder} takes {_told(config.actions, config.twist)}, {domain.name} has "
+                f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave "
+                "them out)"
             )
         if config.image != domain.image:
             raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")

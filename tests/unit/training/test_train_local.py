@@ -9,14 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from ngo_estimator.checkpoint import LOCAL, save_checkpoint
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_recordings.errors import RecordingError
 from training.recorded import RecordedArguments
 from training.streams import Batch
 from training.train_local import (
     HEADING_WEIGHT,
     Arguments,
+    SimulatedSteps,
     calibrated,
     heading_drift,
+    initial_network,
     measure,
     step_losses,
     step_metrics,
@@ -173,6 +177,41 @@ def test_drift_adds_up_errors_that_last_and_not_those_that_cancel(network: Local
 def test_windows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Arguments(**arguments)
+
+
+def begun_with(folder: Path, **changes: Any) -> LocalPoseNetwork:
+    arguments = Arguments(world="maze2d", recordings=RecordedArguments(from_weights=folder))
+    world = dataclasses.replace(WORLDS["maze2d"], **changes)
+    return initial_network(arguments, world, SimulatedSteps(arguments, world))[0].eval()
+
+
+def test_weights_to_begin_with_see_as_before_and_are_told_more(network: LocalPoseNetwork, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / f"{LOCAL}.safetensors", network, LOCAL, "maze2d", {})
+    begun = begun_with(tmp_path, action_history=5, mirrors=False)
+    assert begun.config.action_history == 5 and not begun.config.symmetric
+    (pairs,) = pairs_with_truth(network, torch.ones(3), torch.zeros(3))
+    with torch.no_grad():
+        told = torch.randint(0, 3, (200, 5), generator=torch.Generator().manual_seed(2))
+        told[:, -1] = pairs["action"]
+        torch.testing.assert_close(begun(pairs["earlier"], pairs["later"], told)[0], pairs["relative"])
+    assert begun_with(tmp_path).config.symmetric
+    save_checkpoint(tmp_path / f"{LOCAL}.safetensors", begun, LOCAL, "maze2d", {})
+    assert torch.equal(begun_with(tmp_path, action_history=5).fusion[0].weight, begun.fusion[0].weight)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"actions": 0}, "takes actions, maze2d has images alone"),
+        ({"action_history": 4}, "is told the latest 5 actions; expected 1 or 4"),
+        ({"image": WORLDS["maze3d"].image}, "takes ImageFormat.*; expected ImageFormat"),
+    ],
+)
+def test_weights_that_know_other_things_are_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    config = LocalPoseConfig(WORLDS["maze2d"].image, width=0.03, actions=3, period_s=0.1, action_history=5)
+    save_checkpoint(tmp_path / f"{LOCAL}.safetensors", LocalPoseNetwork(config), LOCAL, "maze2d", {})
+    with pytest.raises(RecordingError, match=message):
+        begun_with(tmp_path, **changes)
 
 
 @pytest.mark.parametrize("count", [0, 13])
