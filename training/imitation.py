@@ -1,4 +1,4 @@
-"""Imitation of a teacher where the pupil gets to, not only where the teacher would have been.
+"""Imitation of a teacher where the pupil gets to, not only where the teacher would have been (DAgger).
 
 Ross et al., "A reduction of imitation learning and structured prediction to no-regret online learning" (2011): the
 pupil drives ever more of the way itself, the teacher says at every decision what it would have done, and the pupil

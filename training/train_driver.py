@@ -2,11 +2,10 @@
 
     python -m training.train_driver
 
-The reward is the distance travelled (paper, section 4.2). It begins with lessons of a teacher that knows the maze and
-drives for distance: turning about at the end of a long corridor costs before it pays, and was not found without them.
-Run again, it goes on after its last checkpoint, in mazes
-that it has not met. It ends with the weights written into the simulator's package. Progress goes to `metrics.csv` in
-its folder below `runs/`, beside `run.json`.
+The reward is the distance travelled (paper, section 4.2). It begins with lessons (DAgger) of a teacher that knows the
+maze and drives for distance: turning about at the end of a long corridor costs before it pays, and was not found
+without them. Run again, it goes on after its last checkpoint, in mazes that it has not met. It ends with the weights
+written into the simulator's package. Progress goes to `metrics.csv` in its folder below `runs/`, beside `run.json`.
 """
 
 from __future__ import annotations

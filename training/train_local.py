@@ -45,7 +45,7 @@ from training.streams import (
 )
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
 
-DRIFT_STEPS = 100
+RPE_STEPS = 100
 HEADING_WEIGHT = 3.0
 LIKELIHOOD_WEIGHT = 0.1
 _ONE_LOOK = 4
@@ -345,7 +345,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     final.load_state_dict(training.network.state_dict())
     metrics = measure(final, data.validation)
     if recorded is None:
-        metrics["drift_deg"] = heading_drift(final, data.validation)
+        metrics["rpe_100_deg"] = heading_rpe(final, data.validation)
     about = {} if recorded is None else {"data": recorded.about}
     details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", final, LOCAL, domain.name, details)
@@ -411,11 +411,11 @@ def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
 
 
 @torch.no_grad()
-def heading_drift(network: LocalPoseNetwork, episodes: list[Batch], steps: int = DRIFT_STEPS) -> float:
-    """What a network's headings drift in so many steps (RMS, deg), over all windows of that length in episodes.
+def heading_rpe(network: LocalPoseNetwork, episodes: list[Batch], steps: int = RPE_STEPS) -> float:
+    """Relative pose error of a network's headings over so many steps (RMS, deg), of all such windows in episodes.
 
-    Shorter episodes are one window each. Where errors of single steps are independent, it is theirs by the root of the
-    number of steps.
+    Shorter episodes are one window each. Where errors of single steps are independent, it is their RMS times the root
+    of the number of steps.
     """
     errors = [estimated(network, episode)[0][:, 2] - episode["relative"][:, 2] for episode in episodes]
     drifts = [se2.wrap(error).double().unfold(0, min(steps, len(error)), 1).sum(-1) for error in errors]

@@ -19,7 +19,7 @@ from training.train_local import (
     Arguments,
     SimulatedSteps,
     calibrated,
-    heading_drift,
+    heading_rpe,
     initial_network,
     measure,
     step_losses,
@@ -154,13 +154,18 @@ def test_a_component_that_was_not_learned_keeps_a_positive_deviation(network: Lo
     assert abs(measure(better, pairs)["bias_forward_m"]) < 1e-4
 
 
-def test_drift_adds_up_errors_that_last_and_not_those_that_cancel(network: LocalPoseNetwork) -> None:
+def test_rpe_adds_up_errors_that_last_and_not_those_that_cancel(network: LocalPoseNetwork) -> None:
     (pairs,) = pairs_with_truth(network, torch.ones(3), torch.zeros(3))
-    lasting = {**pairs, "relative": pairs["relative"] - torch.tensor([0.0, 0.0, 0.01])}
-    assert heading_drift(network, [lasting, lasting], 50) == pytest.approx(np.degrees(0.5), rel=1e-4)
-    sign = torch.tensor([1.0, -1.0]).repeat(100)[:, None]
-    cancelling = {**pairs, "relative": pairs["relative"] + sign * torch.tensor([0.0, 0.0, 0.01])}
-    assert heading_drift(network, [cancelling], 50) == pytest.approx(0.0, abs=1e-3)
+
+    def off(by: Tensor) -> Batch:
+        return {**pairs, "relative": pairs["relative"] + by * torch.tensor([0.0, 0.0, 0.01])}
+
+    # One to the left and one to the right: a window of both would have less.
+    lasting = [off(torch.ones(200, 1)), off(-torch.ones(200, 1))]
+    assert heading_rpe(network, lasting, 50) == pytest.approx(np.degrees(0.5), rel=1e-4)
+    assert heading_rpe(network, lasting, 300) == pytest.approx(np.degrees(2.0), rel=1e-4)
+    cancelling = [off(torch.tensor([1.0, -1.0]).repeat(100)[:, None])]
+    assert heading_rpe(network, cancelling, 50) == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(
