@@ -28,14 +28,15 @@ class DeepVOConfig:
     """What a DeepVO network is made of.
 
     ``width`` scales the channels of the convolutions and the units of the LSTM layers. ``relative_mean`` and
-    ``relative_std`` (m, m, rad) normalise the output. With ``symmetric`` the estimate is the mean of that of the frames
-    and that of their mirror images, as that of our local network.
+    ``relative_std`` (m, m, rad) normalise the output, to which ``relative_bias`` is added. With ``symmetric`` the
+    estimate is the mean of that of the frames and that of their mirror images, as that of our local network.
     """
 
     image: ImageFormat
     width: float
     relative_mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     relative_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    relative_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     symmetric: bool = False
 
     def __post_init__(self) -> None:
@@ -62,8 +63,10 @@ class DeepVO(nn.Module):
         self.pose = nn.Linear(units, 3)
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
+        self.register_buffer("relative_bias", torch.tensor(config.relative_bias), persistent=False)
         self.relative_mean: Tensor
         self.relative_std: Tensor
+        self.relative_bias: Tensor
 
     def forward(self, images: Tensor, state: State | None = None) -> tuple[Tensor, State]:
         """Estimate the motion between consecutive frames.
@@ -76,10 +79,11 @@ class DeepVO(nn.Module):
             Relative poses ``(sequences, steps, 3)`` of each frame in the one before (m, m, rad), and the state.
         """
         if self.training or not self.config.symmetric:
-            return self._estimate(images, state)
+            relative, after = self._estimate(images, state)
+            return relative + self.relative_bias, after
         relative, after = self._estimate(torch.cat((images, images.flip(-2))), state)
         seen, mirrored = relative.chunk(2)
-        return 0.5 * (seen + mirrored * mirrored.new_tensor([1.0, -1.0, -1.0])), after
+        return 0.5 * (seen + mirrored * mirrored.new_tensor([1.0, -1.0, -1.0])) + self.relative_bias, after
 
     def _estimate(self, images: Tensor, state: State | None) -> tuple[Tensor, State]:
         sequences, frames = images.shape[:2]

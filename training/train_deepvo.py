@@ -155,13 +155,14 @@ def calibrated(network: DeepVO, world: World, seeds: list[int]) -> DeepVOConfig:
     ]
     relative, truth = (np.stack(part) for part in zip(*episodes, strict=True))
     fit = fit_calibration(relative, truth)
-    mean, std = network.config.relative_mean, network.config.relative_std
+    mean, std, bias = network.config.relative_mean, network.config.relative_std, network.config.relative_bias
     # What was not learned at all may fit best mirrored; a deviation stays positive.
     gain = [max(one, 0.01) for one in fit["odometry_gain"]]
-    bias = (se2.g2r(torch.from_numpy(truth)).numpy() - gain * relative).mean(axis=(0, 1))
-    x, y, yaw = (float(g * m + b) for g, m, b in zip(gain, mean, bias, strict=True))
-    std_x, std_y, std_yaw = (g * s for g, s in zip(gain, std, strict=True))
-    return dataclasses.replace(network.config, relative_mean=(x, y, yaw), relative_std=(std_x, std_y, std_yaw))
+    rest = (se2.g2r(torch.from_numpy(truth)).numpy() - gain * relative).mean(axis=(0, 1))
+    scaled = np.array(gain) * np.array([mean, std, bias])
+    scaled[2] += rest
+    mean, std, bias = ((float(x), float(y), float(yaw)) for x, y, yaw in scaled)
+    return dataclasses.replace(network.config, relative_mean=mean, relative_std=std, relative_bias=bias)
 
 
 def main(arguments: Arguments) -> dict[str, float]:

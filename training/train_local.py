@@ -287,19 +287,21 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
     estimates, log_std = (torch.cat([part[k] for part in parts]).double() for k in (0, 1))
     truth = torch.cat([p["relative"] for p in pairs]).double()
     mean, std = list(network.config.relative_mean), list(network.config.relative_std)
+    bias = list(network.config.relative_bias)
     fits = torch.zeros_like(truth)
     for i in range(3):
         fitted, _ = np.polyfit(estimates[:, i].numpy(), truth[:, i].numpy(), 1)
         scale = max(fitted, 0.01)  # what was not learned at all may fit best mirrored; a deviation stays positive
-        bias = float((truth[:, i] - scale * estimates[:, i]).mean())
-        mean[i], std[i] = float(scale * mean[i] + bias), float(scale * std[i])
-        fits[:, i] = scale * estimates[:, i] + bias
+        rest = float((truth[:, i] - scale * estimates[:, i]).mean())
+        mean[i], std[i], bias[i] = float(scale * mean[i]), float(scale * std[i]), float(scale * bias[i] + rest)
+        fits[:, i] = scale * estimates[:, i] + rest
         log_std[:, i] += math.log(scale)
     deviation = ((fits - truth) / log_std.exp()).square().mean(0).sqrt().clamp(min=0.01).tolist()
     return dataclasses.replace(
         network.config,
         relative_mean=(mean[0], mean[1], mean[2]),
         relative_std=(std[0], std[1], std[2]),
+        relative_bias=(bias[0], bias[1], bias[2]),
         deviation_scale=(deviation[0], deviation[1], deviation[2]),
     )
 
@@ -373,7 +375,9 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         wanted = domain.action_history if domain.actions else 1
         if config.action_history not in (1, wanted):
             raise RecordingError(f"{folder} is told the latest {config.action_history} actions; expected 1 or {wanted}")
-        changes: dict[str, Any] = {"action_history": wanted, "deviation_scale": (1.0, 1.0, 1.0)}
+        # Calibrated they are anew.
+        changes: dict[str, Any] = {"deviation_scale": (1.0, 1.0, 1.0), "relative_bias": (0.0, 0.0, 0.0)}
+        changes["action_history"] = wanted
         if domain.mirrors:
             changes |= {"symmetric": True, "mirrored_actions": domain.mirrored_actions}
         changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s, **changes))

@@ -128,9 +128,21 @@ def test_calibration_removes_bias_and_scale(network: LocalPoseNetwork) -> None:
     pairs = pairs_with_truth(network, scale, bias)
     assert measure(network, pairs)["rmse_m"] > 0.05
     config = calibrated(network, pairs)
-    assert config.relative_mean == pytest.approx(tuple(bias.tolist()), abs=1e-4)
+    assert config.relative_bias == pytest.approx(tuple(bias.tolist()), abs=1e-4)
     assert config.relative_std == pytest.approx(tuple(scale.tolist()), rel=1e-3)
     better = LocalPoseNetwork(config).eval()
+    better.load_state_dict(network.state_dict())
+    metrics = measure(better, pairs)
+    assert metrics["rmse_m"] < 1e-4 and metrics["rmse_deg"] < 1e-2
+
+
+def test_calibration_of_a_symmetric_network_removes_what_is_to_one_side(network: LocalPoseNetwork) -> None:
+    symmetric = LocalPoseNetwork(
+        dataclasses.replace(network.config, symmetric=True, mirrored_actions=(0, 2, 1), relative_mean=(0.1, 0.02, 0.03))
+    ).eval()
+    symmetric.load_state_dict(network.state_dict())
+    pairs = pairs_with_truth(symmetric, torch.tensor([1.2, 0.9, 1.1]), torch.tensor([0.0, 0.01, -0.02]))
+    better = LocalPoseNetwork(calibrated(symmetric, pairs)).eval()
     better.load_state_dict(network.state_dict())
     metrics = measure(better, pairs)
     assert metrics["rmse_m"] < 1e-4 and metrics["rmse_deg"] < 1e-2

@@ -18,13 +18,15 @@ class LocalPoseConfig:
     """What a local pose network is made of.
 
     ``relative_mean`` and ``relative_std`` (m, m, rad) normalise the output: the network works on poses of mean 0 and
-    deviation 1, and gives SI units. ``width`` scales the channels of FlowNetS; ``actions`` is the number of discrete
-    actions, 0 for none, and ``action_history`` how many of the latest ones the network is told: in how a robot with
-    momentum moves, what it did before goes on. More than one of them pass through ``fusion_size`` hidden units. With
-    ``twist`` the network is told the mean velocity between the frames,
-    which it divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between frames in training.
-    With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror images, in which action
-    ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard deviations that the heads give.
+    deviation 1, and gives SI units. ``relative_bias`` (m, m, rad) is added to what it gives, in a symmetric network
+    too, where means to the sides cancel: a robot may turn a little more one way than its mirror image would. ``width``
+    scales the channels of FlowNetS; ``actions`` is the number of discrete actions, 0 for none, and ``action_history``
+    how many of the latest ones the network is told: in how a robot with momentum moves, what it did before goes on.
+    More than one of them pass through ``fusion_size`` hidden units. With ``twist`` the network is told the mean
+    velocity between the frames, which it divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between
+    frames in training. With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror
+    images, in which action ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard
+    deviations that the heads give.
     """
 
     image: ImageFormat
@@ -38,6 +40,7 @@ class LocalPoseConfig:
     symmetric: bool = False
     mirrored_actions: tuple[int, ...] = ()
     deviation_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    relative_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     twist: bool = False
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     action_history: int = 1
@@ -126,11 +129,13 @@ class LocalPoseNetwork(nn.Module):
                 nn.init.zeros_(parameter)  # it begins with what is seen
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
+        self.register_buffer("relative_bias", torch.tensor(config.relative_bias), persistent=False)
         self.register_buffer("log_deviation_scale", torch.tensor(config.deviation_scale).log(), persistent=False)
         self.register_buffer("mirrored_actions", torch.tensor((*config.mirrored_actions, NO_ACTION)), persistent=False)
         self.register_buffer("twist_scale", torch.tensor(config.twist_scale), persistent=False)
         self.relative_mean: Tensor
         self.relative_std: Tensor
+        self.relative_bias: Tensor
         self.log_deviation_scale: Tensor
         self.mirrored_actions: Tensor
         self.twist_scale: Tensor
@@ -154,7 +159,7 @@ class LocalPoseNetwork(nn.Module):
         actions = self._checked(actions, twist)
         if self.training or not self.config.symmetric:
             estimates = self._estimates(earlier, later, actions, twist)
-            return estimates.fused.mean, estimates.fused.log_std, estimates.feature
+            return estimates.fused.mean + self.relative_bias, estimates.fused.log_std, estimates.feature
         both = [torch.cat((frames, frames.flip(-2))) for frames in (earlier, later)]
         actions = actions if actions is None else torch.cat((actions, self.mirrored_actions[actions]))
         flip = self.relative_std.new_tensor([1.0, -1.0, -1.0])
@@ -162,12 +167,15 @@ class LocalPoseNetwork(nn.Module):
         estimates = self._estimates(both[0], both[1], actions, twist)
         of_both = (estimates.fused.mean, estimates.fused.log_std, estimates.feature)
         mean, log_std, feature = (values.chunk(2) for values in of_both)
-        return 0.5 * (mean[0] + mean[1] * flip), 0.5 * (log_std[0] + log_std[1]), feature[0]
+        return 0.5 * (mean[0] + mean[1] * flip) + self.relative_bias, 0.5 * (log_std[0] + log_std[1]), feature[0]
 
     def estimates(
         self, earlier: Tensor, later: Tensor, actions: Tensor | None = None, twist: Tensor | None = None
     ) -> StepEstimates:
-        """What is estimated with and without the earlier actions, of the frames as they are; arguments as above."""
+        """What is estimated with and without the earlier actions, of the frames as they are and without the bias.
+
+        Arguments as of ``forward``.
+        """
         return self._estimates(earlier, later, self._checked(actions, twist), twist)
 
     def _checked(self, actions: Tensor | None, twist: Tensor | None) -> Tensor | None:
