@@ -52,6 +52,14 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     toy.shrink(monkeypatch, 161, place_frames)
+    windows: list[tuple[int, ...]] = []
+    losses = train_local.step_losses
+
+    def noted(*values: Any) -> Any:
+        windows.append(values[4] if len(values) > 4 else (1,))
+        return losses(*values)
+
+    monkeypatch.setattr(train_local, "step_losses", noted)
     told = {"maze2d": 3}.get(world)  # of the latest actions; the others' number is the world's
     local_metrics = train_local.main(toy.local(world, tmp_path, action_history=told))
     place_metrics = train_place.main(toy.place(world, tmp_path))
@@ -80,8 +88,10 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
         assert str(tmp_path) not in json.dumps(description)
     # A calibrated network has no constant error on what it was calibrated with: the normalisation was changed for it.
     config = load_local(weights, world)[0].config
-    assert config.relative_mean[2] != 0.0
+    assert config.relative_bias[2] != 0.0
     assert config.action_history == {"maze2d": 3, "scan": 1, "maze3d": 12}[world]
+    # Steps alone of what is seen and in validation; the world's windows where earlier actions correct it.
+    assert set(windows) == {"maze2d": {(1,)}, "scan": {(1,)}, "maze3d": {(1,), (1, 4, 16)}}[world]
 
 
 def test_the_papers_form_trains_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
