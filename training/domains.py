@@ -16,8 +16,7 @@ class Domain:
 
     ``actions`` is the number of discrete actions (0: networks see images alone), ``mirrored_actions`` what each of them
     becomes in a mirror, ``action_history`` how many of the latest ones the local network is told, ``block_m`` the
-    length that errors of positions are measured by (a corridor's width). ``error_windows`` says over how many
-    consecutive steps errors of odometry are added up in training: beside those of single steps, these drift.
+    length that errors of positions are measured by (a corridor's width).
     ``place_radius_m`` and ``heading_limit_rad`` say how far two frames of one place may be apart and turned against
     each other, ``loop_views`` between how many pairs of frames a loop is measured, and ``registration`` how frames are
     registered, where they are scans with ranges good enough for it. ``reverses`` says that the robot may
@@ -43,7 +42,6 @@ class Domain:
     actions: int = 3
     mirrored_actions: tuple[int, ...] = MIRRORED_ACTIONS
     action_history: int = 1
-    error_windows: tuple[int, ...] = (1,)
     twist: bool = False
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     mirrors: bool = True

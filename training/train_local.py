@@ -337,7 +337,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         },
     )
     network, begun = initial_network(arguments, domain, steps)
-    training = LocalTraining(arguments, network, domain.error_windows)
+    # Pairs of recordings are shuffled one by one.
+    training = LocalTraining(arguments, network, world.error_windows if recorded is None else (1,))
     data = StreamedData(steps.pairs, steps.validation, arguments.workers)
     run.fit(training, data)
     if not run.is_first:

@@ -78,8 +78,9 @@ class World(Domain):
     mazes are drawn from. ``tables`` names the kinds of trajectories that results are given for, ``table_trajectories``
     says how many a table has and ``prefixes`` after how many steps their errors are given. ``simulator`` holds its
     settings that are not its own defaults. ``looks`` is what ``make_random`` draws beside a size, None: nothing, the
-    simulator's own looks. No driver here drives backwards,
-    whether the world ``reverses`` or not.
+    simulator's own looks. ``error_windows`` says over how many consecutive steps errors of odometry are added up in
+    training: beside those of single steps, these drift. No driver here drives backwards, whether the world ``reverses``
+    or not.
     """
 
     driver: str
@@ -91,6 +92,7 @@ class World(Domain):
     table_trajectories: int = 64
     prefixes: tuple[int, ...] = (250, 500, 750, 1000)
     looks: Looks | None = None
+    error_windows: tuple[int, ...] = (1,)
     simulator: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
