@@ -105,6 +105,8 @@ class Arguments(runs.TrainerArguments):
             )
         if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
             raise ValueError(f"action_history is {self.action_history}; expected 1 to {ACTION_HISTORY}")
+        if self.action_history is not None and self.without_action:
+            raise ValueError(f"action_history is {self.action_history} with without_action; expected one of the two")
         if self.error_windows is not None and (self.world is None or min(self.error_windows, default=0) < 1):
             given = f"{self.error_windows}{' with recordings' if self.world is None else ''}"
             raise ValueError(f"error_windows is {given}; expected numbers of steps, each at least 1, of a world")

@@ -235,3 +235,8 @@ def test_weights_that_know_other_things_are_refused(changes: dict[str, Any], mes
 def test_a_history_that_no_batch_tells_is_refused(count: int) -> None:
     with pytest.raises(ValueError, match=f"action_history is {count}; expected 1 to 12"):
         Arguments(world="maze3d", action_history=count)
+
+
+def test_a_history_of_actions_that_are_not_told_is_refused() -> None:
+    with pytest.raises(ValueError, match="action_history is 4 with without_action; expected one of the two"):
+        Arguments(world="maze3d", action_history=4, without_action=True)
