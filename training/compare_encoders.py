@@ -21,8 +21,9 @@ import tyro
 from ngo_estimator.checkpoint import load_local
 from training import runs, train_local
 from training.curves import write_at_once
-from training.encoder_measures import inference_ms, measured, pairs_a_second
+from training.encoder_measures import inference_ms, pairs_a_second
 from training.results_page import interval, markdown, number
+from training.validation_steps import measured
 from training.worlds import world_named
 
 NAME = "encoders"

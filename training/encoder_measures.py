@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +10,7 @@ import torch
 from ngo_estimator.local_pose_network import LocalPoseNetwork
 from training import train_local
 from training.curves import rows
-from training.statistics import mean_interval, rms_interval
 from training.streams import PairStream, action_histories, images_of, loader, simulate
-from training.validation_steps import estimated_steps, odometry_error, step_errors, true_steps, validation_episodes
 from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World
 
 _WARM_UP = 4  # batches: the process that simulates has started
@@ -55,19 +52,3 @@ def inference_ms(network: LocalPoseNetwork, world: World) -> float:
         network(*step)
         took.append(time.perf_counter() - started)
     return 1e3 * float(np.median(took[_UNTIMED:]))
-
-
-def measured(network: LocalPoseNetwork, world: World, mazes: int, frames: int) -> dict[str, Any]:
-    """RMSE of a step (m, deg) and the odometry's final error (% of the path) on validation mazes, with intervals."""
-    squares, steps, final_percent = [], [], []
-    for episode in validation_episodes(world, mazes, frames):
-        estimated, true = estimated_steps(network, world, episode), true_steps(episode)
-        squares.append(np.square(step_errors(estimated, true)).sum(axis=0))
-        steps.append(float(len(true)))
-        final_percent.append(odometry_error(estimated, true).final_percent)
-    totals, counts = np.array(squares), np.array(steps)
-    return {
-        "rmse_m": rms_interval(totals[:, 0], counts).as_json(),
-        "rmse_deg": rms_interval(totals[:, 1], counts).as_json(),
-        "final_percent": mean_interval(np.array(final_percent)).as_json(),
-    }

@@ -316,11 +316,15 @@ def main(arguments: Arguments) -> dict[str, float]:
         world = simulated_world(arguments)
         domain: Domain = world
         steps = SimulatedSteps(arguments, world)
+        windows = world.error_windows
+        told = {"action_history": world.action_history, "error_windows": list(windows)}
+        settings: dict[str, Any] | None = {**told, **world.stream_settings}
     else:
         domain = recorded.domain
         if arguments.action_history is not None:
             domain = dataclasses.replace(domain, action_history=arguments.action_history)
         steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
+        windows, settings = (1,), None  # pairs of recordings are shuffled one by one
     kind = "local-no_action" if arguments.without_action else "local"
     run = runs.Run(
         arguments.runs / domain.name / (kind if arguments.looks is None else f"{kind}-{arguments.looks}"),
@@ -330,17 +334,10 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
-        settings=None
-        if recorded is not None
-        else {
-            "action_history": world.action_history,
-            "error_windows": list(world.error_windows),
-            **world.stream_settings,
-        },
+        settings=settings,
     )
     network, begun = initial_network(arguments, domain, steps)
-    # Pairs of recordings are shuffled one by one.
-    training = LocalTraining(arguments, network, world.error_windows if recorded is None else (1,))
+    training = LocalTraining(arguments, network, windows)
     data = StreamedData(steps.pairs, steps.validation, arguments.workers)
     run.fit(training, data)
     if not run.is_first:
@@ -348,9 +345,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     training.cpu()
     final = LocalPoseNetwork(calibrated(training.network, steps.unseen())).eval()
     final.load_state_dict(training.network.state_dict())
-    metrics = measure(final, data.validation)
-    if recorded is None:
-        metrics["rpe_100_deg"] = heading_rpe(final, data.validation)
+    metrics = measure(final, data.validation, RPE_STEPS if recorded is None else 0)
     about = {} if recorded is None else {"data": recorded.about}
     details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
     save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", final, LOCAL, domain.name, details)
@@ -410,23 +405,23 @@ def _told(actions: int, twist: bool) -> str:
 
 
 @torch.no_grad()
-def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
-    """``step_metrics`` of a network over episodes."""
+def measure(network: LocalPoseNetwork, pairs: list[Batch], rpe_steps: int = 0) -> dict[str, float]:
+    """``step_metrics`` of a network over episodes.
+
+    With ``rpe_steps`` also the relative pose error of its headings over so many steps (RMS, deg), of all such windows
+    in episodes; shorter ones are one window each. Where errors of single steps are independent, it is their RMS times
+    the root of the number of steps.
+    """
     parts = [estimated(network, p)[:2] for p in pairs]
     truth = torch.cat([p["relative"] for p in pairs])
-    return step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
-
-
-@torch.no_grad()
-def heading_rpe(network: LocalPoseNetwork, episodes: list[Batch], steps: int = RPE_STEPS) -> float:
-    """Relative pose error of a network's headings over so many steps (RMS, deg), of all such windows in episodes.
-
-    Shorter episodes are one window each. Where errors of single steps are independent, it is their RMS times the root
-    of the number of steps.
-    """
-    errors = [estimated(network, episode)[0][:, 2] - episode["relative"][:, 2] for episode in episodes]
-    drifts = [se2.wrap(error).double().unfold(0, min(steps, len(error)), 1).sum(-1) for error in errors]
-    return float(torch.cat(drifts).square().mean().sqrt().rad2deg())
+    metrics = step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
+    if rpe_steps:
+        errors = [
+            se2.wrap(mean[:, 2] - p["relative"][:, 2]).double() for (mean, _), p in zip(parts, pairs, strict=True)
+        ]
+        drifts = [error.unfold(0, min(rpe_steps, len(error)), 1).sum(-1) for error in errors]
+        metrics[f"rpe_{rpe_steps}_deg"] = float(torch.cat(drifts).square().mean().sqrt().rad2deg())
+    return metrics
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from ngo_estimator.local_pose_network import LocalPoseNetwork
 from training import streams
 from training.metrics import TrajectoryError, trajectory_error
 from training.online_estimate import with_origin
+from training.statistics import mean_interval, rms_interval
 from training.worlds import VALIDATION_SEEDS, World
 
 if TYPE_CHECKING:
@@ -57,3 +58,34 @@ def odometry_error(steps: np.ndarray, true: np.ndarray) -> TrajectoryError:
     """The error of the trajectory of steps ``(steps, 3)`` against that of the true ones."""
     estimate, truth = (with_origin(se2.r2g(torch.from_numpy(one)).numpy()) for one in (steps, true))
     return trajectory_error(estimate, truth)
+
+
+def measured(
+    network: LocalPoseNetwork, world: World, mazes: int, frames: int, rpe_steps: int | None = None
+) -> dict[str, Any]:
+    """Errors of a local network's odometry on validation mazes, with intervals over them.
+
+    RMSE of a step (m, deg) and the final error (% of the path); with ``rpe_steps`` also the relative pose error of the
+    heading over so many steps (deg, RMS of all such windows).
+    """
+    squares, steps, over_many, windows, final_percent = [], [], [], [], []
+    for episode in validation_episodes(world, mazes, frames):
+        estimated, true = estimated_steps(network, world, episode), true_steps(episode)
+        errors = step_errors(estimated, true)
+        squares.append(np.square(errors).sum(axis=0))
+        steps.append(float(len(true)))
+        final_percent.append(odometry_error(estimated, true).final_percent)
+        if rpe_steps is not None:
+            sums = np.cumsum([0.0, *errors[:, 1]])
+            drifts = sums[rpe_steps:] - sums[:-rpe_steps]
+            over_many.append(np.square(drifts).sum())
+            windows.append(float(len(drifts)))
+    totals, counts = np.array(squares), np.array(steps)
+    found = {
+        "rmse_m": rms_interval(totals[:, 0], counts).as_json(),
+        "rmse_deg": rms_interval(totals[:, 1], counts).as_json(),
+        "final_percent": mean_interval(np.array(final_percent)).as_json(),
+    }
+    if rpe_steps is not None:
+        found[f"rpe_{rpe_steps}_deg"] = rms_interval(np.array(over_many), np.array(windows)).as_json()
+    return found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ngo_sim.episodes import Episode
-from training import evaluate_odometry
+from training import evaluate_odometry, validation_steps
 from training.evaluate_odometry import Arguments
 from training.validation_steps import true_steps
 
@@ -17,7 +17,7 @@ def test_a_heading_error_that_lasts_adds_up(
     def steps(_: object, __: object, episode: Episode) -> np.ndarray:
         return true_steps(episode) + np.array([0.0, 0.0, 1e-3])
 
-    monkeypatch.setattr(evaluate_odometry, "estimated_steps", steps)
+    monkeypatch.setattr(validation_steps, "estimated_steps", steps)
     result = evaluate_odometry.main(Arguments("maze2d", driver="random", mazes=2, frames=130))
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == result
     assert (result["driver"], result["mazes"], result["frames"]) == ("random", 2, 130)

@@ -19,7 +19,6 @@ from training.train_local import (
     Arguments,
     SimulatedSteps,
     calibrated,
-    heading_rpe,
     initial_network,
     measure,
     step_losses,
@@ -174,10 +173,10 @@ def test_rpe_adds_up_errors_that_last_and_not_those_that_cancel(network: LocalPo
 
     # One to the left and one to the right: a window of both would have less.
     lasting = [off(torch.ones(200, 1)), off(-torch.ones(200, 1))]
-    assert heading_rpe(network, lasting, 50) == pytest.approx(np.degrees(0.5), rel=1e-4)
-    assert heading_rpe(network, lasting, 300) == pytest.approx(np.degrees(2.0), rel=1e-4)
+    assert measure(network, lasting, 50)["rpe_50_deg"] == pytest.approx(np.degrees(0.5), rel=1e-4)
+    assert measure(network, lasting, 300)["rpe_300_deg"] == pytest.approx(np.degrees(2.0), rel=1e-4)
     cancelling = [off(torch.tensor([1.0, -1.0]).repeat(100)[:, None])]
-    assert heading_rpe(network, cancelling, 50) == pytest.approx(0.0, abs=1e-3)
+    assert measure(network, cancelling, 50)["rpe_50_deg"] == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,7 @@ class LocalPoseNetwork(nn.Module):
         self.translation = nn.Linear(config.feature_size + told, 4)
         self.rotation = nn.Linear(config.feature_size + told, 2)
         if config.action_history > 1:
-            known = 6 + config.feature_size + told - config.actions + config.actions * config.action_history
+            known = 6 + config.feature_size + config.actions * config.action_history + 3 * config.twist
             self.fusion = nn.Sequential(
                 nn.Linear(known, config.fusion_size),
                 nn.ReLU(),
