@@ -36,7 +36,8 @@ demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 
 	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
 
 train: build ## every network of a world, into the estimator's package: WORLD=maze3d|maze2d|scan, or DATA="a.mcap b.mcap" NAME=my_robot
-	@$(OPEN) && for script in train_local train_place featurise train_optimizer evaluate; do \
+	@$(OPEN) && for script in train_local train_place featurise $(if $(filter maze3d-,$(WORLD)-$(DATA)),train_smoother) \
+		train_optimizer evaluate; do \
 		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) || exit; done
 
 results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d

@@ -25,9 +25,9 @@ class Domain:
 
     What an optimizer here begins with: ``robust`` says whether the loops' gates start from a robust kernel or from
     nothing, ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart`` meta-poses from each other and
-    ``max_loops`` of a trajectory. It is trained for ``optimizer_epochs``, the first ``single_share`` of them with one
-    iteration where it closes loops, and errors count by their square below ``loss_scale``: so many corridor widths, and
-    as many fifths of a radian.
+    ``max_loops`` of a trajectory, and ``smoothing`` says whether its odometry is smoothed. It is trained for
+    ``optimizer_epochs``, the first ``single_share`` of them with one iteration where it closes loops, and errors count
+    by their square below ``loss_scale``: so many corridor widths, and as many fifths of a radian.
     """
 
     name: str
@@ -49,6 +49,7 @@ class Domain:
     loops_per_pose: int = LoopSearch.per_pose
     max_loops: int = LoopSearch.most
     loops_apart: int = LoopSearch.min_apart
+    smoothing: bool = False
     optimizer_epochs: int = 6
     single_share: float = 0.0
     loss_scale: float = 0.1

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,10 +13,11 @@ import torch
 from torch import Tensor
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import load_optimizer, load_place
+from ngo_estimator.checkpoint import load_optimizer, load_place, load_smoother
 from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to_read
 from ngo_estimator.loop_closure import Loops, LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.odometry_smoothing import OdometrySmoother
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import loop_factors
@@ -74,10 +76,16 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
     place, description = load_place(sources.networks, sources.world.name)
     if row == "registered":
         return [Estimator(lambda arrays: registered(arrays, place.pair_head), f"{row} {description['sha256']}")]
-    form = "compass" if kind.compass else "registered" if kind.registered else "loops"
+    identity, smoother = f"{row} {description['sha256']}", None
+    if kind.smoothed:
+        smoother, smooths = load_smoother(sources.networks, sources.world.name)
+        identity += f" {smooths['sha256']}"
+        if row == "smoothed":
+            return [Estimator(partial(smoothed, smoother), identity)]
+    form = "compass" if kind.compass else "registered" if kind.registered else "smoothed" if kind.smoothed else "loops"
     settings = load_settings(sources.settings_file(form))
-    identity = f"{row} {json.dumps(dataclasses.asdict(settings))} {description['sha256']}"
-    return [Estimator(pose_graph(row, settings, place.pair_head, sources.world.block_m), identity)]
+    poses = pose_graph(row, settings, place.pair_head, sources.world.block_m, smoother=smoother)
+    return [Estimator(poses, f"{identity} {json.dumps(dataclasses.asdict(settings))}")]
 
 
 def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
@@ -96,6 +104,12 @@ def registered(arrays: Arrays, pair_head: PairHead) -> np.ndarray:
     seen = seen_in(prefix(arrays, _whole(arrays["relative"].shape[1], _BLOCK)))
     steps, _ = loop_factors.registered_odometry(pair_head, seen, LoopSearch(registrations=REGISTRATIONS), _BLOCK)
     return _with_tail(se2.r2g(_float64(steps)), _float64(arrays["relative"])).numpy()
+
+
+def smoothed(smoother: OdometrySmoother, arrays: Arrays) -> np.ndarray:
+    """The odometry as our optimizer smooths it, from what was seen of each trajectory and nothing that follows."""
+    steps, _ = loop_factors.smoothed_odometry(smoother, arrays["relative"], arrays["log_std"], arrays["motion"])
+    return se2.r2g(_float64(steps)).numpy()
 
 
 def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
@@ -181,10 +195,12 @@ def pose_graph(
     pair_head: PairHead,
     block_m: float,
     known: Callable[[LoopFactors, np.ndarray], LoopFactors] | None = None,
+    smoother: OdometrySmoother | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
     """The classical rows: GTSAM with the loops that are found (and a compass), or with those that are known.
 
-    ``known`` makes other loops of those of a trajectory and its true poses.
+    ``known`` makes other loops of those of a trajectory and its true poses, ``smoother`` the odometry of a row that
+    takes it smoothed.
     """
 
     def poses(arrays: Arrays) -> np.ndarray:
@@ -193,6 +209,8 @@ def pose_graph(
         steps = whole["relative"], whole["log_std"]
         if ROWS[row].registered:
             steps = loop_factors.registered_odometry(pair_head, seen, settings.search, settings.block)
+        if smoother is not None:
+            steps = loop_factors.smoothed_odometry(smoother, *steps, whole["motion"])
         odometry = list(zip(*steps, strict=True))
         if row == "oracle":
             solved = [optimize_exact(*one, true, settings) for one, true in zip(odometry, truth, strict=True)]

@@ -41,6 +41,8 @@ COLORS = {
     "gtsam": "#444444",
     "registered": "#b8860b",
     "gtsam_registered": "#1a9988",
+    "smoothed": "#b8860b",
+    "gtsam_smoothed": "#1a9988",
     "true_pairs": "#bcbd22",
     "oracle": "#9a9a9a",
     "end_to_end": "#e377c2",
@@ -58,6 +60,8 @@ MAIN_ROWS = (
     "ngo_1",
     "registered",
     "gtsam_registered",
+    "smoothed",
+    "gtsam_smoothed",
     "ngo_5",
     "ngo_5_compass",
 )

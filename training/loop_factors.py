@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch, find_loops, fused_measurements
+from ngo_estimator.odometry_smoothing import OdometrySmoother
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
 from ngo_estimator.registered_odometry import registered_steps
@@ -72,6 +73,15 @@ def registered_odometry(
     parts = [part.registered(pair_head, search, block) for part in _parts(seen)]
     steps, log_std = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
     return steps, log_std
+
+
+def smoothed_odometry(
+    smoother: OdometrySmoother, relative: np.ndarray, log_std: np.ndarray, motion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and logarithms of deviations ``(trajectories, steps, 3)`` as our optimizer smooths them."""
+    with torch.inference_mode():
+        steps, deviations = smoother(_float32(relative), _float32(log_std), _float32(motion))
+    return steps.numpy(), deviations.numpy()
 
 
 def found_loops(pair_head: PairHead, seen: Seen, search: LoopSearch, block: int = 8) -> list[LoopFactors]:

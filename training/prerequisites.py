@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
 from ngo_estimator.compass import COMPASS
 from training import (
     featurise,
@@ -24,6 +24,7 @@ from training import (
     train_local,
     train_optimizer,
     train_place,
+    train_smoother,
     tune_pose_graph,
 )
 from training.curves import write_at_once
@@ -42,6 +43,7 @@ class Scripts:
     compass: train_compass.Arguments = field(default_factory=lambda: train_compass.Arguments(world="maze2d"))
     features: featurise.Arguments = field(default_factory=lambda: featurise.Arguments(world="maze2d"))
     optimizer: train_optimizer.Arguments = field(default_factory=lambda: train_optimizer.Arguments(world="maze2d"))
+    smoother: train_smoother.Arguments = field(default_factory=lambda: train_smoother.Arguments(world="maze3d"))
     pose_graph: tune_pose_graph.Arguments = field(default_factory=lambda: tune_pose_graph.Arguments(world="maze2d"))
     speed: throughput.Arguments = field(default_factory=lambda: throughput.Arguments(world="maze2d"))
     deepvo: train_deepvo.Arguments = field(default_factory=lambda: train_deepvo.Arguments(world="maze3d"))
@@ -71,6 +73,7 @@ def prepare(sources: Sources, wanted: Wanted, scripts: Scripts) -> None:
     for step in (
         *_networks(sources, scripts),
         *_features(sources, wanted, scripts, (_TRAIN, _VALIDATION, wanted.split)),
+        *_smoother(sources, scripts),
         *_settings(sources, scripts),
         *_optimizers(sources, wanted, scripts),
         *_end_to_end(sources, wanted, scripts),
@@ -119,9 +122,21 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
             yield Step(f"the feature store {store}", _whole(sources, store), _call(featurise.main, arguments))
 
 
+def _smoother(sources: Sources, scripts: Scripts) -> Iterator[Step]:
+    if sources.world.smoothing:
+        common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
+        arguments = replace(scripts.smoother, weights=sources.weights, out=sources.weights, **common)
+        yield Step("the odometry smoother", _exists(sources, SMOOTHER), lambda: train_smoother.main(arguments))
+
+
 def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-    known = {"loops": True, "registered": sources.world.registration is not None, "compass": sources.has_compass}
+    known = {
+        "loops": True,
+        "registered": sources.world.registration is not None,
+        "smoothed": sources.world.smoothing,
+        "compass": sources.has_compass,
+    }
     for form in (form for form in tune_pose_graph.FORMS if known[form]):
         changes = {**common, "form": form}
         arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)

@@ -16,7 +16,8 @@ class Row:
 
     ``form``, ``iterations`` and ``learning_rate`` (None: the script's own) are what is trained for it, with several
     seeds. With ``compass`` it takes the readings of a compass. With ``own_networks`` all its networks are its own, and
-    so are its features. ``registered`` is what takes the odometry that was registered again, without our optimizer.
+    so are its features. ``registered`` is what takes the odometry that was registered again, without our optimizer, and
+    ``smoothed`` what takes the odometry as our optimizer smooths it.
     ``odometry`` is the kind of a network of its own whose relative poses are all there is to it. ``worlds`` have the
     row; none: all of them.
     """
@@ -28,6 +29,7 @@ class Row:
     learning_rate: float | None = None
     own_networks: bool = False
     registered: bool = False
+    smoothed: bool = False
     odometry: str | None = None
     worlds: tuple[str, ...] = ()
 
@@ -39,6 +41,7 @@ ROWS = {
     "local": Row("odometry of the local network"),
     "local_calibrated": Row("the same, with a constant bias and gain fitted on validation"),
     "registered": Row("odometry, each meta-step measured again by registering scans; no loops", registered=True),
+    "smoothed": Row("odometry, smoothed as in our optimizer; no loops", smoothed=True),
     "local_no_action": Row(
         "odometry of a local network that is not told the actions", odometry=LOCAL, worlds=("maze3d",)
     ),
@@ -51,6 +54,7 @@ ROWS = {
     "end_to_end": Row("`ngo_5` of seed 0, all networks fine-tuned together", own_networks=True),
     "gtsam": Row("robust pose graph (GTSAM), same odometry and loops, tuned on validation"),
     "gtsam_registered": Row("`gtsam` on the odometry of `registered`, with settings of its own", registered=True),
+    "gtsam_smoothed": Row("`gtsam` on the odometry of `smoothed`, with settings of its own", smoothed=True),
     "true_pairs": Row("GTSAM with true revisits, measured by our pair head"),
     "oracle": Row("GTSAM with true revisits, measured exactly"),
     "ngo_1_compass": Row("`ngo_1` with a compass", "loops", 1, compass=True, learning_rate=1e-4, worlds=COMPASS_WORLDS),
@@ -64,7 +68,9 @@ def rows_of(world: World) -> list[str]:
     return [
         name
         for name, row in ROWS.items()
-        if (not row.worlds or world.name in row.worlds) and (world.registration or not row.registered)
+        if (not row.worlds or world.name in row.worlds)
+        and (world.registration or not row.registered)
+        and (world.smoothing or not row.smoothed)
     ]
 
 

@@ -17,6 +17,7 @@ Table = Mapping[str, Sequence[Measured]]
 
 PAIRS = (
     ("local", "local_calibrated"),
+    ("smoothed", "local"),
     ("local_no_action", "local"),
     ("deepvo", "local"),
     ("paper_5", "local"),
@@ -25,12 +26,14 @@ PAIRS = (
     ("ngo_1", "local"),
     ("ngo_5", "local"),
     ("ngo_5", "deepvo"),
+    ("ngo_5", "smoothed"),
     ("ngo_5", "ngo_1"),
     ("ngo_5", "paper_5"),
     ("ngo_5", "gauss_newton"),
     ("ngo_5", "registered"),
     ("ngo_5", "gtsam"),
     ("ngo_5", "gtsam_registered"),
+    ("ngo_5", "gtsam_smoothed"),
     ("ngo_5", "oracle"),
     ("gtsam", "oracle"),
     ("end_to_end", "ngo_5"),

@@ -13,29 +13,35 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import lightning
-import numpy as np
 import torch
 import tyro
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
-from torch.utils.data import DataLoader
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
+from ngo_estimator.checkpoint import (
+    OPTIMIZER,
+    CheckpointError,
+    load_local,
+    load_optimizer,
+    load_place,
+    load_smoother,
+    save_checkpoint,
+)
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.domains import Domain
 from training.featurise import check_networks
 from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
-from training.streams import Batch, Share
-from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, fixes_of, loops_of
+from training.streams import Batch
+from training.trajectories import StoredTrajectories, StretchData, correction_scale, fixes_of, loops_of, rmse_figures
 from training.worlds import WorldName, world_named
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
-_FEWEST_STEPS = 8  # of an epoch
 _LEAST_GAIN = 0.1
 """Of loops on the validation part of recordings, which is small: less may be chance, and do harm on a longer way."""
 
@@ -56,6 +62,8 @@ class Arguments(runs.TrainerArguments):
     """Whether the loops' gates start from a robust kernel, or from nothing; by default as suits the world."""
     compass: bool = False
     """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
+    smoothing: bool | None = None
+    """Whether the odometry is smoothed before loops are closed; by default as suits the world."""
     width: int = 64
     """Channels of aggregation and optimizer."""
     loops_per_pose: int | None = None
@@ -121,6 +129,8 @@ class OptimizerTraining(lightning.LightningModule):
     def __init__(self, arguments: Arguments, optimizer: NeuralGraphOptimizer, domain: Domain) -> None:
         super().__init__()
         self.arguments, self.optimizer, self.domain = arguments, optimizer, domain
+        if optimizer.config.smoother is not None:
+            optimizer.smoother.requires_grad_(False)  # it has learned what it can, at a rate of its own
 
     def forward(self, batch: Batch) -> Any:
         fixes = fixes_of(batch, self.optimizer.block, self.domain.block_m)
@@ -152,15 +162,15 @@ class OptimizerTraining(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, _: int) -> None:
         for name, poses in (("odometry", se2.r2g(batch["odometry"])), ("corrected", self(batch).poses)):
-            error = (poses - batch["truth"])[..., :2].norm(dim=-1).square().mean(dim=1).sqrt()
-            heading = (poses - batch["truth"])[..., 2].square().mean(dim=1).sqrt().rad2deg()
-            figures = {f"{name}_m": error.mean(), f"{name}_deg": heading.mean()}
-            self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(error), sync_dist=True)
+            figures = rmse_figures(name, poses, batch["truth"])
+            self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(poses), sync_dist=True)
 
     def configure_optimizers(self) -> Any:
         slow: list[nn.Parameter] = []
         fast: list[nn.Parameter] = []
         for name, parameter in self.optimizer.named_parameters():
+            if not parameter.requires_grad:
+                continue
             # Single numbers that start from zero, and hold the rest back until they move.
             (fast if name in ("place_gain", "loop_gain") else slow).append(parameter)
         rate = self.arguments.learning_rate
@@ -171,31 +181,11 @@ class OptimizerTraining(lightning.LightningModule):
         return runs.one_cycle(optimizer, self.trainer)
 
 
-class _Data(lightning.LightningDataModule):
-    def __init__(self, arguments: Arguments, train: StoredTrajectories, validation: StoredTrajectories) -> None:
-        super().__init__()
-        self.arguments, self.train = arguments, train
-        rows = np.array_split(np.arange(len(validation)), max(1, len(validation) // 8))
-        self.fixed = [validation.batch(chosen.tolist(), 0, validation.steps) for chosen in rows]
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        a, trainer = self.arguments, self.trainer
-        share = Share(trainer.global_rank, trainer.world_size)
-        steps, batch_size = a.steps, a.batch_size
-        if a.world is None:  # recordings have few stretches
-            steps, batch_size = min(steps, max(_FEWEST_STEPS, len(self.train))), min(batch_size, len(self.train))
-        data = RandomStretches(self.train, steps, batch_size, a.seed, trainer.current_epoch, share)
-        return DataLoader(data, batch_size=None)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.fixed, batch_size=None)  # type: ignore[arg-type]
-
-
 class Choices(NamedTuple):
     """The arguments that are the domain's unless they are given."""
 
     robust: bool
+    smoothing: bool
     loops_per_pose: int
     max_loops: int
     epochs: int
@@ -206,19 +196,25 @@ def choices(arguments: Arguments, domain: Domain) -> Choices:
     given = arguments
     return Choices(
         domain.robust if given.robust is None else given.robust,
+        domain.smoothing and given.form == "loops" if given.smoothing is None else given.smoothing,
         domain.loops_per_pose if given.loops_per_pose is None else given.loops_per_pose,
         domain.max_loops if given.max_loops is None else given.max_loops,
         domain.optimizer_epochs if given.epochs is None else given.epochs,
     )
 
 
-def config_of(arguments: Arguments, domain: Domain, scale: tuple[float, float, float]) -> NeuralGraphOptimizerConfig:
+def config_of(
+    arguments: Arguments,
+    domain: Domain,
+    scale: tuple[float, float, float],
+    smoother: SmootherConfig | None = None,
+) -> NeuralGraphOptimizerConfig:
     """What the optimizer is made of; ``scale`` is the typical error of the odometry over a meta-pose."""
     local, _ = load_local(arguments.weights / domain.name, domain.name)
     aggregation = PoseAggregationConfig(
         motion_feature_size=local.config.feature_size, width=arguments.width, relative_std=local.config.relative_std
     )
-    changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale}
+    changes: dict[str, Any] = {"iterations": arguments.iterations, "correction_std": scale, "smoother": smoother}
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
     place, _ = load_place(arguments.weights / domain.name, domain.name)
@@ -278,9 +274,14 @@ def main(arguments: Arguments) -> dict[str, float]:
         settings={"single_share": domain.single_share, "loss_scale": domain.loss_scale},
     )
     if optimizer is None:
-        optimizer = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train)))
+        smoother = _smoother(folder, domain.name, local_description, about) if arguments.smoothing else None
+        config = config_of(arguments, domain, correction_scale(train), None if smoother is None else smoother.config)
+        optimizer = NeuralGraphOptimizer(config)
+        if smoother is not None:
+            optimizer.smoother.load_state_dict(smoother.state_dict())
     training = OptimizerTraining(arguments, optimizer, domain)
-    data = _Data(arguments, train, validation)
+    few = recorded is not None
+    data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)
     metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
     if not run.is_first:
@@ -296,6 +297,18 @@ def main(arguments: Arguments) -> dict[str, float]:
     path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
     save_checkpoint(path, optimizer.cpu(), OPTIMIZER, domain.name, details)
     return metrics
+
+
+def _smoother(folder: Path, name: str, local_description: dict[str, Any], about: dict[str, Any]) -> OdometrySmoother:
+    """The smoother in a folder, whose hash goes into ``about``; one of other odometry raises ``CheckpointError``."""
+    smoother, description = load_smoother(folder, name)
+    if description["local_pose_network_sha256"] != local_description["sha256"]:
+        raise CheckpointError(
+            f"{folder}: the odometry smoother was trained on another local network than the one beside it; train it "
+            "again"
+        )
+    about["odometry_smoother_sha256"] = description["sha256"]
+    return smoother
 
 
 def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], why: str) -> dict[str, float]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, load_description
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER, load_description
 from ngo_estimator.compass import COMPASS
 from training.deepvo import DEEPVO
 from training.rows import ROWS, Sources, rows_of, trainings_of
@@ -18,7 +18,7 @@ def trainings_json(sources: Sources, seeds: int) -> dict[str, Any]:
     """Command, time, throughput and memory of each training, as far as the JSON beside the weights says."""
     name = sources.world.name
     result: dict[str, Any] = {}
-    for kind in (LOCAL, PLACE):
+    for kind in (LOCAL, PLACE, *((SMOOTHER,) if sources.world.smoothing else ())):
         result[kind] = _kept(load_description(sources.networks / f"{kind}.safetensors", kind, name))
     if sources.has_compass:
         path = sources.compass_weights / name / f"{COMPASS}.safetensors"

@@ -6,9 +6,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import lightning
 import numpy as np
 import torch
-from torch.utils.data import IterableDataset
+from torch.utils.data import DataLoader, IterableDataset
 
 from ngo_estimator import se2
 from ngo_estimator.compass_closure import CompassFixes, compass_fixes, frames_to_read
@@ -20,7 +21,8 @@ from training.featurise import open_store
 from training.streams import ALL, Batch, Share
 
 _LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
-_TOGETHER = 8  # trajectories that are searched for loops at once
+_TOGETHER = 8  # trajectories that are searched for loops, or measured, at once
+_FEWEST_BATCHES = 8  # of an epoch
 _STEPWISE = ("relative", "log_std", "motion", "truth")
 _REGISTERED = ("relative", "log_std")
 _COMPASS = ("compass", "compass_log_scale")
@@ -178,15 +180,58 @@ class RandomStretches(IterableDataset[Batch]):
             yield data.batch(chosen.tolist(), start, length)
 
 
-def correction_scale(data: StoredTrajectories) -> tuple[float, float, float]:
-    """Root mean square (m, m, rad) of the odometry's error over a meta-pose."""
+class StretchData(lightning.LightningDataModule):
+    """``RandomStretches`` to train on, and whole trajectories to be measured on.
+
+    Args:
+        steps, batch_size: batches in an epoch, and stretches in a batch.
+        few: whether the trajectories are few, as of recordings: then a batch has at most as many stretches as there
+            are trajectories, and an epoch a batch for each, but ``_FEWEST_BATCHES`` at least.
+    """
+
+    def __init__(
+        self,
+        train: StoredTrajectories,
+        validation: StoredTrajectories,
+        steps: int,
+        batch_size: int,
+        seed: int,
+        few: bool = False,
+    ) -> None:
+        super().__init__()
+        self._train, self._seed = train, seed
+        self._steps = min(steps, max(_FEWEST_BATCHES, len(train))) if few else steps
+        self._batch_size = min(batch_size, len(train)) if few else batch_size
+        rows = np.array_split(np.arange(len(validation)), max(1, len(validation) // _TOGETHER))
+        self.validation = [validation.batch(chosen.tolist(), 0, validation.steps) for chosen in rows]
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        assert self.trainer is not None
+        share = Share(self.trainer.global_rank, self.trainer.world_size)
+        epoch = self.trainer.current_epoch
+        data = RandomStretches(self._train, self._steps, self._batch_size, self._seed, epoch, share)
+        return DataLoader(data, batch_size=None)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation, batch_size=None)  # type: ignore[arg-type]
+
+
+def rmse_figures(name: str, poses: torch.Tensor, truth: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Mean RMSE of trajectories ``(batch, steps, 3)``: ``NAME_m`` of positions, ``NAME_deg`` of headings."""
+    error = poses - truth
+    position = error[..., :2].square().sum(-1).mean(1).sqrt()
+    heading = error[..., 2].square().mean(1).sqrt().rad2deg()
+    return {f"{name}_m": position.mean(), f"{name}_deg": heading.mean()}
+
+
+def correction_scale(data: StoredTrajectories, steps: int | None = None) -> tuple[float, float, float]:
+    """Root mean square (m, m, rad) of the odometry's error over so many steps; None: over a meta-pose."""
+    steps = data.block if steps is None else steps
     total, count = torch.zeros(3), 0
     for k in range(len(data)):
-        batch = data.batch([k], 0, data.steps)
-        error = poses_in_blocks(batch["relative"], data.block)[..., -1, :] - se2.g2r(
-            batch["truth"][:, data.block - 1 :: data.block]
-        )
-        error = se2.wrapped(error).square()
+        batch = data.batch([k], 0, data.steps // steps * steps)
+        truth = se2.g2r(batch["truth"][:, steps - 1 :: steps])
+        error = se2.wrapped(poses_in_blocks(batch["relative"], steps)[..., -1, :] - truth).square()
         total, count = total + error.sum(dim=(0, 1)), count + error.shape[1]
     x, y, yaw = (total / count).sqrt().tolist()
     return x, y, yaw

@@ -20,14 +20,15 @@ import tyro
 from tqdm import tqdm
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import load_place
+from ngo_estimator.checkpoint import load_place, load_smoother
 from ngo_estimator.compass_closure import CompassFixes
 from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.odometry_smoothing import OdometrySmoother
 from ngo_estimator.place_encoder import PairHead
 from training import runs
 from training.compass_factors import found_fixes
 from training.featurise import open_store
-from training.loop_factors import LoopFactors, Seen, found_loops, registered_odometry
+from training.loop_factors import LoopFactors, Seen, found_loops, registered_odometry, smoothed_odometry
 from training.metrics import trajectory_error
 from training.pose_graph import PoseGraphSettings, optimize
 from training.worlds import world_named
@@ -68,8 +69,9 @@ COMPASS_GRID: tuple[tuple[dict[str, Any], ...], ...] = (
 )
 """The same for the pose graph with a compass, which begins with what is best without."""
 
+_ARRAYS = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
 _COMPASS = ("compass", "compass_log_scale")
-FORMS = ("loops", "registered", "compass")
+FORMS = ("loops", "registered", "smoothed", "compass")
 REGISTRATIONS = 5
 """Steps of each registration for the pose graph, where scans are registered: as many as for our optimizer."""
 
@@ -84,13 +86,13 @@ class Arguments:
     """World to tune for."""
     trajectories: int = 0
     """Validation trajectories of each table of results; 0 for all."""
-    form: Literal["loops", "registered", "compass"] = "loops"
-    """The graph of odometry and loops; that on odometry that was registered again; or the first with a compass, from
-    the settings that are best without."""
+    form: Literal["loops", "registered", "smoothed", "compass"] = "loops"
+    """The graph of odometry and loops; that on odometry that was registered again, or as our optimizer smooths it; or
+    the first with a compass, from the settings that are best without."""
     passes: int = 2
     """How often the search goes over all groups at most."""
     weights: Path = runs.WEIGHTS
-    """Folder with WORLD/place_encoder.safetensors."""
+    """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
     out: Path = runs.ROOT / "training" / "results"
     """Folder that gets WORLD.gtsam.json, of another form WORLD.gtsam_FORM.json."""
     runs: Path = runs.ROOT / "runs"
@@ -101,9 +103,11 @@ class Objective:
     """Mean position RMSE (m) of the pose graph over trajectories, as a function of its settings.
 
     Args:
-        arrays: ``relative``, ``log_std``, ``codes``, ``origin_code`` and ``truth`` of a feature store.
+        arrays: ``relative``, ``log_std``, ``codes``, ``origin_code`` and ``truth`` of a feature store, and ``motion``
+            for a smoother.
         compass: readings for each trajectory.
         registered: whether the graph's odometry is registered again.
+        smoother: what smooths it, if anything.
     """
 
     def __init__(
@@ -112,8 +116,9 @@ class Objective:
         pair_head: PairHead,
         compass: list[CompassFixes] | None = None,
         registered: bool = False,
+        smoother: OdometrySmoother | None = None,
     ) -> None:
-        self.arrays, self._pair_head, self._registered = arrays, pair_head, registered
+        self.arrays, self._pair_head, self._registered, self._smoother = arrays, pair_head, registered, smoother
         self._odometry: tuple[np.ndarray, np.ndarray] | None = None
         self._compass: Sequence[CompassFixes | None] = compass or [None] * len(arrays["relative"])
         self._loops: dict[object, list[LoopFactors]] = {}
@@ -130,10 +135,13 @@ class Objective:
         return Seen(relative, arrays["log_std"], arrays["codes"], arrays["origin_code"])
 
     def _steps(self, settings: PoseGraphSettings) -> tuple[np.ndarray, np.ndarray]:
-        if not self._registered:
-            return self.arrays["relative"], self.arrays["log_std"]
         if self._odometry is None:  # nothing that is tuned for it changes it
-            self._odometry = registered_odometry(self._pair_head, self._seen(settings), settings.search, settings.block)
+            odometry = self.arrays["relative"], self.arrays["log_std"]
+            if self._registered:
+                odometry = registered_odometry(self._pair_head, self._seen(settings), settings.search, settings.block)
+            if self._smoother is not None:
+                odometry = smoothed_odometry(self._smoother, *odometry, self.arrays["motion"])
+            self._odometry = odometry
         return self._odometry
 
     def __call__(self, settings: PoseGraphSettings) -> float:
@@ -224,7 +232,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     stores = [open_store(features / f"validation_{table}", with_compass) for table in world.unseen_tables]
     arrays = {
         name: np.concatenate([store[name][: arguments.trajectories or None] for store in stores])
-        for name in ("relative", "log_std", "codes", "origin_code", "truth", *(_COMPASS if with_compass else ()))
+        for name in (*_ARRAYS, *(_COMPASS if with_compass else ()))
     }
     path = arguments.out / f"{world.name}.gtsam.json"
     pair_head = load_place(arguments.weights / world.name, world.name)[0].pair_head
@@ -232,8 +240,11 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     start = PoseGraphSettings()
     start = replace(start, search=replace(start.search, registrations=registrations))
     grid = [[_registering(change, registrations) for change in group] for group in GRID]
-    if arguments.form == "registered":
-        path = arguments.out / f"{world.name}.gtsam_registered.json"
+    smoother: OdometrySmoother | None = None
+    if arguments.form in ("registered", "smoothed"):
+        path = arguments.out / f"{world.name}.gtsam_{arguments.form}.json"
+        if arguments.form == "smoothed":
+            smoother, _ = load_smoother(arguments.weights / world.name, world.name)
     else:
         grid.append([fit_calibration(arrays["relative"], arrays["truth"])])
     compass: list[CompassFixes] | None = None
@@ -243,7 +254,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
         relative = start.calibrated(arrays["relative"])
         readings, log_scale = (arrays[name] for name in _COMPASS)
         compass = found_fixes(readings, log_scale, relative, arrays["log_std"], start.block, world.block_m)
-    objective = Objective(arrays, pair_head, compass, arguments.form == "registered")
+    objective = Objective(arrays, pair_head, compass, arguments.form == "registered", smoother)
     started = time.monotonic()
     best, least = tune(objective, start, grid, arguments.passes)
     odometry = objective.error(se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy())

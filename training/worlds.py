@@ -245,6 +245,8 @@ WORLDS = {
         loops_per_pose=2,
         max_loops=96,
         loops_apart=0,
+        # What moves the robot sideways shows in the steps around a turn (docs/results.md).
+        smoothing=True,
         # With the scale of the 2D world the gates hardly move, with all iterations at once some trainings never do
         # (docs/results.md).
         optimizer_epochs=40,

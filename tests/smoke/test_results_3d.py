@@ -11,7 +11,15 @@ import pytest
 
 from ngo_estimator.checkpoint import write_untrained
 from tests.smoke import toy
-from training import results, train_deepvo, train_end_to_end, train_local, train_optimizer, tune_pose_graph
+from training import (
+    results,
+    train_deepvo,
+    train_end_to_end,
+    train_local,
+    train_optimizer,
+    train_smoother,
+    tune_pose_graph,
+)
 from training.featurise import open_store
 from training.limits import LIMITS
 from training.own_odometry import open_odometry
@@ -62,7 +70,8 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
     assert (result["trajectories"], result["steps"], result["seeds"]) == (2, STEPS, [0])
     assert list(result["tables"]) == TABLES == list(result["limits"])
     assert {"local", "local_no_action", "deepvo", "paper_1", "paper_5", "ngo_1", "ngo_5", "gauss_newton", "gtsam",
-            "true_pairs", "oracle", "end_to_end"} < set(rows_of(world_named("maze3d")))  # fmt: skip
+            "smoothed", "gtsam_smoothed", "true_pairs", "oracle",
+            "end_to_end"} < set(rows_of(world_named("maze3d")))  # fmt: skip
     for name, table in result["tables"].items():
         assert list(table) == rows_of(world_named("maze3d"))
         for row in table.values():
@@ -73,7 +82,7 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
                     assert 0.0 <= low <= entry[metric]["mean"] <= high
         assert list(result["limits"][name]) == ["ngo_5", "gtsam", "true_pairs", "oracle", *LIMITS]
         assert result["limits"][name]["gtsam"] == {metric: table["gtsam"][metric] for metric in METRICS}
-    assert {"deepvo-seed0", "local_no_action-seed0", "ngo_5-seed0"} < set(result["trainings"])
+    assert {"odometry_smoother", "deepvo-seed0", "local_no_action-seed0", "ngo_5-seed0"} < set(result["trainings"])
     assert "--without-action" in result["trainings"]["local_no_action-seed0"]["command"]
     assert str(folder) not in json.dumps(result)
 
@@ -107,7 +116,7 @@ def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, An
 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
-    scripts = (train_deepvo, train_end_to_end, train_local, train_optimizer, tune_pose_graph)
+    scripts = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_smoother, tune_pose_graph)
     toy.refuse(monkeypatch, scripts, "training.prerequisites.make_odometry", "training.measured.scores")
     assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result
 

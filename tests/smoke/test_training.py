@@ -17,7 +17,17 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, load_local, load_optimizer, load_place
+from ngo_estimator.checkpoint import (
+    LOCAL,
+    OPTIMIZER,
+    PLACE,
+    SMOOTHER,
+    CheckpointError,
+    load_local,
+    load_optimizer,
+    load_place,
+    load_smoother,
+)
 from ngo_estimator.local_odometry import LocalOdometry
 from ngo_estimator.online_trajectory import OnlineTrajectory
 from tests.smoke import toy
@@ -31,6 +41,8 @@ from training import (
     train_local,
     train_optimizer,
     train_place,
+    train_smoother,
+    worlds,
 )
 from training.deepvo import DEEPVO
 
@@ -64,6 +76,13 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     local_metrics = train_local.main(toy.local(world, tmp_path, action_history=told))
     place_metrics = train_place.main(toy.place(world, tmp_path))
     featurise.main(toy.features(world, tmp_path))
+    smoothed = worlds.world_named(world).smoothing
+    if smoothed:
+        with pytest.raises(CheckpointError, match="odometry_smoother"):
+            train_optimizer.main(toy.optimizer(world, tmp_path))
+        assert train_smoother.main(toy.smoother(world, tmp_path)).keys() == {
+            f"{name}_{unit}" for name in ("odometry", "smoothed") for unit in ("m", "deg")
+        }
     optimizer_metrics = train_optimizer.main(toy.optimizer(world, tmp_path))
     capsys.readouterr()
     table = evaluate.main(toy.evaluation(world, tmp_path))
@@ -75,7 +94,9 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     assert table["trajectories"] == 2 and table["frames"] == 60
     weights = tmp_path / "weights" / world
     assert sorted(path.name for path in weights.iterdir()) == sorted(
-        kind + suffix for kind in (LOCAL, PLACE, OPTIMIZER) for suffix in (".json", ".safetensors")
+        kind + suffix
+        for kind in (LOCAL, PLACE, OPTIMIZER, *((SMOOTHER,) if smoothed else ()))
+        for suffix in (".json", ".safetensors")
     )
     assert LocalOdometry.load(weights, world).world == world
     OnlineTrajectory.load(weights, world=world)
@@ -86,6 +107,14 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
         assert min(description["training"][name] for name in ("seconds", "datapoints_per_s", "peak_memory_mb")) > 0
         assert description["metrics"]["validation"]
         assert str(tmp_path) not in json.dumps(description)
+    optimizer, description = load_optimizer(weights, world)
+    assert (optimizer.config.smoother is not None) == smoothed
+    if smoothed:  # with a copy, which is left as it is
+        smoother, of_smoother = load_smoother(weights, world)
+        assert description["odometry_smoother_sha256"] == of_smoother["sha256"]
+        assert of_smoother["local_pose_network_sha256"] == load_local(weights, world)[1]["sha256"]
+        copied, stored = optimizer.smoother.state_dict(), smoother.state_dict()
+        assert all(torch.equal(copied[name], value) for name, value in stored.items())
     # A calibrated network has no constant error on what it was calibrated with: the normalisation was changed for it.
     config = load_local(weights, world)[0].config
     assert config.relative_bias[2] != 0.0
@@ -102,6 +131,17 @@ def test_the_papers_form_trains_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not load_optimizer(tmp_path / "weights" / "maze2d")[0].config.loops
 
 
+def test_a_smoother_of_another_local_network_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy.shrink(monkeypatch, 161, 400)
+    prepare(tmp_path)
+    train_smoother.main(toy.smoother("maze2d", tmp_path))
+    path = tmp_path / "weights" / "maze2d" / f"{SMOOTHER}.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "local_pose_network_sha256": "another"}))
+    asked = dataclasses.replace(toy.optimizer("maze2d", tmp_path, form="paper"), smoothing=True)
+    with pytest.raises(CheckpointError, match="was trained on another local network than the one beside it"):
+        train_optimizer.main(asked)
+
+
 def prepare(folder: Path) -> None:
     """The weights and features that the later stages start from, untrained; no optimizer yet."""
     from ngo_estimator.checkpoint import write_untrained
@@ -113,6 +153,7 @@ def prepare(folder: Path) -> None:
 TRAININGS: dict[str, tuple[Callable[[Any], Any], Callable[..., Any], type[lightning.LightningModule], str, str]] = {
     "local": (train_local.main, toy.local, train_local.LocalTraining, "weights", LOCAL),
     "place": (train_place.main, toy.place, train_place.PlaceTraining, "weights", PLACE),
+    "smoother": (train_smoother.main, toy.smoother, train_smoother.SmootherTraining, "weights", SMOOTHER),
     "optimizer": (train_optimizer.main, toy.optimizer, train_optimizer.OptimizerTraining, "weights", OPTIMIZER),
     "deepvo": (train_deepvo.main, toy.deepvo, train_deepvo.DeepVOTraining, "weights", DEEPVO),
     "end_to_end": (train_end_to_end.main, toy.end_to_end, train_end_to_end.EndToEndTraining, "end_to_end", "*"),
@@ -126,7 +167,7 @@ def test_a_stopped_training_ends_with_the_weights_of_an_unbroken_one(
     toy.shrink(monkeypatch, 97, 300)
     main, arguments, module, out, kind = TRAININGS[name]
     unbroken, stopped = tmp_path / "unbroken", tmp_path / "stopped"
-    if name in ("optimizer", "end_to_end"):
+    if name in ("smoother", "optimizer", "end_to_end"):
         prepare(unbroken)
         if name == "optimizer":
             (unbroken / "weights" / "maze2d" / f"{OPTIMIZER}.safetensors").unlink()

@@ -21,6 +21,7 @@ from training import (
     train_local,
     train_optimizer,
     train_place,
+    train_smoother,
     tune_pose_graph,
     worlds,
 )
@@ -102,6 +103,18 @@ def features(world: str, folder: Path) -> featurise.Arguments:
     )
 
 
+def smoother(world: Any, folder: Path, epochs: int = 1) -> train_smoother.Arguments:
+    return train_smoother.Arguments(
+        world=world,
+        epochs=epochs,
+        steps=3,
+        batch_size=2,
+        weights=folder / "weights",
+        out=folder / "weights",
+        runs=folder / "runs",
+    )
+
+
 def optimizer(world: str, folder: Path, epochs: int = 1, form: str = "loops") -> train_optimizer.Arguments:
     return train_optimizer.Arguments(
         world=world,
@@ -150,6 +163,7 @@ def scripts(world: Any, folder: Path) -> prerequisites.Scripts:
             world="maze2d", width=4, epochs=1, datapoints=1, batch_size=32, validation_mazes=2, workers=0
         ),
         features=features(world, folder),
+        smoother=smoother(world, folder),
         optimizer=optimizer(world, folder),
         pose_graph=tune_pose_graph.Arguments(world=world, trajectories=2, passes=1),
         speed=speed(world),

@@ -7,6 +7,7 @@ from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.local_pose_network import LocalPoseConfig
 from ngo_estimator.loop_closure import Loops, LoopSearch
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig, OptimizedTrajectory
+from ngo_estimator.odometry_smoothing import SmootherConfig
 from ngo_estimator.place_encoder import PairHead, PlaceConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 
@@ -30,13 +31,19 @@ def place_config(world: str, **changes: object) -> PlaceConfig:
 def small_optimizer(
     form: str = "loops", trained: bool = False, seed: int = 0, **changes: object
 ) -> NeuralGraphOptimizer:
-    """An optimizer for 6 motion features, fresh or with random weights that close loops and move every pose."""
+    """An optimizer for 6 motion features, fresh or with random weights that close loops and move every pose.
+
+    ``form`` is ``loops``, ``learned`` (with gates from nothing), ``smoothed`` (with a smoother), ``gauss_newton`` or
+    ``paper``.
+    """
     torch.manual_seed(0)
     aggregation = PoseAggregationConfig(motion_feature_size=6, width=16, relative_std=(0.1, 0.02, 0.05))
     make = NeuralGraphOptimizerConfig.paper_form if form == "paper" else NeuralGraphOptimizerConfig
     settings = {"aggregation": aggregation, "iterations": 3, **changes}
     if form != "paper":
-        parts = {"network": form != "gauss_newton", "robust": form != "learned"}
+        parts: dict[str, object] = {"network": form != "gauss_newton", "robust": form != "learned"}
+        if form == "smoothed":
+            parts["smoother"] = SmootherConfig(6, aggregation.relative_std, width=8)
         settings = {**parts, "search": LoopSearch(2, 8, 2, 0, 3), **settings}
     optimizer = NeuralGraphOptimizer(make(**settings)).eval()  # type: ignore[arg-type]
     if trained:

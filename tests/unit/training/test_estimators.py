@@ -1,5 +1,7 @@
 """The rows' estimators: batches equal single trajectories, and prefixes know nothing of what follows."""
 
+import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +9,13 @@ import pytest
 import torch
 
 from ngo_estimator import se2
+from ngo_estimator.checkpoint import PLACE, SMOOTHER, PlaceNetworks, save_checkpoint
 from ngo_estimator.compass_closure import frames_to_read
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import optimize_offline
 from ngo_estimator.place_encoder import PairHead
 from tests.unit.ngo_estimator.rooms import drive_in_the_room, registering_pair_head
-from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
+from tests.unit.ngo_estimator.samples import place_config, small_optimizer, small_pair_head, trajectory_inputs
 from training.estimators import (
     Arrays,
     Prepared,
@@ -110,7 +113,8 @@ def test_rows_with_a_compass_say_so() -> None:
     for name, row in ROWS.items():
         assert row.compass == ("compass" in name)
     for world in WORLDS.values():
-        assert {name for name, row in ROWS.items() if not (row.worlds or row.registered)} <= set(rows_of(world))
+        everywhere = {name for name, row in ROWS.items() if not (row.worlds or row.registered or row.smoothed)}
+        assert everywhere <= set(rows_of(world))
 
 
 def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
@@ -121,8 +125,30 @@ def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
 
 def test_worlds_have_the_rows_that_are_theirs() -> None:
     in_2d, in_3d = (set(rows_of(WORLDS[name])) for name in ("maze2d", "maze3d"))
-    assert in_3d - in_2d == {"local_no_action", "deepvo"}
+    assert in_3d - in_2d == {"local_no_action", "deepvo", "smoothed", "gtsam_smoothed"}
     assert in_2d - in_3d == {name for name, row in ROWS.items() if row.compass or row.registered}
+
+
+def test_what_is_smoothed_is_what_our_optimizer_takes(tmp_path: Path) -> None:
+    optimizer = small_optimizer("smoothed", trained=True)
+    place = PlaceNetworks(place_config("maze3d", code_size=12))
+    for kind, network in ((SMOOTHER, optimizer.smoother), (PLACE, place)):
+        save_checkpoint(tmp_path / "maze3d" / f"{kind}.safetensors", network, kind, "maze3d", {})
+    sources = Sources(world_named("maze3d"), tmp_path, tmp_path, tmp_path)
+    relative, log_std, motion, codes = (value.numpy() for value in trajectory_inputs(2, 40))
+    some = {"relative": relative, "log_std": log_std, "motion": motion, "codes": codes, "origin_code": codes[:, :1]}
+    some["truth"] = se2.r2g(torch.from_numpy(relative)).numpy()
+    (smoothed,) = estimators("smoothed", 1, sources)
+    steps = optimizer.aggregate(*(torch.from_numpy(some[name]) for name in ("relative", "log_std", "motion")))
+    expected = se2.r2g(steps.relative)
+    np.testing.assert_allclose(smoothed.poses(some)[:, 7::8], expected, atol=1e-5)
+    # Of a prefix, nothing is known that follows.
+    assert not np.allclose(smoothed.poses(prefix(some, 16))[:, 15], expected[:, 1], atol=1e-5)
+    settings = dataclasses.asdict(PoseGraphSettings(min_logit=1e9))
+    (tmp_path / "maze3d.gtsam_smoothed.json").write_text(json.dumps({"settings": settings}))
+    (graph,) = estimators("gtsam_smoothed", 1, sources)
+    np.testing.assert_allclose(graph.poses(some)[:, 7::8], expected, atol=1e-4)
+    assert smoothed.identity != graph.identity
 
 
 def test_only_what_is_trained_has_trainings() -> None:

@@ -13,19 +13,22 @@ from training.worlds import WORLDS, world_named
 
 
 def test_a_world_says_what_suits_it() -> None:
-    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(False, 2, 96, 40)
-    assert choices(Arguments(world="maze2d"), world_named("maze2d")) == Choices(True, 4, 512, 6)
+    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(False, True, 2, 96, 40)
+    assert choices(Arguments(world="maze2d"), world_named("maze2d")) == Choices(True, False, 4, 512, 6)
 
 
 def test_what_is_given_counts() -> None:
-    given = Arguments(world="maze3d", robust=True, loops_per_pose=3, max_loops=7, epochs=1)
-    assert choices(given, world_named("maze3d")) == Choices(True, 3, 7, 1)
+    given = Arguments(world="maze3d", robust=True, smoothing=False, loops_per_pose=3, max_loops=7, epochs=1)
+    assert choices(given, world_named("maze3d")) == Choices(True, False, 3, 7, 1)
+    # By itself only the form with loops and a network smooths.
+    assert not choices(Arguments(world="maze3d", form="gauss_newton"), world_named("maze3d")).smoothing
 
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None:
     shipped = load_optimizer(WEIGHTS / world, world)[0].config
-    made = config_of(Arguments(world=world), world_named(world), shipped.correction_std)  # type: ignore[arg-type]
+    arguments = Arguments(world=world)
+    made = config_of(arguments, world_named(world), shipped.correction_std, shipped.smoother)  # type: ignore[arg-type]
     assert replace(made, covariance_scale=shipped.covariance_scale) == shipped
 
 

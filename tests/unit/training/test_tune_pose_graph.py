@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,14 @@ import pytest
 import torch
 
 from ngo_estimator import se2
+from ngo_estimator.checkpoint import SMOOTHER, save_checkpoint
 from ngo_estimator.compass_closure import frames_to_read
 from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from tests.unit.ngo_estimator.samples import small_pair_head
 from training.compass_factors import found_fixes
 from training.pose_graph import PoseGraphSettings
+from training.runs import WEIGHTS
 from training.tune_pose_graph import (
     COMPASS_GRID,
     GRID,
@@ -148,6 +152,16 @@ def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
     assert load_settings(tmp_path / "maze2d.gtsam_registered.json") == registered
     assert registered.search.registrations == best.search.registrations > 0
     assert registered.odometry_bias == (0.0, 0.0, 0.0)
+    weights = tmp_path / "weights" / "maze2d"
+    shutil.copytree(WEIGHTS / "maze2d", weights)
+    smoother = OdometrySmoother(SmootherConfig(1, (0.1, 0.02, 0.05)))
+    with torch.no_grad():
+        smoother.head.bias[2] = -2.0  # two tenths of 0.05 rad a step, which is what the odometry turns too much
+    save_checkpoint(weights / f"{SMOOTHER}.safetensors", smoother, SMOOTHER, "maze2d", {})
+    smoothed = main(replace(arguments, form="smoothed", weights=tmp_path / "weights"))
+    assert load_settings(tmp_path / "maze2d.gtsam_smoothed.json") == smoothed
+    validation = json.loads((tmp_path / "maze2d.gtsam_smoothed.json").read_text())["validation"]
+    assert validation["position_rmse_m"] < 0.7 * validation["odometry_position_rmse_m"]
 
 
 def test_settings_survive_a_file(tmp_path: Path) -> None:

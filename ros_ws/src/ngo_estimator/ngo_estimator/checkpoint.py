@@ -18,11 +18,17 @@ from torch import nn
 from ngo_estimator.images import ImageFormat
 from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 
 FORMAT = 1
-LOCAL, PLACE, OPTIMIZER = "local_pose_network", "place_encoder", "neural_graph_optimizer"
+LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
+    "local_pose_network",
+    "place_encoder",
+    "odometry_smoother",
+    "neural_graph_optimizer",
+)
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
@@ -188,6 +194,11 @@ def load_local(weights: Path, world: str | None = None) -> tuple[LocalPoseNetwor
 def load_place(weights: Path, world: str | None = None) -> tuple[PlaceNetworks, dict[str, Any]]:
     """The place encoder and pair head in the folder ``weights``."""
     return load_network(weights / f"{PLACE}.safetensors", PLACE, PlaceNetworks, PlaceConfig, world)
+
+
+def load_smoother(weights: Path, world: str | None = None) -> tuple[OdometrySmoother, dict[str, Any]]:
+    """The odometry smoother in the folder ``weights``: optimizers are trained with a copy of it."""
+    return load_network(weights / f"{SMOOTHER}.safetensors", SMOOTHER, OdometrySmoother, SmootherConfig, world)
 
 
 def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraphOptimizer, dict[str, Any]]:

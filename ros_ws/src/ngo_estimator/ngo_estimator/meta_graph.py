@@ -21,7 +21,8 @@ from ngo_estimator.registered_odometry import registered_steps
 from ngo_estimator.rows import GrowingRows, SlidingRows
 
 _CONTEXT = 2
-"""Blocks on either side that a block's feature depends on: the convolutions reach 2 ** (halvings + 1) - 1 frames."""
+"""Blocks on either side that a block's feature depends on: the convolutions reach 2 ** (halvings + 1) - 1 frames. What
+smooths the odometry may reach farther."""
 
 _MOST_DRIFT = 4.0
 """How much the variance between a key frame and the newest pose is taken to be more than the graph says."""
@@ -52,17 +53,20 @@ class MetaGraph:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
-        keep = (2 * _CONTEXT + 2) * self._block
+        smoother = optimizer.config.smoother
+        self._context = max(_CONTEXT, 0 if smoother is None else smoother.context(self._block))
+        keep = (2 * self._context + 2) * self._block
         self.odometry = GrowingRows((3,), np.float64)
         self.odometry.append(np.zeros(3))
         self._relative = SlidingRows((3,), np.float32, keep)
         self._log_std = SlidingRows((3,), np.float32, keep)
         config = optimizer.config.aggregation
         self._motion = SlidingRows((config.motion_feature_size,), np.float32, keep)
-        self._steps = SlidingRows((3,), np.float32, window + 2)
-        self._std = SlidingRows((3,), np.float32, window + 2)
-        self._optimized_std = SlidingRows((3,), np.float64, window + 2)
-        self._features = SlidingRows((config.width,), np.float32, window + 2)
+        keep = max(window, self._context) + 2
+        self._steps = SlidingRows((3,), np.float32, keep)
+        self._std = SlidingRows((3,), np.float32, keep)
+        self._optimized_std = SlidingRows((3,), np.float64, keep)
+        self._features = SlidingRows((config.width,), np.float32, keep)
         self._nodes = GrowingRows((3,), np.float64)
         self._nodes.append(np.zeros(3))
         self._first = 0  # node where the window begins
@@ -135,7 +139,7 @@ class MetaGraph:
         self._optimized_std.append(std)
         relative = se2.between(*torch.from_numpy(self.odometry.values[[-1 - self._block, -1]]))
         self._nodes.append(se2.compose(torch.from_numpy(self._nodes.values[-1]), relative).numpy())
-        if self._optimizer.config.network:
+        if self._optimizer.config.network or self._optimizer.config.smoother is not None:
             self._aggregate(block)
         if self._loops is not None:
             found = self._loops.find(block, self._first, self._keys)
@@ -163,13 +167,17 @@ class MetaGraph:
         odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
 
     def _aggregate(self, block: int) -> None:
-        """Features of the blocks that the newest one changes, and of itself."""
-        changed = max(0, block - _CONTEXT)
-        start = max(0, changed - _CONTEXT)
+        """Features and smoothed odometry of the blocks that the newest one changes, and of itself."""
+        changed = max(0, block - self._context)
+        start = max(0, changed - self._context)
         rows = (self._relative, self._log_std, self._motion)
         inputs = [torch.from_numpy(r.slice(start * self._block)).unsqueeze(0) for r in rows]
-        features = self._optimizer.aggregation(*inputs)[0, changed - start :]
-        self._features.replace(changed, features.numpy())
+        steps = self._optimizer.aggregate(*inputs)
+        if steps.features is not None:
+            self._features.replace(changed, steps.features[0, changed - start :].numpy())
+        if self._optimizer.config.smoother is not None:
+            self._steps.replace(changed, steps.relative[0, changed - start :].numpy())
+            self._std.replace(changed, steps.std[0, changed - start :].numpy())
 
     def _slide(self) -> None:
         """Move the window by a block: its first node becomes a key frame."""

@@ -20,6 +20,7 @@ from ngo_estimator.loop_closure import (
 )
 from ngo_estimator.loop_gates import LearnedLoopGate, RobustLoopGate
 from ngo_estimator.normal_equations import GraphStructure, NormalEquations
+from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import (
     PoseAggregation,
@@ -43,7 +44,7 @@ class NeuralGraphOptimizerConfig:
     normalised over its channels. With ``loops`` every iteration sees the residuals of the loop candidates under the
     current poses and takes a Gauss-Newton step that reduces them; ``search`` says which candidates there are. Without
     ``network`` this step is all there is: no attention and no convolutions, one learned factor for the odometry's
-    deviations.
+    deviations. With a ``smoother``, meta-poses are made of odometry that it has smoothed.
     ``correction_std`` (m, m, rad), the typical error of a relative meta-pose, is the unit of the adjustments.
     ``covariance_scale`` multiplies the covariance of a pose: how far errors were beyond it on validation.
     """
@@ -57,6 +58,7 @@ class NeuralGraphOptimizerConfig:
     network: bool = True
     robust: bool = True
     compass: bool = False
+    smoother: SmootherConfig | None = None
     search: LoopSearch = field(default_factory=LoopSearch)
     correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
     covariance_scale: float = 1.0
@@ -73,6 +75,16 @@ class NeuralGraphOptimizerConfig:
             raise ValueError(
                 f"loops, network, compass are {self.loops}, {self.network}, {self.compass}; expected loops or a "
                 "network, and a compass with loops only"
+            )
+        if self.smoother is not None and self.smoother.motion_feature_size != self.aggregation.motion_feature_size:
+            raise ValueError(
+                f"the smoother takes {self.smoother.motion_feature_size} motion features; expected "
+                f"{self.aggregation.motion_feature_size}, as the aggregation"
+            )
+        if self.smoother is not None and self.registrations:
+            raise ValueError(
+                f"registrations is {self.registrations} beside a smoother; expected 0, as what smooths odometry learned"
+                " from steps that are not registered"
             )
         if min(self.correction_std) <= 0.0:
             raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
@@ -98,7 +110,7 @@ class NeuralGraphOptimizerConfig:
 
 @dataclass(frozen=True)
 class MetaSteps:
-    """Relative meta-poses as the local odometry has them.
+    """Relative meta-poses as the local odometry has them, smoothed where the optimizer does so.
 
     ``relative`` ``(batch, poses, 3)`` and ``std``, their standard deviations along the axes of the pose before. The
     last ``blocks`` of them are blocks of steps, with ``features`` ``(batch, blocks, width)`` where the optimizer has a
@@ -165,6 +177,8 @@ class NeuralGraphOptimizer(nn.Module):
         self.config = config
         self.register_buffer("correction_std", torch.tensor(config.correction_std), persistent=False)
         self.correction_std: Tensor
+        if config.smoother is not None:
+            self.smoother = OdometrySmoother(config.smoother)
         if config.network:
             self._build_network(config)
         if config.loops:
@@ -248,6 +262,8 @@ class NeuralGraphOptimizer(nn.Module):
 
     def aggregate(self, relative: Tensor, log_std: Tensor, motion_features: Tensor) -> MetaSteps:
         """Meta-steps of trajectories whose number of steps is a multiple of the block; arguments as of ``forward``."""
+        if self.config.smoother is not None:
+            relative, log_std = self.smoother(relative, log_std, motion_features)
         in_blocks = poses_in_blocks(relative, self.block)
         features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
         std = block_variances(in_blocks, log_std).sqrt()

@@ -1,0 +1,80 @@
+"""Odometry smoothed: every step is corrected by what the steps before and after it show.
+
+Not in the paper, which composes the local poses as they are. The local network sees two frames, but a robot has
+momentum, and what one step leaves open its neighbours often tell.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+_UNIT = 0.1
+"""Correction of a step by a head that says 1, in deviations of relative poses; one such deviation is the most."""
+_LARGEST_INPUT = 10.0
+"""Steps of more deviations, as where frames were lost, look to their neighbours as if they had so many."""
+
+
+@dataclass(frozen=True)
+class SmootherConfig:
+    """What an odometry smoother is made of.
+
+    ``relative_std`` (m, m, rad), the deviation of one step, normalises the relative poses. ``dilations`` holds one
+    number a convolution, of ``width`` channels each.
+    """
+
+    motion_feature_size: int
+    relative_std: tuple[float, float, float]
+    dilations: tuple[int, ...] = (1, 2, 4, 8, 16)
+    width: int = 64
+
+    def __post_init__(self) -> None:
+        if min(self.motion_feature_size, self.width, *self.dilations, len(self.dilations)) < 1:
+            raise ValueError(
+                f"motion_feature_size, width, dilations are {self.motion_feature_size}, {self.width}, "
+                f"{self.dilations}; expected at least 1, and a positive number for each convolution"
+            )
+        if min(self.relative_std) <= 0.0:
+            raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
+
+    def context(self, block: int) -> int:
+        """Blocks of so many steps, on either side, that a smoothed step depends on."""
+        return math.ceil(sum(self.dilations) / block)
+
+
+class OdometrySmoother(nn.Module):
+    """Residual temporal convolutions (kernel 3) over motion features and relative poses.
+
+    A freshly initialised smoother returns its input exactly.
+    """
+
+    def __init__(self, config: SmootherConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, dilations = config.width, config.dilations
+        self.first = nn.Linear(config.motion_feature_size + 6, width)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in dilations)
+        self.convolutions = nn.ModuleList(nn.Conv1d(width, width, 3, 1, d, d) for d in dilations)
+        self.head = nn.Linear(width, 6)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+        self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
+        self.relative_std: Tensor
+
+    def forward(self, relative: Tensor, log_std: Tensor, motion_features: Tensor) -> tuple[Tensor, Tensor]:
+        """Smoothed steps and the logarithms of their deviations, ``(batch, steps, 3)`` both.
+
+        Args:
+            relative: relative poses ``(batch, steps, 3)`` (m, m, rad).
+            log_std: logarithm of their standard deviations ``(batch, steps, 3)``.
+            motion_features: ``(batch, steps, motion_feature_size)``.
+        """
+        scaled = (relative / self.relative_std).clamp(-_LARGEST_INPUT, _LARGEST_INPUT)
+        certainty = (log_std - self.relative_std.log()).clamp(-_LARGEST_INPUT, _LARGEST_INPUT)
+        hidden = torch.relu(self.first(torch.cat((motion_features, scaled, certainty), dim=-1)))
+        for norm, convolution in zip(self.norms, self.convolutions, strict=True):
+            hidden = hidden + torch.relu(convolution(norm(hidden).mT)).mT
+        correction, scale = self.head(hidden).split(3, dim=-1)
+        smoothed = relative + self.relative_std * torch.tanh(_UNIT * correction)
+        return smoothed, log_std + 2.0 * torch.tanh(0.5 * scale)

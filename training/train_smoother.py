@@ -1,0 +1,160 @@
+"""Train what smooths the odometry, on whole trajectories of the feature store, before the optimizer that it is part of.
+
+    python -m training.train_smoother --world maze3d
+    python -m training.train_smoother --data drive_1.mcap drive_2.mcap --name my_robot
+
+Run again, it goes on where it was stopped. It ends with the weights written beside those of the other networks, from
+where ``train_optimizer --smoothing`` takes them.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning
+import torch
+import tyro
+from torch import Tensor
+
+from ngo_estimator import se2
+from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, save_checkpoint
+from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
+from training import runs
+from training.featurise import check_networks
+from training.recorded import RecordedArguments, check_source, open_recorded, run_script
+from training.streams import Batch
+from training.train_local import LIKELIHOOD_WEIGHT, step_losses
+from training.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
+from training.worlds import WorldName, world_named
+
+ERROR_WINDOWS = (1, 4, 16)
+"""Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
+
+_BLOCK = PoseAggregationConfig(1).block
+
+
+@dataclass(frozen=True)
+class Arguments(runs.TrainerArguments):
+    """Settings of a training of the odometry smoother."""
+
+    world: WorldName | None = None
+    """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
+    epochs: int = 300
+    """Epochs; the learning rate falls to zero over all of them."""
+    steps: int = 40
+    """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
+    batch_size: int = 8
+    """Trajectories in a step."""
+    learning_rate: float = 3e-3
+    """Highest learning rate."""
+    seed: int = 0
+    """Seed of initial weights and of the order of the data."""
+    precision: Literal["bf16-mixed", "32-true"] = field(default="32-true", kw_only=True)
+    """Arithmetic of the network."""
+    weights: Path = runs.WEIGHTS
+    """Folder with NAME's local network and place encoder, of which the features are."""
+    out: Path = runs.WEIGHTS
+    """Folder that gets NAME/odometry_smoother.safetensors."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of the feature stores, checkpoints and logs."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
+
+
+class SmootherTraining(lightning.LightningModule):
+    """Errors of smoothed steps and meta-poses; on the validation split, errors of whole trajectories by odometry.
+
+    ``step_std`` and ``meta_std`` (m, m, rad) are the errors of steps and meta-poses that are not smoothed.
+    """
+
+    def __init__(self, arguments: Arguments, smoother: OdometrySmoother, step_std: Tensor, meta_std: Tensor) -> None:
+        super().__init__()
+        self.arguments, self.smoother = arguments, smoother
+        self.register_buffer("step_std", step_std, persistent=False)
+        self.register_buffer("meta_std", meta_std, persistent=False)
+        self.step_std: Tensor
+        self.meta_std: Tensor
+
+    def forward(self, batch: Batch) -> Any:
+        return self.smoother(batch["relative"], batch["log_std"], batch["motion"])
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        relative, log_std = self(batch)
+        loss = smoothing_loss(relative, log_std, batch["truth"], self.step_std, self.meta_std)
+        self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
+        return loss
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        for name, relative in (("odometry", batch["relative"]), ("smoothed", self(batch)[0])):
+            figures = rmse_figures(name, se2.r2g(relative), batch["truth"])
+            self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(relative), sync_dist=True)
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-3)
+        return runs.one_cycle(optimizer, self.trainer)
+
+
+def smoothing_loss(relative: Tensor, log_std: Tensor, truth: Tensor, step_std: Tensor, meta_std: Tensor) -> Tensor:
+    """Errors of steps, errors of meta-poses added up over windows, and what the meta-poses' deviations say of these.
+
+    Args:
+        relative, log_std: smoothed steps ``(batch, steps, 3)``, and the logarithm of their deviations.
+        truth: true global poses after each step ``(batch, steps, 3)``.
+        step_std, meta_std: units of the errors of steps and of meta-poses ``(3,)``.
+    """
+    in_blocks = poses_in_blocks(relative, _BLOCK)
+    steps = se2.wrapped(relative - se2.g2r(truth))
+    metas = se2.wrapped(in_blocks[..., -1, :] - se2.g2r(truth[:, _BLOCK - 1 :: _BLOCK]))
+    deviations = 0.5 * block_variances(in_blocks.detach(), log_std).log()
+    windows = tuple(window for window in ERROR_WINDOWS if window <= metas.shape[1])
+    of_steps, _ = step_losses(steps, torch.zeros_like(steps), torch.zeros_like(steps), step_std)
+    of_metas, likelihood = step_losses(metas, deviations, torch.zeros_like(metas), meta_std, windows)
+    return of_steps + of_metas + LIKELIHOOD_WEIGHT * likelihood
+
+
+def main(arguments: Arguments) -> dict[str, float]:
+    """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
+    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
+    domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
+    folder = arguments.weights / domain.name
+    local, local_description = load_local(folder, domain.name)
+    place, place_description = load_place(folder, domain.name)
+    features = arguments.runs / domain.name / "features"
+    stores = [features / "train", *(features / name for name in domain.validation_stores)]
+    for store in stores:
+        check_networks(store, local_description, place_description)
+    train, validation = (StoredTrajectories(s, None, place.pair_head, _BLOCK) for s in (stores[:1], stores[1:]))
+    run = runs.Run(
+        arguments.runs / domain.name / f"smoother-seed{arguments.seed}",
+        "train_smoother",
+        arguments,
+        arguments.epochs,
+        arguments.seed,
+        best=None if recorded is None else "smoothed_m",
+        data=None if recorded is None else recorded.sha256,
+        settings={"error_windows": ERROR_WINDOWS},
+    )
+    config = SmootherConfig(local.config.feature_size, local.config.relative_std)
+    scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
+    training = SmootherTraining(arguments, OdometrySmoother(config), *scales)
+    data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, recorded is not None)
+    run.fit(training, data)
+    metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
+    if not run.is_first:
+        return {}
+    details: dict[str, Any] = {"local_pose_network_sha256": local_description["sha256"]}
+    if recorded is not None:
+        details["data"] = recorded.about
+    details |= {"training": run.finish(metrics), "metrics": {"validation": metrics}}
+    path = arguments.out / domain.name / f"{SMOOTHER}.safetensors"
+    save_checkpoint(path, training.smoother.cpu(), SMOOTHER, domain.name, details, half=True)
+    print("validation", {name: round(value, 4) for name, value in metrics.items()})
+    return metrics
+
+
+if __name__ == "__main__":
+    run_script(main, Arguments, __doc__)
