@@ -35,11 +35,21 @@ def test_a_step_depends_on_those_within_the_dilations_and_no_others() -> None:
     assert (int(moved[0]), int(moved[-1])) == (30 - 7, 30 + 7)
 
 
-@pytest.mark.parametrize(
-    ("dilations", "block", "blocks"), [((1, 2, 4, 8, 16), 8, 4), ((1, 2, 4, 8), 8, 2), ((1,), 1, 1)]
-)
-def test_the_context_is_counted_in_blocks(dilations: tuple[int, ...], block: int, blocks: int) -> None:
-    assert SmootherConfig(6, STD, dilations).context(block) == blocks
+@pytest.mark.parametrize(("form", "blocks"), [("loops", 2), ("smoothed", 6), ("gauss_newton", 0)])
+def test_blocks_depend_on_so_many_others_and_no_more(form: str, blocks: int) -> None:
+    optimizer, (relative, log_std, motion, _) = small_optimizer(form, trained=True), trajectory_inputs(1, 240)
+    assert optimizer.config.context == blocks
+    before = optimizer.aggregate(relative, log_std, motion)
+    # The outermost steps of a block are what reaches farthest.
+    for step, side in ((15 * 8, -1), (15 * 8 + 7, 1)):
+        changed = relative.clone()
+        changed[0, step] += 0.1
+        after = optimizer.aggregate(changed, log_std, motion)
+        moved = (after.relative - before.relative).abs().sum(-1)
+        if before.features is not None and after.features is not None:
+            moved = moved + (after.features - before.features).abs().sum(-1)
+        farthest = moved[0].nonzero()[:, 0][0 if side < 0 else -1]
+        assert int(farthest) == 15 + side * blocks
 
 
 def test_a_step_over_lost_frames_is_corrected_no_more_than_others_and_does_not_drown_its_neighbours() -> None:

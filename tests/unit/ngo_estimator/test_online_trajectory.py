@@ -23,7 +23,7 @@ FORMS = ["loops", "paper"]
 def make(form: str = "loops", trained: bool = True, window_frames: int = 2000) -> OnlineTrajectory:
     return OnlineTrajectory(
         # Fresh and with gates that are learned from nothing, it passes the odometry on.
-        small_optimizer("learned" if form != "paper" and not trained else form, trained),
+        small_optimizer("learned" if form == "loops" and not trained else form, trained),
         None if form == "paper" else small_pair_head(),
         window_frames,
     )
@@ -118,8 +118,9 @@ def assert_sound(update: Seen) -> None:
 # ---- online equals offline
 
 
-@pytest.mark.parametrize("form", [*FORMS, "smoothed"])
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize(
+    ("form", "trained"), [*((form, trained) for form in FORMS for trained in (False, True)), ("smoothed", True)]
+)
 def test_after_every_step_it_equals_the_offline_optimizer_on_the_steps_so_far(form: str, trained: bool) -> None:
     core, steps = make(form, trained), make_steps(75)
     moved = 0.0
@@ -139,6 +140,27 @@ def test_after_every_step_it_equals_the_offline_optimizer_on_the_steps_so_far(fo
     else:
         assert_same_poses(update.poses_xyyaw, update.odometry_xyyaw, 1e-4)
         assert moved < 1e-3
+
+
+@pytest.mark.parametrize("form", ["loops", "smoothed"])
+@pytest.mark.parametrize("window_frames", [16, 40, 400])
+def test_meta_steps_and_features_are_those_of_all_steps_however_far_the_networks_reach(
+    form: str, window_frames: int
+) -> None:
+    core, steps = make(form, True, window_frames), make_steps(240)
+    inputs = [value[:1] for value in trajectory_inputs(1, 240)[:3]]
+    for count, step in enumerate(steps, start=1):
+        core.update(step)
+        if count % 8 == 0:
+            whole = core._optimizer.aggregate(*(value[:, :count] for value in inputs))
+            assert whole.features is not None
+            graph, first = core._graph, max(0, count - window_frames) // 8
+            for rows, expected in (
+                (graph._steps, whole.relative),
+                (graph._std, whole.std),
+                (graph._features, whole.features),
+            ):
+                np.testing.assert_allclose(rows.slice(first), expected[0, first:].numpy(), rtol=1e-4, atol=1e-5)
 
 
 def test_moved_is_how_far_each_pose_moved() -> None:

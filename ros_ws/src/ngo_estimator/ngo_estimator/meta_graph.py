@@ -20,10 +20,6 @@ from ngo_estimator.pose_aggregation import block_variances, poses_in_blocks
 from ngo_estimator.registered_odometry import registered_steps
 from ngo_estimator.rows import GrowingRows, SlidingRows
 
-_CONTEXT = 2
-"""Blocks on either side that a block's feature depends on: the convolutions reach 2 ** (halvings + 1) - 1 frames. What
-smooths the odometry may reach farther."""
-
 _MOST_DRIFT = 4.0
 """How much the variance between a key frame and the newest pose is taken to be more than the graph says."""
 
@@ -53,8 +49,7 @@ class MetaGraph:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
-        smoother = optimizer.config.smoother
-        self._context = max(_CONTEXT, 0 if smoother is None else smoother.context(self._block))
+        self._context = optimizer.config.context
         keep = (2 * self._context + 2) * self._block
         self.odometry = GrowingRows((3,), np.float64)
         self.odometry.append(np.zeros(3))

@@ -45,7 +45,8 @@ class NeuralGraphOptimizerConfig:
     current poses and takes a Gauss-Newton step that reduces them; ``search`` says which candidates there are. Without
     ``network`` this step is all there is: no attention and no convolutions, one learned factor for the odometry's
     deviations. With a ``smoother``, meta-poses are made of odometry that it has smoothed.
-    ``correction_std`` (m, m, rad), the typical error of a relative meta-pose, is the unit of the adjustments.
+    ``correction_std`` (m, m, rad), the typical error of a relative meta-pose as the local odometry has it, is the unit
+    of the adjustments.
     ``covariance_scale`` multiplies the covariance of a pose: how far errors were beyond it on validation.
     """
 
@@ -90,6 +91,13 @@ class NeuralGraphOptimizerConfig:
             raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
         if not 0.0 < self.covariance_scale < math.inf:
             raise ValueError(f"covariance_scale is {self.covariance_scale}; expected a positive number")
+
+    @property
+    def context(self) -> int:
+        """Blocks on either side that a block's relative meta-pose and feature depend on."""
+        reach = 0 if self.smoother is None else self.smoother.reach
+        reach += self.aggregation.reach if self.network else 0
+        return math.ceil(reach / self.aggregation.block)
 
     @property
     def registrations(self) -> int:

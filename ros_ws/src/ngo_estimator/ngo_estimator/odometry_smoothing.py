@@ -4,24 +4,23 @@ Not in the paper, which composes the local poses as they are. The local network 
 momentum, and what one step leaves open its neighbours often tell.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 _UNIT = 0.1
-"""Correction of a step by a head that says 1, in deviations of relative poses; one such deviation is the most."""
+"""Correction of a step by a head that says 1, in units of ``relative_std``, of which one is the most."""
 _LARGEST_INPUT = 10.0
-"""Steps of more deviations, as where frames were lost, look to their neighbours as if they had so many."""
+"""Steps of more ``relative_std``, as where frames were lost, look to their neighbours as if they had so many."""
 
 
 @dataclass(frozen=True)
 class SmootherConfig:
     """What an odometry smoother is made of.
 
-    ``relative_std`` (m, m, rad), the deviation of one step, normalises the relative poses. ``dilations`` holds one
-    number a convolution, of ``width`` channels each.
+    ``relative_std`` (m, m, rad), how much steps differ from each other, normalises the relative poses. ``dilations``
+    holds one number a convolution, of ``width`` channels each.
     """
 
     motion_feature_size: int
@@ -38,9 +37,10 @@ class SmootherConfig:
         if min(self.relative_std) <= 0.0:
             raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
 
-    def context(self, block: int) -> int:
-        """Blocks of so many steps, on either side, that a smoothed step depends on."""
-        return math.ceil(sum(self.dilations) / block)
+    @property
+    def reach(self) -> int:
+        """Steps on either side that a smoothed step depends on."""
+        return sum(self.dilations)
 
 
 class OdometrySmoother(nn.Module):

@@ -34,6 +34,11 @@ class PoseAggregationConfig:
         """Steps in a meta-pose."""
         return 2**self.halvings
 
+    @property
+    def reach(self) -> int:
+        """Steps before and after a block that its meta-feature depends on."""
+        return 2 * self.block - 1
+
 
 class PoseAggregation(nn.Module):
     """Temporal convolutions (k3 s1 p1) and max-poolings (k2 s2) in turn, over motion features and relative poses."""
