@@ -108,8 +108,9 @@ def registered(arrays: Arrays, pair_head: PairHead) -> np.ndarray:
 
 def smoothed(smoother: OdometrySmoother, arrays: Arrays) -> np.ndarray:
     """The odometry as our optimizer smooths it, from what was seen of each trajectory and nothing that follows."""
-    steps, _ = loop_factors.smoothed_odometry(smoother, arrays["relative"], arrays["log_std"], arrays["motion"])
-    return se2.r2g(_float64(steps)).numpy()
+    whole = prefix(arrays, _whole(arrays["relative"].shape[1], _BLOCK))
+    steps, _ = loop_factors.smoothed_odometry(smoother, whole["relative"], whole["log_std"], whole["motion"])
+    return _with_tail(se2.r2g(_float64(steps)), _float64(arrays["relative"])).numpy()
 
 
 def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
@@ -138,6 +139,11 @@ def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None
         raise ValueError(
             f"{optimizer_folder} was trained on features of other networks than the present ones; remove it to make "
             "it anew"
+        )
+    smooths = trained.get("odometry_smoother_sha256")  # where networks were tuned together, its copy has changed
+    if smooths is not None and load_smoother(sources.networks, sources.world.name)[1]["sha256"] != smooths:
+        raise ValueError(
+            f"{optimizer_folder} has another smoother than the one in {sources.networks}; remove it to make it anew"
         )
     identity = f"{trained['sha256']} {description['sha256']}"
     return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m, prepared), identity)

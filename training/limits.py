@@ -5,6 +5,7 @@ the networks have seen.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +15,9 @@ from torch import Tensor
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.loop_closure import Loops
+from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer
 from training.estimators import Arrays, Estimator, estimators, optimized_by, pose_graph
-from training.loop_factors import LoopFactors
+from training.loop_factors import LoopFactors, smoothed_odometry
 from training.pose_graph import PoseGraphSettings
 from training.rows import Sources
 from training.tune_pose_graph import load_settings
@@ -76,9 +78,28 @@ def limit_estimator(name: str, sources: Sources) -> Estimator:
         else:
             poses = pose_graph("gtsam", settings, pair_head, block_m)
     else:
-        optimizer, _ = load_optimizer(sources.row_folder(limit.row, 0), sources.world.name)
-        poses = optimized_by(optimizer, pair_head, block_m, known=exact_loops if limit.exact_loops else None)
+        trained, _ = load_optimizer(sources.row_folder(limit.row, 0), sources.world.name)
+        optimizer, smooth = apart(trained)
+        corrected = optimized_by(optimizer, pair_head, block_m, known=exact_loops if limit.exact_loops else None)
+        # What is true stays so: it is told after the odometry was smoothed.
+        return Estimator(lambda arrays: corrected(told(smooth(arrays), limit)), f"{name} {base.identity}")
     return Estimator(lambda arrays: poses(told(arrays, limit)), f"{name} {base.identity}")
+
+
+def apart(optimizer: NeuralGraphOptimizer) -> tuple[NeuralGraphOptimizer, Callable[[Arrays], Arrays]]:
+    """An optimizer without what smooths the odometry, and the arrays as that smooths them (whole blocks)."""
+    if optimizer.config.smoother is None:
+        return optimizer, lambda arrays: arrays
+    without = NeuralGraphOptimizer(replace(optimizer.config, smoother=None)).eval().requires_grad_(False)
+    values = optimizer.state_dict().items()
+    without.load_state_dict({name: value for name, value in values if not name.startswith("smoother.")})
+
+    def smooth(arrays: Arrays) -> Arrays:
+        odometry = (arrays[name] for name in ("relative", "log_std", "motion"))
+        relative, log_std = smoothed_odometry(optimizer.smoother, *odometry)
+        return {**arrays, "relative": relative, "log_std": log_std}
+
+    return without, smooth
 
 
 def _untouched(settings: PoseGraphSettings, limit: Limit) -> PoseGraphSettings:

@@ -36,6 +36,7 @@ from training.data_module import StreamedData
 from training.streams import Batch, Share, TrajectoryStream
 from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.train_optimizer import trajectory_loss
+from training.trajectories import rmse_figures
 from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
 
 
@@ -140,9 +141,7 @@ class EndToEndTraining(lightning.LightningModule):
         truth = se2.r2g(batch["relative"])
         figures: dict[str, float] = {}
         for name, poses in (("odometry", se2.r2g(relative)), ("corrected", result.poses)):
-            error = poses - truth
-            figures[f"{name}_m"] = float(error[..., :2].square().sum(-1).mean(1).sqrt().mean())
-            figures[f"{name}_deg"] = float(error[..., 2].square().mean(1).sqrt().rad2deg().mean())
+            figures |= {key: float(value) for key, value in rmse_figures(name, poses, truth).items()}
         steps = step_metrics(*(value.flatten(0, 1) for value in (relative, log_std, batch["relative"])))
         return {**figures, **{f"step_{name}": value for name, value in steps.items()}}
 

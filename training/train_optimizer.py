@@ -21,7 +21,6 @@ from torch.nn.functional import huber_loss
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import (
     OPTIMIZER,
-    CheckpointError,
     load_local,
     load_optimizer,
     load_place,
@@ -161,7 +160,11 @@ class OptimizerTraining(lightning.LightningModule):
         return last.meta_relative
 
     def validation_step(self, batch: Batch, _: int) -> None:
-        for name, poses in (("odometry", se2.r2g(batch["odometry"])), ("corrected", self(batch).poses)):
+        estimates = {"odometry": se2.r2g(batch["odometry"]), "corrected": self(batch).poses}
+        if self.optimizer.config.smoother is not None:
+            steps, _ = self.optimizer.smoother(batch["relative"], batch["log_std"], batch["motion"])
+            estimates["smoothed"] = se2.r2g(steps)
+        for name, poses in estimates.items():
             figures = rmse_figures(name, poses, batch["truth"])
             self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(poses), sync_dist=True)
 
@@ -196,7 +199,7 @@ def choices(arguments: Arguments, domain: Domain) -> Choices:
     given = arguments
     return Choices(
         domain.robust if given.robust is None else given.robust,
-        domain.smoothing and given.form == "loops" if given.smoothing is None else given.smoothing,
+        domain.smoothing and given.form != "paper" if given.smoothing is None else given.smoothing,
         domain.loops_per_pose if given.loops_per_pose is None else given.loops_per_pose,
         domain.max_loops if given.max_loops is None else given.max_loops,
         domain.optimizer_epochs if given.epochs is None else given.epochs,
@@ -247,6 +250,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     _, local_description = load_local(folder, domain.name)
     place, place_description = load_place(folder, domain.name)
     about: dict[str, Any] = {"place_encoder_sha256": place_description["sha256"]}
+    smooths: dict[str, Any] = {}
     if recorded is not None:
         about["data"] = recorded.about
     if NO_LOOPS in place_description:
@@ -255,9 +259,19 @@ def main(arguments: Arguments) -> dict[str, float]:
     stores = [features / "train", *(features / name for name in domain.validation_stores)]
     for store in stores:
         check_networks(store, local_description, place_description)
+    smoother: OdometrySmoother | None = None
+    if arguments.smoothing:
+        smoother, described = load_smoother(folder, domain.name)
+        smooths["odometry_smoother_sha256"] = described["sha256"]
     began = arguments.recordings.from_weights
     optimizer = None if began is None else load_optimizer(began)[0].requires_grad_(True).train()
-    config = config_of(arguments, domain, (1.0, 1.0, 1.0)) if optimizer is None else optimizer.config
+    made_of = None if smoother is None else smoother.config
+    config = config_of(arguments, domain, (1.0, 1.0, 1.0), made_of) if optimizer is None else optimizer.config
+    if config.smoother != made_of:
+        raise runs.RunError(
+            f"the optimizer in {began} {'does not smooth' if config.smoother is None else 'smooths'} the odometry; "
+            f"expected one that {'does not' if made_of is None else f'does so as the smoother in {folder}'}"
+        )
     search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
     train = StoredTrajectories(stores[:1], search, place.pair_head, block, arguments.compass)
@@ -271,14 +285,12 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "corrected_m",
         data=None if recorded is None else recorded.sha256,
-        settings={"single_share": domain.single_share, "loss_scale": domain.loss_scale},
+        settings={"single_share": domain.single_share, "loss_scale": domain.loss_scale, **smooths},
     )
     if optimizer is None:
-        smoother = _smoother(folder, domain.name, local_description, about) if arguments.smoothing else None
-        config = config_of(arguments, domain, correction_scale(train), None if smoother is None else smoother.config)
-        optimizer = NeuralGraphOptimizer(config)
-        if smoother is not None:
-            optimizer.smoother.load_state_dict(smoother.state_dict())
+        optimizer = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train), made_of))
+    if smoother is not None:
+        optimizer.smoother.load_state_dict(smoother.state_dict())
     training = OptimizerTraining(arguments, optimizer, domain)
     few = recorded is not None
     data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
@@ -286,12 +298,13 @@ def main(arguments: Arguments) -> dict[str, float]:
     metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
     if not run.is_first:
         return {}
-    details = {**about, "training": run.finish(metrics), "metrics": {"validation": metrics}}
+    details = {**about, **smooths, "training": run.finish(metrics), "metrics": {"validation": metrics}}
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
-    if recorded is not None and metrics["corrected_m"] > (1.0 - _LEAST_GAIN) * metrics["odometry_m"]:
+    without = min(metrics[name] for name in ("odometry_m", "smoothed_m") if name in metrics)
+    if recorded is not None and metrics["corrected_m"] > (1.0 - _LEAST_GAIN) * without:
         why = (
             f"on the validation part the corrected path ({metrics['corrected_m']:.3f} m) is not {_LEAST_GAIN:.0%} "
-            f"better than the odometry ({metrics['odometry_m']:.3f} m): record more, with more places seen again"
+            f"better than the odometry ({without:.3f} m): record more, with more places seen again"
         )
         return {**metrics, **_without_loops(arguments, domain, about, why)}
     path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
@@ -299,21 +312,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     return metrics
 
 
-def _smoother(folder: Path, name: str, local_description: dict[str, Any], about: dict[str, Any]) -> OdometrySmoother:
-    """The smoother in a folder, whose hash goes into ``about``; one of other odometry raises ``CheckpointError``."""
-    smoother, description = load_smoother(folder, name)
-    if description["local_pose_network_sha256"] != local_description["sha256"]:
-        raise CheckpointError(
-            f"{folder}: the odometry smoother was trained on another local network than the one beside it; train it "
-            "again"
-        )
-    about["odometry_smoother_sha256"] = description["sha256"]
-    return smoother
-
-
 def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], why: str) -> dict[str, float]:
     """Write an optimizer that returns the odometry: a fresh one of the paper's form."""
-    print(f"no loops will be closed: {why}")
+    print(f"no loops will be closed{' and nothing is smoothed' if arguments.smoothing else ''}: {why}")
     aggregation = config_of(arguments, domain, (1.0, 1.0, 1.0)).aggregation
     optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig.paper_form(aggregation, iterations=1))
     details = {NO_LOOPS: why, **about, "training": runs.record("train_optimizer", arguments), "metrics": {}}

@@ -17,7 +17,8 @@ import tyro
 from torch import Tensor
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, save_checkpoint
+from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
+from ngo_estimator.local_pose_network import LocalPoseConfig
 from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training import runs
@@ -45,7 +46,7 @@ class Arguments(runs.TrainerArguments):
     epochs: int = 300
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
-    """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
+    """Steps of the optimiser in an epoch; of recordings at most one for each stretch, or eight."""
     batch_size: int = 8
     """Trajectories in a step."""
     learning_rate: float = 3e-3
@@ -128,6 +129,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     for store in stores:
         check_networks(store, local_description, place_description)
     train, validation = (StoredTrajectories(s, None, place.pair_head, _BLOCK) for s in (stores[:1], stores[1:]))
+    made_with = {"local_pose_network_sha256": local_description["sha256"]}
     run = runs.Run(
         arguments.runs / domain.name / f"smoother-seed{arguments.seed}",
         "train_smoother",
@@ -136,17 +138,16 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "smoothed_m",
         data=None if recorded is None else recorded.sha256,
-        settings={"error_windows": ERROR_WINDOWS},
+        settings={"error_windows": ERROR_WINDOWS, **made_with},
     )
-    config = SmootherConfig(local.config.feature_size, local.config.relative_std)
     scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
-    training = SmootherTraining(arguments, OdometrySmoother(config), *scales)
+    training = SmootherTraining(arguments, _initial(arguments, local.config), *scales)
     data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, recorded is not None)
     run.fit(training, data)
     metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
     if not run.is_first:
         return {}
-    details: dict[str, Any] = {"local_pose_network_sha256": local_description["sha256"]}
+    details: dict[str, Any] = {**made_with}
     if recorded is not None:
         details["data"] = recorded.about
     details |= {"training": run.finish(metrics), "metrics": {"validation": metrics}}
@@ -154,6 +155,25 @@ def main(arguments: Arguments) -> dict[str, float]:
     save_checkpoint(path, training.smoother.cpu(), SMOOTHER, domain.name, details, half=True)
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics
+
+
+def _initial(arguments: Arguments, local: LocalPoseConfig) -> OdometrySmoother:
+    """A fresh smoother for steps of this local network, or the one of the weights to begin with.
+
+    Raises:
+        RunError: the weights are of a smoother for other steps.
+    """
+    config = SmootherConfig(local.feature_size, local.relative_std)
+    began = arguments.recordings.from_weights
+    if began is None:
+        return OdometrySmoother(config)
+    smoother = load_smoother(began)[0].requires_grad_(True).train()
+    if smoother.config.motion_feature_size != config.motion_feature_size:
+        raise runs.RunError(
+            f"the smoother in {began} takes {smoother.config.motion_feature_size} motion features; expected "
+            f"{config.motion_feature_size}, as the local network gives"
+        )
+    return smoother
 
 
 if __name__ == "__main__":

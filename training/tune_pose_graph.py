@@ -69,8 +69,10 @@ COMPASS_GRID: tuple[tuple[dict[str, Any], ...], ...] = (
 )
 """The same for the pose graph with a compass, which begins with what is best without."""
 
-_ARRAYS = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
+_ARRAYS = ("relative", "log_std", "codes", "origin_code", "truth")
 _COMPASS = ("compass", "compass_log_scale")
+_OF_FORM = {"smoothed": ("motion",), "compass": _COMPASS}
+"""What is read of a feature store for a form beside these."""
 FORMS = ("loops", "registered", "smoothed", "compass")
 REGISTRATIONS = 5
 """Steps of each registration for the pose graph, where scans are registered: as many as for our optimizer."""
@@ -232,7 +234,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     stores = [open_store(features / f"validation_{table}", with_compass) for table in world.unseen_tables]
     arrays = {
         name: np.concatenate([store[name][: arguments.trajectories or None] for store in stores])
-        for name in (*_ARRAYS, *(_COMPASS if with_compass else ()))
+        for name in (*_ARRAYS, *_OF_FORM.get(arguments.form, ()))
     }
     path = arguments.out / f"{world.name}.gtsam.json"
     pair_head = load_place(arguments.weights / world.name, world.name)[0].pair_head

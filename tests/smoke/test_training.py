@@ -134,12 +134,18 @@ def test_the_papers_form_trains_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_smoother_of_another_local_network_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.shrink(monkeypatch, 161, 400)
     prepare(tmp_path)
+    before = Path(shutil.copytree(tmp_path / "weights" / "maze2d", tmp_path / "before"))
     train_smoother.main(toy.smoother("maze2d", tmp_path))
     path = tmp_path / "weights" / "maze2d" / f"{SMOOTHER}.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "local_pose_network_sha256": "another"}))
     asked = dataclasses.replace(toy.optimizer("maze2d", tmp_path, form="paper"), smoothing=True)
     with pytest.raises(CheckpointError, match="was trained on another local network than the one beside it"):
         train_optimizer.main(asked)
+    # Nor does a run on the features of one network go on with those of another.
+    monkeypatch.setattr(train_smoother, "load_local", lambda folder, _: (load_local(before)[0], {"sha256": "another"}))
+    monkeypatch.setattr(train_smoother, "check_networks", lambda *_: None)
+    with pytest.raises(runs.RunError, match="given local_pose_network_sha256 another"):
+        train_smoother.main(toy.smoother("maze2d", tmp_path))
 
 
 def prepare(folder: Path) -> None:

@@ -30,7 +30,7 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
     import torch
 
     from ngo_estimator import se2
-    from training import evaluate, featurise, train_local, train_optimizer, train_place
+    from training import evaluate, featurise, train_local, train_optimizer, train_place, train_smoother
     from training.evaluate_recorded import with_origin
     from training.metrics import trajectory_error
     from training.recorded import RecordedArguments, open_recorded
@@ -67,11 +67,10 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
         )
     )
     featurise.main(featurise.Arguments(recordings=recordings, weights=folder / "weights", out=folder / "runs"))
-    train_optimizer.main(
-        train_optimizer.Arguments(
-            iterations=3, epochs=2, steps=6, batch_size=4, weights=folder / "weights", out=folder / "weights", **common
-        )
-    )
+    short: dict[str, Any] = {"epochs": 2, "steps": 6, "batch_size": 4, **common}
+    short |= {"weights": folder / "weights", "out": folder / "weights"}
+    train_smoother.main(train_smoother.Arguments(**short))
+    train_optimizer.main(train_optimizer.Arguments(iterations=3, smoothing=True, **short))
     table = evaluate.main(evaluate.Arguments(recordings=recordings, weights=folder / "weights", **places))
     hidden = sorted(name for name in sys.modules if name.partition(".")[0] in HIDDEN)
     return {**table, "untrained": sum(errors) / len(errors), "simulators": hidden}

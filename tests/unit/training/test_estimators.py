@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import PLACE, SMOOTHER, PlaceNetworks, save_checkpoint
+from ngo_estimator.checkpoint import PLACE, SMOOTHER, PlaceNetworks, load_local, save_checkpoint, write_untrained
 from ngo_estimator.compass_closure import frames_to_read
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import optimize_offline
@@ -131,9 +131,12 @@ def test_worlds_have_the_rows_that_are_theirs() -> None:
 
 def test_what_is_smoothed_is_what_our_optimizer_takes(tmp_path: Path) -> None:
     optimizer = small_optimizer("smoothed", trained=True)
+    write_untrained(tmp_path / "maze3d", "maze3d")
+    local = load_local(tmp_path / "maze3d")[1]["sha256"]
     place = PlaceNetworks(place_config("maze3d", code_size=12))
     for kind, network in ((SMOOTHER, optimizer.smoother), (PLACE, place)):
-        save_checkpoint(tmp_path / "maze3d" / f"{kind}.safetensors", network, kind, "maze3d", {})
+        of = {"local_pose_network_sha256": local}
+        save_checkpoint(tmp_path / "maze3d" / f"{kind}.safetensors", network, kind, "maze3d", of)
     sources = Sources(world_named("maze3d"), tmp_path, tmp_path, tmp_path)
     relative, log_std, motion, codes = (value.numpy() for value in trajectory_inputs(2, 40))
     some = {"relative": relative, "log_std": log_std, "motion": motion, "codes": codes, "origin_code": codes[:, :1]}

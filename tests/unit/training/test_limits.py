@@ -10,7 +10,7 @@ from ngo_estimator import se2
 from ngo_estimator.place_encoder import PairHead
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.estimators import Arrays, local, optimized_by, pose_graph, seen_in
-from training.limits import LIMITS, Limit, exact_factors, exact_loops, right_factors, told
+from training.limits import LIMITS, Limit, apart, exact_factors, exact_loops, right_factors, told
 from training.loop_factors import LoopFactors, exact_revisits, found_loops
 from training.pose_graph import PoseGraphSettings
 from training.rows import ROWS
@@ -50,6 +50,22 @@ def test_only_what_is_told_is_true() -> None:
     both = told(some, Limit("", "ngo_5", headings=True, positions=True))
     np.testing.assert_allclose(local(both)[..., :2], some["truth"][..., :2], atol=1e-4)
     assert told(some, Limit("", "ngo_5")) is some
+
+
+def test_what_is_told_is_not_smoothed_any_more(pair_head: PairHead) -> None:
+    some, optimizer = arrays(), small_optimizer("smoothed", trained=True)
+    bare, smooth = apart(optimizer)
+    assert bare.config.smoother is None
+    # In meta-poses the two are what the optimizer is; within these it spreads over the steps what smoothing changed.
+    whole, parts = optimized_by(optimizer, pair_head, 1.0)(some), optimized_by(bare, pair_head, 1.0)(smooth(some))
+    np.testing.assert_allclose(parts[:, BLOCK - 1 :: BLOCK], whole[:, BLOCK - 1 :: BLOCK], atol=0.05)
+    true = told(smooth(some), Limit("", "ngo_5", headings=True, positions=True))
+    steps = bare.aggregate(*(torch.from_numpy(true[name]).float() for name in ("relative", "log_std", "motion")))
+    ends = torch.from_numpy(some["truth"][:, BLOCK - 1 :: BLOCK])
+    torch.testing.assert_close(se2.wrapped(steps.relative - se2.g2r(ends)), torch.zeros(3, STEPS // BLOCK, 3).double(),
+                               atol=1e-4, rtol=0.0)  # fmt: skip
+    plain = small_optimizer("loops")
+    assert apart(plain)[0] is plain and apart(plain)[1](some) is some
 
 
 def test_exact_loops_agree_with_the_true_poses(pair_head: PairHead) -> None:

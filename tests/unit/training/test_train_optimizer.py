@@ -20,8 +20,11 @@ def test_a_world_says_what_suits_it() -> None:
 def test_what_is_given_counts() -> None:
     given = Arguments(world="maze3d", robust=True, smoothing=False, loops_per_pose=3, max_loops=7, epochs=1)
     assert choices(given, world_named("maze3d")) == Choices(True, False, 3, 7, 1)
-    # By itself only the form with loops and a network smooths.
-    assert not choices(Arguments(world="maze3d", form="gauss_newton"), world_named("maze3d")).smoothing
+
+
+def test_the_papers_form_does_not_smooth_by_itself() -> None:
+    for form, smooths in (("loops", True), ("gauss_newton", True), ("paper", False)):
+        assert choices(Arguments(world="maze3d", form=form), world_named("maze3d")).smoothing == smooths  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ngo_estimator import se2
-from ngo_estimator.checkpoint import SMOOTHER, save_checkpoint
+from ngo_estimator.checkpoint import SMOOTHER, load_local, save_checkpoint
 from ngo_estimator.compass_closure import frames_to_read
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
@@ -157,7 +157,8 @@ def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
     smoother = OdometrySmoother(SmootherConfig(1, (0.1, 0.02, 0.05)))
     with torch.no_grad():
         smoother.head.bias[2] = -2.0  # two tenths of 0.05 rad a step, which is what the odometry turns too much
-    save_checkpoint(weights / f"{SMOOTHER}.safetensors", smoother, SMOOTHER, "maze2d", {})
+    of = {"local_pose_network_sha256": load_local(weights)[1]["sha256"]}
+    save_checkpoint(weights / f"{SMOOTHER}.safetensors", smoother, SMOOTHER, "maze2d", of)
     smoothed = main(replace(arguments, form="smoothed", weights=tmp_path / "weights"))
     assert load_settings(tmp_path / "maze2d.gtsam_smoothed.json") == smoothed
     validation = json.loads((tmp_path / "maze2d.gtsam_smoothed.json").read_text())["validation"]

@@ -197,8 +197,17 @@ def load_place(weights: Path, world: str | None = None) -> tuple[PlaceNetworks, 
 
 
 def load_smoother(weights: Path, world: str | None = None) -> tuple[OdometrySmoother, dict[str, Any]]:
-    """The odometry smoother in the folder ``weights``: optimizers are trained with a copy of it."""
-    return load_network(weights / f"{SMOOTHER}.safetensors", SMOOTHER, OdometrySmoother, SmootherConfig, world)
+    """The odometry smoother in the folder ``weights``, of the local network beside it.
+
+    Optimizers are trained with a copy of it. Raises ``CheckpointError`` also if it was trained on the odometry of
+    another local network.
+    """
+    path = weights / f"{SMOOTHER}.safetensors"
+    smoother, description = load_network(path, SMOOTHER, OdometrySmoother, SmootherConfig, world)
+    local = load_description(weights / f"{LOCAL}.safetensors", LOCAL, world)
+    if description.get("local_pose_network_sha256") != local.get("sha256"):
+        raise CheckpointError(f"{path}: was trained on another local network than the one beside it; train it again")
+    return smoother, description
 
 
 def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraphOptimizer, dict[str, Any]]:

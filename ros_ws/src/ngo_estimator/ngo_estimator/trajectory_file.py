@@ -122,7 +122,11 @@ def write_tum(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Non
 
 
 def edges_of(trajectory: Any) -> list[PoseEdges]:
-    """The measurements that a ``Trajectory`` of ``OnlineTrajectory`` was made of: steps of the odometry, and loops."""
+    """The measurements that a ``Trajectory`` of ``OnlineTrajectory`` was made of: steps of the odometry, and loops.
+
+    Steps are as the local network measured them; what an optimizer makes of them (smoothing, adjustments, how far each
+    may bend) is in the poses alone.
+    """
     import torch  # takes seconds, and the nodes import this module before they check their parameters
 
     from ngo_estimator import se2
