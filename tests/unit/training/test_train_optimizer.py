@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import load_optimizer
+from ngo_estimator.checkpoint import load_optimizer, load_smoother
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.runs import WEIGHTS
 from training.train_optimizer import Arguments, Choices, OptimizerTraining, choices, config_of
@@ -33,6 +33,9 @@ def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None
     arguments = Arguments(world=world)
     made = config_of(arguments, world_named(world), shipped.correction_std, shipped.smoother)  # type: ignore[arg-type]
     assert replace(made, covariance_scale=shipped.covariance_scale) == shipped
+    assert (shipped.smoother is not None) == choices(arguments, world_named(world)).smoothing
+    if shipped.smoother is not None:
+        load_smoother(WEIGHTS / world, world)  # for whoever trains an optimizer anew; of the local network beside it
 
 
 @pytest.mark.parametrize(("form", "iterations"), [("learned", (1, 1, 3, 3)), ("paper", (3, 3, 3, 3))])
