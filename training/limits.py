@@ -90,9 +90,7 @@ def apart(optimizer: NeuralGraphOptimizer) -> tuple[NeuralGraphOptimizer, Callab
     """An optimizer without what smooths the odometry, and the arrays as that smooths them (whole blocks)."""
     if optimizer.config.smoother is None:
         return optimizer, lambda arrays: arrays
-    without = NeuralGraphOptimizer(replace(optimizer.config, smoother=None)).eval().requires_grad_(False)
-    values = optimizer.state_dict().items()
-    without.load_state_dict({name: value for name, value in values if not name.startswith("smoother.")})
+    without = optimizer.with_smoother(None).eval().requires_grad_(False)
 
     def smooth(arrays: Arrays) -> Arrays:
         odometry = (arrays[name] for name in ("relative", "log_std", "motion"))

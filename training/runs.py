@@ -71,7 +71,7 @@ def record(script: str, arguments: Any) -> dict[str, Any]:
             values[field.name] = value
         if value != field.default:
             flag = field.name.replace("_", "-")
-            if isinstance(value, bool):
+            if isinstance(value, bool) and field.default is not None:
                 changed.append(f"--{flag}" if value else f"--no-{flag}")
             else:
                 kept = values[field.name]

@@ -62,7 +62,8 @@ class Arguments(runs.TrainerArguments):
     compass: bool = False
     """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
     smoothing: bool | None = None
-    """Whether the odometry is smoothed before loops are closed; by default as suits the world."""
+    """Whether odometry is smoothed before loops are closed, as ``train_smoother`` learned to; by default as suits the
+    world, and not of recordings."""
     width: int = 64
     """Channels of aggregation and optimizer."""
     loops_per_pose: int | None = None
@@ -264,14 +265,13 @@ def main(arguments: Arguments) -> dict[str, float]:
         smoother, described = load_smoother(folder, domain.name)
         smooths["odometry_smoother_sha256"] = described["sha256"]
     began = arguments.recordings.from_weights
-    optimizer = None if began is None else load_optimizer(began)[0].requires_grad_(True).train()
+    optimizer = None if began is None else load_optimizer(began)[0]
+    if optimizer is not None:
+        if optimizer.config.smoother is not None:  # it knows the odometry of another local network
+            print(f"the smoother in {began} is left out{'' if smoother is None else ': the one trained here is taken'}")
+        optimizer = optimizer.with_smoother(smoother)
     made_of = None if smoother is None else smoother.config
     config = config_of(arguments, domain, (1.0, 1.0, 1.0), made_of) if optimizer is None else optimizer.config
-    if config.smoother != made_of:
-        raise runs.RunError(
-            f"the optimizer in {began} {'does not smooth' if config.smoother is None else 'smooths'} the odometry; "
-            f"expected one that {'does not' if made_of is None else f'does so as the smoother in {folder}'}"
-        )
     search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
     train = StoredTrajectories(stores[:1], search, place.pair_head, block, arguments.compass)
@@ -288,9 +288,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         settings={"single_share": domain.single_share, "loss_scale": domain.loss_scale, **smooths},
     )
     if optimizer is None:
-        optimizer = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train), made_of))
-    if smoother is not None:
-        optimizer.smoother.load_state_dict(smoother.state_dict())
+        fresh = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train), made_of))
+        optimizer = fresh.with_smoother(smoother)
     training = OptimizerTraining(arguments, optimizer, domain)
     few = recorded is not None
     data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)

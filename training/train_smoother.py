@@ -4,7 +4,7 @@
     python -m training.train_smoother --data drive_1.mcap drive_2.mcap --name my_robot
 
 Run again, it goes on where it was stopped. It ends with the weights written beside those of the other networks, from
-where ``train_optimizer --smoothing`` takes them.
+where ``train_optimizer`` takes them where it smooths (``--smoothing True``).
 """
 
 from dataclasses import dataclass, field

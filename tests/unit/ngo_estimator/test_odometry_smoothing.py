@@ -74,6 +74,19 @@ def test_meta_poses_are_those_of_the_smoothed_steps() -> None:
     assert torch.equal(steps.std, small_optimizer().aggregate(smoothed, deviations, motion).std)
 
 
+def test_an_optimizer_keeps_all_but_its_smoother() -> None:
+    smoothed, plain = small_optimizer("smoothed", trained=True), small_optimizer("loops", trained=True)
+    without = smoothed.with_smoother(None)
+    assert without.config.smoother is None
+    of_another = plain.with_smoother(smoothed.smoother)
+    assert of_another.config == smoothed.config
+    for changed, of in ((without, smoothed), (of_another, plain)):
+        kept = {name: value for name, value in of.state_dict().items() if not name.startswith("smoother.")}
+        assert all(torch.equal(changed.state_dict()[name], value) for name, value in kept.items())
+    copied, original = of_another.smoother.state_dict(), smoothed.smoother.state_dict()
+    assert copied.keys() == original.keys() and all(torch.equal(copied[name], original[name]) for name in copied)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -36,6 +36,7 @@ def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
 class Switches:
     compass: bool = False
     robust: bool = True
+    smoothing: bool | None = None
     prefixes: tuple[int, ...] = (1, 2)
 
 
@@ -44,6 +45,7 @@ class Switches:
     [
         (Switches(compass=True), " --compass"),
         (Switches(robust=False), " --no-robust"),
+        (Switches(smoothing=True), " --smoothing True"),
         (Switches(prefixes=(5, 6, 7)), " --prefixes 5 6 7"),
         (Switches(), ""),
     ],

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -218,6 +218,16 @@ class NeuralGraphOptimizer(nn.Module):
         if config.loops:
             self.place_gain = nn.Parameter(torch.tensor(0.0))
             self.stiffness = _zero(nn.Conv1d(width, 3, 1))
+
+    def with_smoother(self, smoother: OdometrySmoother | None) -> "NeuralGraphOptimizer":
+        """The same optimizer with a copy of another smoother, or without any."""
+        config = replace(self.config, smoother=None if smoother is None else smoother.config)
+        values = {name: value for name, value in self.state_dict().items() if not name.startswith("smoother.")}
+        if smoother is not None:
+            values |= {f"smoother.{name}": value for name, value in smoother.state_dict().items()}
+        changed = NeuralGraphOptimizer(config)
+        changed.load_state_dict(values)
+        return changed
 
     def attend(self, features: Tensor, place_similarity: Tensor | None) -> Tensor:
         """Attention weights ``(batch, poses, poses)`` of features ``(batch, poses, width)`` ("Attention Phase")."""
