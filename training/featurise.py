@@ -242,6 +242,16 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
         raise runs.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
+def training_stores(
+    folder: Path, domain: Domain, local_description: dict[str, Any], place_description: dict[str, Any]
+) -> tuple[list[Path], list[Path]]:
+    """The stores in ``folder`` to train on, and those to be measured on; raises ``RunError`` as ``check_networks``."""
+    train, validation = [folder / "train"], [folder / name for name in domain.validation_stores]
+    for store in (*train, *validation):
+        check_networks(store, local_description, place_description)
+    return train, validation
+
+
 def open_store(store: Path, with_compass: bool = False, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:
     """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
     names = [*stored, *(_COMPASS if with_compass else ())]

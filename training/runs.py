@@ -192,6 +192,11 @@ class Run:
         if self.best is not None:
             self.best.restore(training)
 
+    def validate(self, training: lightning.LightningModule, data: lightning.LightningDataModule) -> dict[str, float]:
+        """What the training logs of the validation data, as it is now."""
+        (logged,) = self.trainer.validate(training, datamodule=data, verbose=False)
+        return {name: float(value) for name, value in logged.items()}
+
     def finish(self, metrics: dict[str, Any]) -> dict[str, Any]:
         """Complete ``run.json``; returns the ``training`` entry of the JSON beside the weights."""
         training = {**self.record, "processes": self.trainer.world_size, **self.curves.figures()}

@@ -176,7 +176,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.epochs,
         arguments.seed,
         datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
-        settings={"error_windows": list(windows_within(arguments.steps, world)), **world.stream_settings},
+        settings={"error_windows": list(windows_within(arguments.steps, world.error_windows)), **world.stream_settings},
     )
     some = torch.cat([pairs["relative"] for pairs in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
     config = DeepVOConfig(
@@ -186,7 +186,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
         symmetric=world.mirrors,
     )
-    training = DeepVOTraining(arguments, DeepVO(config), windows_within(arguments.steps, world))
+    training = DeepVOTraining(arguments, DeepVO(config), windows_within(arguments.steps, world.error_windows))
 
     def stream(epoch: int, share: Share) -> StretchStream:
         a = arguments

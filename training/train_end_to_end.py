@@ -185,7 +185,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
         settings=world.stream_settings,
     )
-    windows = windows_within(arguments.steps, world)
+    windows = windows_within(arguments.steps, world.error_windows)
     training = EndToEndTraining(arguments, local, place, optimizer, world.block_m, world.loss_scale_rad, windows)
     # Mazes that neither the local network nor the feature store has seen.
     seeds = OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 2 :]

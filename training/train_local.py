@@ -237,9 +237,9 @@ def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, 
     return pose_loss + of_fused[0], likelihood + of_fused[1]
 
 
-def windows_within(steps: int, world: World) -> tuple[int, ...]:
-    """The world's ``error_windows`` that so many steps which follow each other have room for."""
-    return tuple(window for window in world.error_windows if window <= steps)
+def windows_within(steps: int, windows: tuple[int, ...]) -> tuple[int, ...]:
+    """Those of the ``windows`` that so many steps which follow each other have room for."""
+    return tuple(window for window in windows if window <= steps)
 
 
 def step_losses(

@@ -33,7 +33,7 @@ from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.domains import Domain
-from training.featurise import check_networks
+from training.featurise import training_stores
 from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
 from training.streams import Batch
 from training.trajectories import StoredTrajectories, StretchData, correction_scale, fixes_of, loops_of, rmse_figures
@@ -257,9 +257,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     if NO_LOOPS in place_description:
         return _without_loops(arguments, domain, about, str(place_description[NO_LOOPS]))
     features = arguments.runs / domain.name / "features"
-    stores = [features / "train", *(features / name for name in domain.validation_stores)]
-    for store in stores:
-        check_networks(store, local_description, place_description)
+    stores = training_stores(features, domain, local_description, place_description)
     smoother: OdometrySmoother | None = None
     if arguments.smoothing:
         smoother, described = load_smoother(folder, domain.name)
@@ -274,8 +272,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     config = config_of(arguments, domain, (1.0, 1.0, 1.0), made_of) if optimizer is None else optimizer.config
     search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
-    train = StoredTrajectories(stores[:1], search, place.pair_head, block, arguments.compass)
-    validation = StoredTrajectories(stores[1:], search, place.pair_head, block, arguments.compass)
+    train = StoredTrajectories(stores[0], search, place.pair_head, block, arguments.compass)
+    validation = StoredTrajectories(stores[1], search, place.pair_head, block, arguments.compass)
     form = arguments.form + ("-compass" if arguments.compass else "")
     run = runs.Run(
         arguments.runs / domain.name / f"optimizer-{form}-{arguments.iterations}-seed{arguments.seed}",
@@ -294,7 +292,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     few = recorded is not None
     data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)
-    metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
+    metrics = run.validate(training, data)
     if not run.is_first:
         return {}
     details = {**about, **smooths, "training": run.finish(metrics), "metrics": {"validation": metrics}}

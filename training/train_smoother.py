@@ -22,10 +22,10 @@ from ngo_estimator.local_pose_network import LocalPoseConfig
 from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training import runs
-from training.featurise import check_networks
+from training.featurise import training_stores
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.streams import Batch
-from training.train_local import LIKELIHOOD_WEIGHT, step_losses
+from training.train_local import LIKELIHOOD_WEIGHT, step_losses, windows_within
 from training.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
 from training.worlds import WorldName, world_named
 
@@ -111,7 +111,7 @@ def smoothing_loss(relative: Tensor, log_std: Tensor, truth: Tensor, step_std: T
     steps = se2.wrapped(relative - se2.g2r(truth))
     metas = se2.wrapped(in_blocks[..., -1, :] - se2.g2r(truth[:, _BLOCK - 1 :: _BLOCK]))
     deviations = 0.5 * block_variances(in_blocks.detach(), log_std).log()
-    windows = tuple(window for window in ERROR_WINDOWS if window <= metas.shape[1])
+    windows = windows_within(metas.shape[1], ERROR_WINDOWS)
     of_steps, _ = step_losses(steps, torch.zeros_like(steps), torch.zeros_like(steps), step_std)
     of_metas, likelihood = step_losses(metas, deviations, torch.zeros_like(metas), meta_std, windows)
     return of_steps + of_metas + LIKELIHOOD_WEIGHT * likelihood
@@ -125,10 +125,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     local, local_description = load_local(folder, domain.name)
     place, place_description = load_place(folder, domain.name)
     features = arguments.runs / domain.name / "features"
-    stores = [features / "train", *(features / name for name in domain.validation_stores)]
-    for store in stores:
-        check_networks(store, local_description, place_description)
-    train, validation = (StoredTrajectories(s, None, place.pair_head, _BLOCK) for s in (stores[:1], stores[1:]))
+    stores = training_stores(features, domain, local_description, place_description)
+    train, validation = (StoredTrajectories(some, None, place.pair_head, _BLOCK) for some in stores)
     made_with = {"local_pose_network_sha256": local_description["sha256"]}
     run = runs.Run(
         arguments.runs / domain.name / f"smoother-seed{arguments.seed}",
@@ -141,24 +139,25 @@ def main(arguments: Arguments) -> dict[str, float]:
         settings={"error_windows": ERROR_WINDOWS, **made_with},
     )
     scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
-    training = SmootherTraining(arguments, _initial(arguments, local.config), *scales)
+    smoother, begun = initial_smoother(arguments, local.config)
+    training = SmootherTraining(arguments, smoother, *scales)
     data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, recorded is not None)
     run.fit(training, data)
-    metrics = {k: float(v) for k, v in run.trainer.validate(training, datamodule=data, verbose=False)[0].items()}
+    metrics = run.validate(training, data)
     if not run.is_first:
         return {}
     details: dict[str, Any] = {**made_with}
     if recorded is not None:
         details["data"] = recorded.about
-    details |= {"training": run.finish(metrics), "metrics": {"validation": metrics}}
+    details |= {"training": {**run.finish(metrics), **begun}, "metrics": {"validation": metrics}}
     path = arguments.out / domain.name / f"{SMOOTHER}.safetensors"
     save_checkpoint(path, training.smoother.cpu(), SMOOTHER, domain.name, details, half=True)
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics
 
 
-def _initial(arguments: Arguments, local: LocalPoseConfig) -> OdometrySmoother:
-    """A fresh smoother for steps of this local network, or the one of the weights to begin with.
+def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[OdometrySmoother, dict[str, str]]:
+    """A fresh smoother, or that of the weights to begin with; and what the JSON beside the new weights says of it.
 
     Raises:
         RunError: the weights are of a smoother for other steps.
@@ -166,14 +165,14 @@ def _initial(arguments: Arguments, local: LocalPoseConfig) -> OdometrySmoother:
     config = SmootherConfig(local.feature_size, local.relative_std)
     began = arguments.recordings.from_weights
     if began is None:
-        return OdometrySmoother(config)
-    smoother = load_smoother(began)[0].requires_grad_(True).train()
+        return OdometrySmoother(config), {}
+    smoother, description = load_smoother(began)
     if smoother.config.motion_feature_size != config.motion_feature_size:
         raise runs.RunError(
             f"the smoother in {began} takes {smoother.config.motion_feature_size} motion features; expected "
             f"{config.motion_feature_size}, as the local network gives"
         )
-    return smoother
+    return smoother.requires_grad_(True).train(), {"began_with_sha256": description["sha256"]}
 
 
 if __name__ == "__main__":

@@ -103,15 +103,22 @@ def features(world: str, folder: Path) -> featurise.Arguments:
     )
 
 
+def _of_features(folder: Path) -> dict[str, Any]:
+    """What trainings on features have in common."""
+    return {
+        "steps": 3,
+        "batch_size": 2,
+        "weights": folder / "weights",
+        "out": folder / "weights",
+        "runs": folder / "runs",
+    }
+
+
 def smoother(world: Any, folder: Path, epochs: int = 1) -> train_smoother.Arguments:
     return train_smoother.Arguments(
         world=world,
         epochs=epochs,
-        steps=3,
-        batch_size=2,
-        weights=folder / "weights",
-        out=folder / "weights",
-        runs=folder / "runs",
+        **_of_features(folder),
     )
 
 
@@ -123,11 +130,7 @@ def optimizer(world: str, folder: Path, epochs: int = 1, form: str = "loops") ->
         width=16,
         max_loops=8,
         epochs=epochs,
-        steps=3,
-        batch_size=2,
-        weights=folder / "weights",
-        out=folder / "weights",
-        runs=folder / "runs",
+        **_of_features(folder),
     )
 
 

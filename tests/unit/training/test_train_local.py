@@ -119,7 +119,7 @@ def test_what_earlier_actions_tell_leaves_alone_what_is_seen() -> None:
 
 def test_windows_that_do_not_fit_are_left_out() -> None:
     world = dataclasses.replace(WORLDS["maze3d"], error_windows=(1, 4, 16))
-    assert windows_within(40, world) == (1, 4, 16) and windows_within(15, world) == (1, 4)
+    assert windows_within(40, world.error_windows) == (1, 4, 16) and windows_within(15, world.error_windows) == (1, 4)
 
 
 def test_calibration_removes_bias_and_scale(network: LocalPoseNetwork) -> None:

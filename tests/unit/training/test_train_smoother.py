@@ -1,11 +1,20 @@
 """What the smoother of the odometry learns from, and that nothing else changes what it has learned."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
 import torch
 
 from ngo_estimator import se2
+from ngo_estimator.checkpoint import SMOOTHER, load_local, load_smoother, save_checkpoint, write_untrained
+from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from tests.unit.ngo_estimator.samples import small_optimizer, trajectory_inputs
+from training.recorded import RecordedArguments
+from training.runs import RunError
 from training.train_optimizer import Arguments, OptimizerTraining
-from training.train_smoother import smoothing_loss
+from training.train_smoother import Arguments as SmootherArguments
+from training.train_smoother import initial_smoother, smoothing_loss
 from training.worlds import world_named
 
 STEP_STD, META_STD = torch.tensor([0.01, 0.01, 0.004]), torch.tensor([0.05, 0.04, 0.02])
@@ -40,6 +49,23 @@ def test_deviations_learn_from_errors_and_not_the_other_way_round() -> None:
         again = (steps + 0.003).requires_grad_()
         smoothing_loss(again, torch.full_like(steps, -3.0), truth, STEP_STD.double(), META_STD.double()).backward()
         torch.testing.assert_close(again.grad, gradient)
+
+
+def test_it_begins_with_the_weights_that_are_given_and_says_so(tmp_path: Path) -> None:
+    write_untrained(tmp_path, "maze3d")
+    local, description = load_local(tmp_path)
+    smoother = OdometrySmoother(SmootherConfig(local.config.feature_size, local.config.relative_std, (1, 2), 8))
+    smoother.head.bias.data.fill_(0.5)
+    of = {"local_pose_network_sha256": description["sha256"]}
+    save_checkpoint(tmp_path / f"{SMOOTHER}.safetensors", smoother, SMOOTHER, "maze3d", of)
+    given = SmootherArguments(world="maze3d", recordings=RecordedArguments(from_weights=tmp_path))
+    began, said = initial_smoother(given, local.config)
+    assert torch.equal(began.head.bias, smoother.head.bias) and began.head.bias.requires_grad and began.training
+    assert said == {"began_with_sha256": load_smoother(tmp_path)[1]["sha256"]}
+    fresh, said = initial_smoother(SmootherArguments(world="maze3d"), local.config)
+    assert not fresh.head.bias.any() and said == {}
+    with pytest.raises(RunError, match="takes 64 motion features; expected 5, as the local network gives"):
+        initial_smoother(given, replace(local.config, feature_size=5))
 
 
 def test_the_optimizer_that_it_is_part_of_leaves_it_as_it_is() -> None:

@@ -57,11 +57,11 @@ class MetaGraph:
         self._log_std = SlidingRows((3,), np.float32, keep)
         config = optimizer.config.aggregation
         self._motion = SlidingRows((config.motion_feature_size,), np.float32, keep)
-        keep = max(window, self._context) + 2
-        self._steps = SlidingRows((3,), np.float32, keep)
-        self._std = SlidingRows((3,), np.float32, keep)
-        self._optimized_std = SlidingRows((3,), np.float64, keep)
-        self._features = SlidingRows((config.width,), np.float32, keep)
+        blocks_kept = max(window, self._context) + 2
+        self._steps = SlidingRows((3,), np.float32, blocks_kept)
+        self._std = SlidingRows((3,), np.float32, blocks_kept)
+        self._optimized_std = SlidingRows((3,), np.float64, blocks_kept)
+        self._features = SlidingRows((config.width,), np.float32, blocks_kept)
         self._nodes = GrowingRows((3,), np.float64)
         self._nodes.append(np.zeros(3))
         self._first = 0  # node where the window begins
