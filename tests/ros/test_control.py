@@ -37,13 +37,11 @@ def parameters(weights: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def optimizer(weights: Path, parameters: dict[str, Any]) -> Iterator[Optimizer]:
-    probe = Probe()
-    with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
         yield Optimizer(process, weights, probe)
         process.send(signal.SIGINT)
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log
-    probe.close()
 
 
 def xyyaw(pose: Any) -> np.ndarray:
@@ -216,24 +214,30 @@ def test_what_cannot_change_is_refused_in_one_line(optimizer: Optimizer) -> None
 
 def test_quality_of_service_is_overridden_by_ros_own_parameters(parameters: dict[str, Any]) -> None:
     """A path that is latched by the middleware, as some tools ask for; and what is no quality of service."""
-    probe = Probe("qos_probe")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    override = "qos_overrides./latched/ngo/path.publisher"
-    arguments = ("-r", "__ns:=/latched", "-p", f"{override}.durability:=transient_local", "-p", f"{override}.depth:=3")
-    with NodeProcess("ngo_estimator", "ngo_node", parameters, arguments) as process:
-        process.wait_for_log("ready")
-        probe.collect(PathMessage, "/latched/ngo/path", latched)
+    with Probe("qos_probe") as probe:
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        override = "qos_overrides./latched/ngo/path.publisher"
+        arguments = (
+            "-r",
+            "__ns:=/latched",
+            "-p",
+            f"{override}.durability:=transient_local",
+            "-p",
+            f"{override}.depth:=3",
+        )
+        with NodeProcess("ngo_estimator", "ngo_node", parameters, arguments) as process:
+            process.wait_for_log("ready")
+            probe.collect(PathMessage, "/latched/ngo/path", latched)
 
-        def durability() -> object:
-            infos = probe.node.get_publishers_info_by_topic("/latched/ngo/path")
-            return infos[0].qos_profile.durability if infos else None
+            def durability() -> object:
+                infos = probe.node.get_publishers_info_by_topic("/latched/ngo/path")
+                return infos[0].qos_profile.durability if infos else None
 
-        probe.spin_until(lambda: durability() == DurabilityPolicy.TRANSIENT_LOCAL, "a latched path")
-    bad = ("-r", "__ns:=/latched", "-p", f"{override}.reliability:=sometimes")
-    with NodeProcess("ngo_estimator", "ngo_node", parameters, bad) as process:
-        assert process.wait() == 2, process.log
-        assert len(process.lines) == 1 and "reliability" in process.log.lower(), process.log
-    probe.close()
+            probe.spin_until(lambda: durability() == DurabilityPolicy.TRANSIENT_LOCAL, "a latched path")
+        bad = ("-r", "__ns:=/latched", "-p", f"{override}.reliability:=sometimes")
+        with NodeProcess("ngo_estimator", "ngo_node", parameters, bad) as process:
+            assert process.wait() == 2, process.log
+            assert len(process.lines) == 1 and "reliability" in process.log.lower(), process.log
 
 
 # ---- life cycle
@@ -257,44 +261,44 @@ class Managed:
 
 
 def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: dict[str, Any]) -> None:
-    probe, name = Probe("manager"), "/managed/ngo_node"
-    waiting = {**parameters, "autostart": False, "weights": "/nowhere"}
-    with NodeProcess("ngo_estimator", "ngo_node", waiting, ("-r", "__ns:=/managed")) as process:
-        node = Managed(probe, name)
-        assert node.state() == "unconfigured"
-        assert not node.change(Transition.TRANSITION_CONFIGURE)
-        assert node.state() == "unconfigured"
-        process.wait_for_log("ERROR.*there is no folder '/nowhere'")
-        # Unconfigured, everything may change: it takes part when the node is configured.
-        assert probe.set_parameter(name, "weights", str(weights)) == ""
-        assert node.change(Transition.TRANSITION_CONFIGURE) and node.state() == "inactive"
-        assert "cannot change now" in probe.set_parameter(name, "weights", "")
-        assert probe.node.count_subscribers("/managed/relative_pose") == 0
-        assert node.change(Transition.TRANSITION_ACTIVATE) and node.state() == "active"
-        optimizer = Optimizer(process, weights, probe, "/managed")
-        drive = optimizer.drive()
-        optimizer.pose_after(*drive.steps(1, 10))
-        # Deactivated it listens no more; what it has missed is a gap that the odometry bridges.
-        assert node.change(Transition.TRANSITION_DEACTIVATE) and node.state() == "inactive"
-        probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 0, "ngo_node to stop listening")
-        optimizer.publish(*drive.steps(11, 15))
-        assert node.change(Transition.TRANSITION_ACTIVATE)
-        probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 1, "ngo_node to listen again")
-        pose = optimizer.pose_after(*drive.steps(16, 17))
-        assert_pose_is(pose, optimizer.expected([*drive.steps(1, 10), *drive.steps(16, 17)]))
-        # Cleaned up it has forgotten everything.
-        assert node.change(Transition.TRANSITION_DEACTIVATE) and node.change(Transition.TRANSITION_CLEANUP)
-        assert node.state() == "unconfigured"
-        assert node.change(Transition.TRANSITION_CONFIGURE) and node.change(Transition.TRANSITION_ACTIVATE)
-        optimizer.drive()
-        optimizer.connect()
-        drive = optimizer.drive()
-        assert_pose_is(optimizer.pose_after(*drive.steps(1, 5)), optimizer.expected(drive.steps(1, 5)))
-        assert node.change(Transition.TRANSITION_ACTIVE_SHUTDOWN) and node.state() == "finalized"
-        process.send(signal.SIGINT)
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
-    probe.close()
+    name = "/managed/ngo_node"
+    with Probe("manager") as probe:
+        waiting = {**parameters, "autostart": False, "weights": "/nowhere"}
+        with NodeProcess("ngo_estimator", "ngo_node", waiting, ("-r", "__ns:=/managed")) as process:
+            node = Managed(probe, name)
+            assert node.state() == "unconfigured"
+            assert not node.change(Transition.TRANSITION_CONFIGURE)
+            assert node.state() == "unconfigured"
+            process.wait_for_log("ERROR.*there is no folder '/nowhere'")
+            # Unconfigured, everything may change: it takes part when the node is configured.
+            assert probe.set_parameter(name, "weights", str(weights)) == ""
+            assert node.change(Transition.TRANSITION_CONFIGURE) and node.state() == "inactive"
+            assert "cannot change now" in probe.set_parameter(name, "weights", "")
+            assert probe.node.count_subscribers("/managed/relative_pose") == 0
+            assert node.change(Transition.TRANSITION_ACTIVATE) and node.state() == "active"
+            optimizer = Optimizer(process, weights, probe, "/managed")
+            drive = optimizer.drive()
+            optimizer.pose_after(*drive.steps(1, 10))
+            # Deactivated it listens no more; what it has missed is a gap that the odometry bridges.
+            assert node.change(Transition.TRANSITION_DEACTIVATE) and node.state() == "inactive"
+            probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 0, "ngo_node to stop listening")
+            optimizer.publish(*drive.steps(11, 15))
+            assert node.change(Transition.TRANSITION_ACTIVATE)
+            probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 1, "ngo_node to listen again")
+            pose = optimizer.pose_after(*drive.steps(16, 17))
+            assert_pose_is(pose, optimizer.expected([*drive.steps(1, 10), *drive.steps(16, 17)]))
+            # Cleaned up it has forgotten everything.
+            assert node.change(Transition.TRANSITION_DEACTIVATE) and node.change(Transition.TRANSITION_CLEANUP)
+            assert node.state() == "unconfigured"
+            assert node.change(Transition.TRANSITION_CONFIGURE) and node.change(Transition.TRANSITION_ACTIVATE)
+            optimizer.drive()
+            optimizer.connect()
+            drive = optimizer.drive()
+            assert_pose_is(optimizer.pose_after(*drive.steps(1, 5)), optimizer.expected(drive.steps(1, 5)))
+            assert node.change(Transition.TRANSITION_ACTIVE_SHUTDOWN) and node.state() == "finalized"
+            process.send(signal.SIGINT)
+            assert process.wait() == 0, process.log
+            assert "Traceback" not in process.log, process.log
 
 
 # ---- several robots
@@ -302,8 +306,7 @@ def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: di
 
 @pytest.mark.parametrize("shared_tf", [True, False], ids=["one tf", "a tf each"])
 def test_two_robots_in_one_domain_do_not_meet(weights: Path, parameters: dict[str, Any], shared_tf: bool) -> None:
-    probe = Probe("two_robots")
-    with ExitStack() as stack:
+    with Probe("two_robots") as probe, ExitStack() as stack:
         robots = {}
         for seed, name in enumerate(("red", "blue")):
             own = {"frame_prefix": f"{name}/"} if shared_tf else {"tf_topic": "tf"}
@@ -330,4 +333,3 @@ def test_two_robots_in_one_domain_do_not_meet(weights: Path, parameters: dict[st
         for name, topic in zip(("red", "blue"), topics, strict=True):
             frames = [(m.transforms[0].header.frame_id, m.transforms[0].child_frame_id) for m in transforms[topic]]
             assert frames.count((f"{prefixes[name]}map", f"{prefixes[name]}odom")) == 28
-    probe.close()

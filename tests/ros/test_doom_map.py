@@ -19,9 +19,8 @@ SCENARIO = {"wad": "my_way_home.wad", "map": "map01"}
 
 @pytest.fixture
 def probe() -> Iterator[Probe]:
-    probe = Probe()
-    yield probe
-    probe.close()
+    with Probe() as probe:
+        yield probe
 
 
 def stamps(messages: list[Image] | list[Odometry] | list[PoseWithCovarianceStamped]) -> list[int]:

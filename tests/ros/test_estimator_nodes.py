@@ -53,8 +53,8 @@ def graph(weights: Path) -> Iterator[Graph]:
         "weights": str(weights / "maze2d"),
         "diagnostics_period_s": 0.1,
     }
-    probe = Probe()
     with (
+        Probe() as probe,
         NodeProcess(
             "ngo_estimator", "local_node", {**shared, "image_reliability": "reliable", "image_depth": 1000}
         ) as local,
@@ -63,7 +63,6 @@ def graph(weights: Path) -> Iterator[Graph]:
         graph = Graph(local, ngo, weights / "maze2d", probe)
         graph.connect()
         yield graph
-    probe.close()
 
 
 def test_nodes_equal_their_cores(graph: Graph) -> None:
@@ -257,13 +256,10 @@ def test_reset_forgets_the_trajectory(graph: Graph, tmp_path: Path) -> None:
 
 def test_who_comes_late_gets_the_newest_path_at_once(graph: Graph) -> None:
     graph.finish_run(frames=5)
-    late = Probe("late_probe")
-    try:
+    with Probe("late_probe") as late:
         paths = late.collect(PathMessage, "ngo/path")
         late.spin_until(lambda: paths, "a path without new frames")
         assert paths[0] == graph.out.paths[-1]
-    finally:
-        late.close()
 
 
 def test_diagnostics_tell_rates_times_and_the_window(graph: Graph) -> None:
@@ -308,8 +304,7 @@ def test_switches_names_and_the_3d_world(weights: Path) -> None:
         "publish_tf": False,
         "odom_frame": "drift",
     }
-    probe = Probe("probe_3d")
-    with ExitStack() as stack:
+    with Probe("probe_3d") as probe, ExitStack() as stack:
         local = stack.enter_context(
             NodeProcess(
                 "ngo_estimator",
@@ -355,23 +350,21 @@ def test_switches_names_and_the_3d_world(weights: Path) -> None:
         for process in (local, ngo):
             assert process.wait() == 0, process.log
             assert "Traceback" not in process.log, process.log
-    probe.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["sigint", "sigterm"])
 def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path, number: signal.Signals) -> None:
     """The node is in the graph before it loads its networks, which takes long."""
-    probe = Probe("start_probe")
-    parameters = {"world": "maze2d", "weights": str(weights / "maze2d")}
-    with NodeProcess("ngo_estimator", "ngo_node", parameters, ("-r", f"__ns:=/{number.name}")) as process:
-        probe.spin_until(
-            lambda: ("ngo_node", f"/{number.name}") in probe.node.get_node_names_and_namespaces(),
-            "the node",
-        )
-        process.send(number)
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
-    probe.close()
+    with Probe("start_probe") as probe:
+        parameters = {"world": "maze2d", "weights": str(weights / "maze2d")}
+        with NodeProcess("ngo_estimator", "ngo_node", parameters, ("-r", f"__ns:=/{number.name}")) as process:
+            probe.spin_until(
+                lambda: ("ngo_node", f"/{number.name}") in probe.node.get_node_names_and_namespaces(),
+                "the node",
+            )
+            process.send(number)
+            assert process.wait() == 0, process.log
+            assert "Traceback" not in process.log, process.log
 
 
 BAD_STARTS = """

@@ -48,18 +48,17 @@ def parameters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def graph(parameters: dict[str, Any]) -> Iterator[Graph]:
     """A running, connected pair of estimators."""
-    probe = Probe()
-    local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
-    with (
-        NodeProcess("ngo_estimator", "local_node", local) as local_node,
-        NodeProcess("ngo_estimator", "ngo_node", {**parameters, "path_rate_hz": 0.0}) as ngo_node,
-    ):
-        graph = Graph(local_node, ngo_node, Path(parameters["weights"]), probe)
-        graph.connect()
-        yield graph
-        for process in (local_node, ngo_node):
-            assert process.running and "Traceback" not in process.log, process.log
-    probe.close()
+    with Probe() as probe:
+        local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
+        with (
+            NodeProcess("ngo_estimator", "local_node", local) as local_node,
+            NodeProcess("ngo_estimator", "ngo_node", {**parameters, "path_rate_hz": 0.0}) as ngo_node,
+        ):
+            graph = Graph(local_node, ngo_node, Path(parameters["weights"]), probe)
+            graph.connect()
+            yield graph
+            for process in (local_node, ngo_node):
+                assert process.running and "Traceback" not in process.log, process.log
 
 
 def wait_for_problem(probe: Probe, node: str, diagnostics: list[DiagnosticArray], *texts: str) -> None:
@@ -204,41 +203,40 @@ def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, p
 
 def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: dict[str, Any]) -> None:
     """What moved meanwhile is unknown, and nothing is made up for it."""
-    probe = Probe("returning")
-    local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
-    arguments = ("-r", "__ns:=/returning")
-    with ExitStack() as stack:
-        ngo = stack.enter_context(NodeProcess("ngo_estimator", "ngo_node", parameters, arguments))
-        images = probe.node.create_publisher(Image, "/returning/image", 1000)
-        actions = probe.node.create_publisher(DiscreteAction, "/returning/action", 1000)
-        relative_poses = probe.collect(RelativePose, "/returning/relative_pose")
-        poses = probe.collect(PoseWithCovarianceStamped, "/returning/ngo/pose")
-        ngo.wait_for_log("ready")
-        step = 0
+    with Probe("returning") as probe:
+        local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
+        arguments = ("-r", "__ns:=/returning")
+        with ExitStack() as stack:
+            ngo = stack.enter_context(NodeProcess("ngo_estimator", "ngo_node", parameters, arguments))
+            images = probe.node.create_publisher(Image, "/returning/image", 1000)
+            actions = probe.node.create_publisher(DiscreteAction, "/returning/action", 1000)
+            relative_poses = probe.collect(RelativePose, "/returning/relative_pose")
+            poses = probe.collect(PoseWithCovarianceStamped, "/returning/ngo/pose")
+            ngo.wait_for_log("ready")
+            step = 0
 
-        def drive_until_heard(after_ns: int) -> int:
-            """Until there are poses of an odometry that began later; returns when it did."""
+            def drive_until_heard(after_ns: int) -> int:
+                """Until there are poses of an odometry that began later; returns when it did."""
 
-            def origin_ns() -> int:
-                return to_ns(relative_poses[-1].origin_stamp) if relative_poses else 0
+                def origin_ns() -> int:
+                    return to_ns(relative_poses[-1].origin_stamp) if relative_poses else 0
 
-            def heard() -> bool:
-                nonlocal step
-                stamp = to_time(RUN_NS + step * STEP_NS)
-                actions.publish(DiscreteAction(header=Image().header.__class__(stamp=stamp), action=0))
-                step += 1
-                images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
-                return origin_ns() > after_ns and bool(poses) and to_ns(poses[-1].header.stamp) > origin_ns()
+                def heard() -> bool:
+                    nonlocal step
+                    stamp = to_time(RUN_NS + step * STEP_NS)
+                    actions.publish(DiscreteAction(header=Image().header.__class__(stamp=stamp), action=0))
+                    step += 1
+                    images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
+                    return origin_ns() > after_ns and bool(poses) and to_ns(poses[-1].header.stamp) > origin_ns()
 
-            probe.spin_until(heard, "relative poses")
-            return origin_ns()
+                probe.spin_until(heard, "relative poses")
+                return origin_ns()
 
-        with NodeProcess("ngo_estimator", "local_node", local, arguments) as process:
-            first_ns = drive_until_heard(0)
-            process.send(signal.SIGKILL)
-            process.wait()
-        stack.enter_context(NodeProcess("ngo_estimator", "local_node", local, arguments))
-        assert drive_until_heard(first_ns) > first_ns
-        ngo.wait_for_log("the relative poses have a new origin: their source restarted")
-        assert "only the first that was heard" not in ngo.log
-    probe.close()
+            with NodeProcess("ngo_estimator", "local_node", local, arguments) as process:
+                first_ns = drive_until_heard(0)
+                process.send(signal.SIGKILL)
+                process.wait()
+            stack.enter_context(NodeProcess("ngo_estimator", "local_node", local, arguments))
+            assert drive_until_heard(first_ns) > first_ns
+            ngo.wait_for_log("the relative poses have a new origin: their source restarted")
+            assert "only the first that was heard" not in ngo.log

@@ -43,12 +43,10 @@ def parameters(weights: Path) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def optimizer(weights: Path, parameters: dict[str, object]) -> Iterator[Optimizer]:
-    probe = Probe()
-    with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
         yield Optimizer(process, weights, probe)
         assert process.running, process.log
         assert "Traceback" not in process.log, process.log
-    probe.close()
 
 
 def test_lost_steps_become_a_gap_with_a_large_covariance(optimizer: Optimizer) -> None:
@@ -340,25 +338,24 @@ def test_a_killed_node_that_comes_back_goes_on_in_the_middle(weights: Path, para
 
 def test_a_clock_that_stands_still_or_jumps_stops_nothing(weights: Path, parameters: dict[str, object]) -> None:
     """With use_sim_time: stamps come from the input, and pace and diagnostics from a clock that always goes on."""
-    probe = Probe("clock")
-    clock = probe.node.create_publisher(Clock, "/clock", 10)
-    simulated = {**parameters, "use_sim_time": True}
-    with NodeProcess("ngo_estimator", "ngo_node", simulated, ("-r", "__ns:=/simulated")) as process:
-        optimizer = Optimizer(process, weights, probe, "/simulated")
-        paths = probe.collect(PathMessage, "/simulated/ngo/path")
-        probe.spin_until(lambda: probe.node.count_subscribers("/simulated/ngo/path") == 1, "a subscription")
-        for clock_s in (0, 100, 100, 3):
-            clock.publish(Clock(clock=to_time(clock_s * 10**9)))
-            drive = optimizer.drive()
-            optimizer.publish(*drive.steps(1, 12))
-            pose = optimizer.wait_for_stamp(drive.stamp_ns(12))
-            assert_pose_is(pose, optimizer.expected(drive.steps(1, 12)))
-            probe.spin_until(lambda: paths and to_ns(paths[-1].header.stamp) == drive.stamp_ns(12), "the path")  # noqa: B023
-            optimizer.wait_for_value("frames", "13".__eq__)
-        assert to_ns(optimizer.diagnostics[-1].header.stamp) == drive.stamp_ns(12)
-        process.send(signal.SIGINT)
-        assert process.wait() == 0, process.log
-    probe.close()
+    with Probe("clock") as probe:
+        clock = probe.node.create_publisher(Clock, "/clock", 10)
+        simulated = {**parameters, "use_sim_time": True}
+        with NodeProcess("ngo_estimator", "ngo_node", simulated, ("-r", "__ns:=/simulated")) as process:
+            optimizer = Optimizer(process, weights, probe, "/simulated")
+            paths = probe.collect(PathMessage, "/simulated/ngo/path")
+            probe.spin_until(lambda: probe.node.count_subscribers("/simulated/ngo/path") == 1, "a subscription")
+            for clock_s in (0, 100, 100, 3):
+                clock.publish(Clock(clock=to_time(clock_s * 10**9)))
+                drive = optimizer.drive()
+                optimizer.publish(*drive.steps(1, 12))
+                pose = optimizer.wait_for_stamp(drive.stamp_ns(12))
+                assert_pose_is(pose, optimizer.expected(drive.steps(1, 12)))
+                probe.spin_until(lambda: paths and to_ns(paths[-1].header.stamp) == drive.stamp_ns(12), "the path")  # noqa: B023
+                optimizer.wait_for_value("frames", "13".__eq__)
+            assert to_ns(optimizer.diagnostics[-1].header.stamp) == drive.stamp_ns(12)
+            process.send(signal.SIGINT)
+            assert process.wait() == 0, process.log
 
 
 def test_nothing_is_left_of_a_burst_of_rubbish(optimizer: Optimizer) -> None:

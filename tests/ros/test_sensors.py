@@ -35,9 +35,8 @@ WAITING = {"wait_for_flow_control": True, "wait_for_subscribers": 1}
 def probe() -> Iterator[Probe]:
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    probe = Probe()
-    yield probe
-    probe.close()
+    with Probe() as probe:
+        yield probe
 
 
 def assert_same_motion(core: LocalOdometry, message: RelativePose, image: np.ndarray, twist: np.ndarray | None) -> None:

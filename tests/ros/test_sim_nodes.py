@@ -38,9 +38,8 @@ DRIVERS = {"maze2d": "corners", "maze3d": "random_goals"}
 
 @pytest.fixture
 def probe() -> Iterator[Probe]:
-    probe = Probe()
-    yield probe
-    probe.close()
+    with Probe() as probe:
+        yield probe
 
 
 def simulator(world: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:

@@ -27,45 +27,44 @@ def test_two_robots_drive_at_once(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     write_untrained(tmp_path, "maze2d")
-    probe = Probe()
-    steps = {name: probe.collect(RelativePose, f"/{name}/relative_pose", 5000) for name in ROBOTS}
-    poses = {name: probe.collect(PoseWithCovarianceStamped, f"/{name}/ngo/pose", 5000) for name in ROBOTS}
-    transforms = probe.collect(TFMessage, "/tf", 5000)
-    mazes: dict[str, dict[str, object]] = {}
-    with ExitStack() as stack:
-        for seed, name in enumerate(ROBOTS):
-            shared = {"world": "maze2d", "weights": str(tmp_path), "frame_prefix": f"{name}/"}
-            local = {**shared, "image_reliability": "reliable", "image_depth": 100}
-            # At rate 0 it waits for its own two estimators, and publishes no frame that they do not take.
-            maze = {
-                "seed": seed,
-                "frames": FRAMES,
-                "rate": 0.0,
-                "wait_for_subscribers": 1,
-                "wait_for_flow_control": True,
-            }
-            for executable, parameters in (("ngo_node", shared), ("local_node", local)):
-                stack.enter_context(NodeProcess("ngo_estimator", executable, parameters, ("-r", f"__ns:=/{name}")))
-            mazes[name] = maze
-        # Simulators wait for their own estimators alone, so that these and the probe must have found each other before.
-        topics = [f"/{name}/{topic}" for name in ROBOTS for topic in ("relative_pose", "ngo/pose")]
-        probe.spin_until(lambda: all(probe.node.count_publishers(topic) for topic in topics), "all estimators")
-        for name, maze in mazes.items():
-            stack.enter_context(NodeProcess("ngo_sim", "maze2d", maze, ("-r", f"__ns:=/{name}")))
-        probe.spin_until(lambda: all(len(found) == FRAMES - 1 for found in poses.values()), "every pose of both")
-        probe.spin_until(lambda: len(transforms) == 4 * (FRAMES - 1), "every transform of both")
-    core = OnlineTrajectory.load(tmp_path, iterations_per_step=1)  # as ngo_node by default
-    for name in ROBOTS:
-        core.reset()
-        assert len(steps[name]) == FRAMES - 1
-        for message, pose in zip(steps[name], poses[name], strict=True):
-            update = core.update(relative_step(message))
-            assert to_ns(pose.header.stamp) == update.stamp_ns
-            position = pose.pose.pose.position
-            np.testing.assert_allclose((position.x, position.y), update.pose_xyyaw[:2], atol=1e-5)
-        frames = {(m.transforms[0].header.frame_id, m.transforms[0].child_frame_id) for m in transforms}
-        assert {(f"{name}/map", f"{name}/odom"), (f"{name}/odom", f"{name}/base_link")} <= frames
-    assert len(frames) == 4
-    red, blue = (np.array([[m.x, m.y, m.yaw] for m in steps[name]]) for name in ROBOTS)
-    assert np.abs(red - blue).max() > 1e-6, "they see different mazes"
-    probe.close()
+    with Probe() as probe:
+        steps = {name: probe.collect(RelativePose, f"/{name}/relative_pose", 5000) for name in ROBOTS}
+        poses = {name: probe.collect(PoseWithCovarianceStamped, f"/{name}/ngo/pose", 5000) for name in ROBOTS}
+        transforms = probe.collect(TFMessage, "/tf", 5000)
+        mazes: dict[str, dict[str, object]] = {}
+        with ExitStack() as stack:
+            for seed, name in enumerate(ROBOTS):
+                shared = {"world": "maze2d", "weights": str(tmp_path), "frame_prefix": f"{name}/"}
+                local = {**shared, "image_reliability": "reliable", "image_depth": 100}
+                # At rate 0 it waits for its own two estimators, and publishes no frame that they do not take.
+                maze = {
+                    "seed": seed,
+                    "frames": FRAMES,
+                    "rate": 0.0,
+                    "wait_for_subscribers": 1,
+                    "wait_for_flow_control": True,
+                }
+                for executable, parameters in (("ngo_node", shared), ("local_node", local)):
+                    stack.enter_context(NodeProcess("ngo_estimator", executable, parameters, ("-r", f"__ns:=/{name}")))
+                mazes[name] = maze
+            # Simulators wait for their own estimators alone: these and the probe must have found each other before.
+            topics = [f"/{name}/{topic}" for name in ROBOTS for topic in ("relative_pose", "ngo/pose")]
+            probe.spin_until(lambda: all(probe.node.count_publishers(topic) for topic in topics), "all estimators")
+            for name, maze in mazes.items():
+                stack.enter_context(NodeProcess("ngo_sim", "maze2d", maze, ("-r", f"__ns:=/{name}")))
+            probe.spin_until(lambda: all(len(found) == FRAMES - 1 for found in poses.values()), "every pose of both")
+            probe.spin_until(lambda: len(transforms) == 4 * (FRAMES - 1), "every transform of both")
+        core = OnlineTrajectory.load(tmp_path, iterations_per_step=1)  # as ngo_node by default
+        for name in ROBOTS:
+            core.reset()
+            assert len(steps[name]) == FRAMES - 1
+            for message, pose in zip(steps[name], poses[name], strict=True):
+                update = core.update(relative_step(message))
+                assert to_ns(pose.header.stamp) == update.stamp_ns
+                position = pose.pose.pose.position
+                np.testing.assert_allclose((position.x, position.y), update.pose_xyyaw[:2], atol=1e-5)
+            frames = {(m.transforms[0].header.frame_id, m.transforms[0].child_frame_id) for m in transforms}
+            assert {(f"{name}/map", f"{name}/odom"), (f"{name}/odom", f"{name}/base_link")} <= frames
+        assert len(frames) == 4
+        red, blue = (np.array([[m.x, m.y, m.yaw] for m in steps[name]]) for name in ROBOTS)
+        assert np.abs(red - blue).max() > 1e-6, "they see different mazes"

@@ -26,35 +26,28 @@ def run_node(name: str, create: Callable[[], Node]) -> int:
     or a ``StartError``. One line then says why.
     """
     # rclpy's own handlers end the context from another thread while this one publishes, which now and then ends in a
-    # crash. These raise in this thread while the node starts; once it spins they only say that it is to end, for an
-    # exception in the middle of taking a message would come out as an error of rclpy's.
-    for number in _SIGNALS:
-        signal.signal(number, signal.default_int_handler)
+    # crash, and so does an exception that a handler raises while rclpy makes a node or takes a message. These only say
+    # that it is to end, which is seen once the node is made and between any two messages.
     node, ended = None, False
 
     def end(*_: object) -> None:
         nonlocal ended
         ended = True
 
+    for number in _SIGNALS:
+        signal.signal(number, end)
     try:
         _initialise()
         node = create()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        for number in _SIGNALS:
-            signal.signal(number, end)
         while not ended:
             executor.spin_once(timeout_sec=_WAIT_S)
-        return 0
-    except KeyboardInterrupt:
         return 0
     except (BadParameter, StartError) as error:
         get_logger(name).fatal(" ".join(str(error).split()))
         return 2
     finally:
-        # A second signal, as from a terminal and a launcher together, must not interrupt the cleaning up.
-        for number in _SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

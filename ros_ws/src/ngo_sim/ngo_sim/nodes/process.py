@@ -20,36 +20,36 @@ def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | N
 
     0 in both cases, 2 after a bad parameter, which one line on stderr names.
     """
-    # rclpy's own handlers shut down from another thread while this one publishes, which now and then ends in a crash.
-    # These raise in this thread; the node waits for short times only, so they are never late.
-    ended = False
+    # rclpy's own handlers shut down from another thread while this one publishes, which now and then ends in a crash,
+    # and so does an exception that a handler raises while rclpy makes a node. While it starts these only say that it is
+    # to end; once it runs they raise in this thread: it waits for short times only, so they are never late.
+    ended = started = False
 
     def end(*_: object) -> None:
         nonlocal ended
         ended = True
-        raise KeyboardInterrupt
+        if started:
+            raise KeyboardInterrupt
 
     for number in _SIGNALS:
         signal.signal(number, end)
-    try:
-        return _run(node_type, name, args)
-    except KeyboardInterrupt:
-        return 0
-    except RuntimeError:
-        if not ended:
-            raise
-        return 0  # what rclpy makes of an exception in the middle of taking a message
-
-
-def _run(node_type: type[SimulatorNode], name: str, args: list[str] | None) -> int:
     node = None
     try:
         _initialise(args)
         node = node_type(name)
-        node.run()
+        started = True
+        if not ended:
+            node.run()
+        return 0
+    except KeyboardInterrupt:
+        return 0
     except BadParameter as error:
         print(f"{name}: bad parameter: {error}", file=sys.stderr)
         return 2
+    except Exception:
+        if not ended:
+            raise
+        return 0  # what rclpy or ViZDoom, which a terminal tells as well, makes of a signal
     finally:
         # A second signal, as from a terminal and a launcher together, must not interrupt the cleaning up.
         for number in _SIGNALS:
@@ -57,7 +57,6 @@ def _run(node_type: type[SimulatorNode], name: str, args: list[str] | None) -> i
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
 
 
 def _initialise(args: list[str] | None) -> None:
