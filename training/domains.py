@@ -19,7 +19,7 @@ class Domain:
     length that errors of positions are measured by (a corridor's width).
     ``place_radius_m`` and ``heading_limit_rad`` say how far two frames of one place may be apart and turned against
     each other, ``loop_views`` between how many pairs of frames a loop is measured, and ``registration`` how frames are
-    registered, where they are scans with ranges good enough for it. ``reverses`` says that the robot may
+    registered, where ranges are known that are good enough for it. ``reverses`` says that the robot may
     drive backwards. With ``twist`` the networks are told the velocity of each step, which they divide by
     ``twist_scale`` (m/s, m/s, rad/s). ``mirrors`` says that a frame seen in a mirror is a frame that could be.
 
@@ -53,6 +53,11 @@ class Domain:
     optimizer_epochs: int = 6
     single_share: float = 0.0
     loss_scale: float = 0.1
+
+    @property
+    def registers_odometry(self) -> bool:
+        """Whether steps of the odometry are measured again by their ranges, and not loops alone."""
+        return self.registration is not None and self.registration.odometry
 
     @property
     def loss_scale_m(self) -> float:

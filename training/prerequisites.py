@@ -133,7 +133,7 @@ def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
     known = {
         "loops": True,
-        "registered": sources.world.registration is not None,
+        "registered": sources.world.registers_odometry,
         "smoothed": sources.world.smoothing,
         "compass": sources.has_compass,
     }

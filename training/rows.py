@@ -69,7 +69,7 @@ def rows_of(world: World) -> list[str]:
         name
         for name, row in ROWS.items()
         if (not row.worlds or world.name in row.worlds)
-        and (world.registration or not row.registered)
+        and (world.registers_odometry or not row.registered)
         and (world.smoothing or not row.smoothed)
     ]
 

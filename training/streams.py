@@ -83,6 +83,8 @@ def mirrored(batch: Batch) -> Batch:
     for name, value in batch.items():
         if name in ("earlier", "later", "a", "b", "images"):
             result[name] = value.flip(-2)
+        elif name == "ranges":
+            result[name] = value.flip(-1)
         elif name in ("relative", "poses", "twist"):
             result[name] = value * value.new_tensor([1.0, -1.0, -1.0])
         elif name == "action":
@@ -228,7 +230,8 @@ class PlaceStream(_Stream):
     """Batches of pairs of frames that show one place, from several mazes and well apart in time.
 
     A batch holds ``a``, ``b`` ``(batch, height, width, channels)``, their ``poses`` ``(batch, 2, 3)`` and the number of
-    their ``maze`` ``(batch,)``. Mazes in which no place is seen twice give none; a group of such mazes alone raises
+    their ``maze`` ``(batch,)``; where networks learn to see how far walls are, also the true ``ranges`` ``(batch, 2,
+    rays)``. Mazes in which no place is seen twice give none; a group of such mazes alone raises
     ``ValueError``.
     """
 
@@ -256,6 +259,8 @@ class PlaceStream(_Stream):
                 f"{self.frames} frames, {self.MIN_STEPS_APART} or more apart; expected longer episodes or smaller mazes"
             )
         images = [images_of(self.world, episode) for episode, _ in usable]
+        registration = self.world.registration
+        angles = None if registration is None or self.world.image.has_depth else registration.angles_rad.numpy()
         for count in range(self.batches_a_group):
             parts: list[Batch] = []
             for maze, (episode, found) in enumerate(usable):
@@ -263,14 +268,15 @@ class PlaceStream(_Stream):
                 swap = rng.random(len(chosen)) < 0.5
                 chosen[swap] = chosen[swap, ::-1]
                 index = torch.from_numpy(chosen)
-                parts.append(
-                    {
-                        "a": images[maze][index[:, 0]],
-                        "b": images[maze][index[:, 1]],
-                        "poses": torch.from_numpy(episode.poses_xyyaw[chosen]).float(),
-                        "maze": torch.full((len(chosen),), maze),
-                    }
-                )
+                part = {
+                    "a": images[maze][index[:, 0]],
+                    "b": images[maze][index[:, 1]],
+                    "poses": torch.from_numpy(episode.poses_xyyaw[chosen]).float(),
+                    "maze": torch.full((len(chosen),), maze),
+                }
+                if angles is not None:
+                    part["ranges"] = ranges_of(episode, chosen, angles)
+                parts.append(part)
             batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             yield mirrored(batch) if count % 2 else batch
 
@@ -303,6 +309,15 @@ class TrajectoryStream(_Stream):
                 "relative": torch.stack([relative_poses(episode.poses_xyyaw) for episode in chosen]),
             }
             yield mirrored(batch) if count % 2 else batch
+
+
+def ranges_of(episode: Episode, frames: np.ndarray, angles_rad: np.ndarray) -> Tensor:
+    """True ranges ``(*frames.shape, rays)`` in m of the walls in some frames of an episode in a maze."""
+    from training.wall_view import wall_ranges
+
+    assert episode.maze is not None  # worlds are mazes
+    ranges = wall_ranges(episode.maze, episode.poses_xyyaw[frames.ravel()], angles_rad)
+    return torch.from_numpy(ranges).unflatten(0, frames.shape)
 
 
 def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.ndarray:

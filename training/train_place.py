@@ -71,7 +71,8 @@ class Arguments(runs.TrainerArguments):
 class PlaceTraining(lightning.LightningModule):
     """Symmetric InfoNCE between the two frames of each place, and the pair head's likelihood and same-place loss.
 
-    Frames of a maze that lie near each other without being a pair count neither for nor against.
+    Frames of a maze that lie near each other without being a pair count neither for nor against. Where codes hold
+    ranges that are seen in pictures, their likelihood counts as well.
     """
 
     BRIGHTNESS = 0.15
@@ -87,7 +88,7 @@ class PlaceTraining(lightning.LightningModule):
         if augment and images.dtype == torch.uint8:
             gain = 1.0 + self.BRIGHTNESS * (2.0 * torch.rand(len(images), 1, 1, 1, device=images.device) - 1.0)
             images = (images * gain).clamp(0, 255).to(torch.uint8)
-        codes = self.networks.encoder(images)
+        codes, seen = self.networks.encoder.see(images)
         code_a, code_b = codes.chunk(2)
         embedding_a, embedding_b = self.networks.pair_head.embed(codes).float().chunk(2)
         similarity = embedding_a @ embedding_b.mT
@@ -115,8 +116,14 @@ class PlaceTraining(lightning.LightningModule):
         belief = binary_cross_entropy_with_logits(same, torch.ones_like(same)) + binary_cross_entropy_with_logits(
             other, torch.zeros_like(other)
         )
+        figures = {"loss": contrast + regression + 0.5 * belief}
+        if seen is not None:
+            truth_log = batch["ranges"].transpose(0, 1).flatten(0, 1).log()
+            error = (seen.log_range - truth_log).abs()
+            figures["loss"] = figures["loss"] + (error * torch.exp(-seen.log_scale) + seen.log_scale).mean()
+            figures["median_range_percent"] = 100.0 * error.median()
         return {
-            "loss": contrast + regression + 0.5 * belief,
+            **figures,
             "contrast": contrast,
             "precision_at_1": (logits.argmax(1) == target).float().mean(),
             "median_m": position_error.median(),

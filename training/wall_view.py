@@ -41,16 +41,28 @@ def filled_depth_m(camera: Maze3DConfig) -> float:
 def wall_view(maze: Maze, poses_xyyaw: np.ndarray, camera: Maze3DConfig) -> WallView:
     """The walls that the camera sees from true poses ``(frames, 3)``."""
     angles = column_angles_rad(camera)
+    scans = _scans(maze, poses_xyyaw, angles)
+    distance = scans[..., 3].astype(np.float64)
+    return WallView(distance, distance * np.cos(angles), _faces(maze, poses_xyyaw, angles, scans))
+
+
+def wall_ranges(maze: Maze, poses_xyyaw: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
+    """Distances ``(frames, rays)`` in m, float32, of the first walls along ``(rays,)`` from poses ``(frames, 3)``."""
+    found: np.ndarray = _scans(maze, poses_xyyaw, angles_rad)[..., 3]
+    return found
+
+
+def _scans(maze: Maze, poses_xyyaw: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
+    """Row and column of the block that each ray ends on, a filler, and the distance: ``(frames, rays, 4)``."""
     height, width = maze.walls.shape
     numbers = np.zeros((height, width, 3), dtype=np.float32)
     numbers[..., 0] = np.arange(height)[:, None]
     numbers[..., 1] = np.arange(width)
-    scans = np.empty((len(poses_xyyaw), len(angles), 4), dtype=np.float32)
-    rays = np.cos(angles), np.sin(angles)
+    scans = np.empty((len(poses_xyyaw), len(angles_rad), 4), dtype=np.float32)
+    rays = np.cos(angles_rad), np.sin(angles_rad)
     for (x, y, yaw), scan in zip(poses_xyyaw.tolist(), scans, strict=True):
         cast_rays(maze.walls, maze.block_m, x, y, yaw, *rays, numbers, scan)
-    distance = scans[..., 3].astype(np.float64)
-    return WallView(distance, distance * np.cos(angles), _faces(maze, poses_xyyaw, angles, scans))
+    return scans
 
 
 def _faces(maze: Maze, poses_xyyaw: np.ndarray, angles: np.ndarray, scans: np.ndarray) -> np.ndarray:

@@ -238,6 +238,10 @@ WORLDS = {
         extra_openings=(0, 3),
         place_radius_m=1.0,
         heading_limit_rad=np.radians(35.0),
+        # Ranges that a network sees in pictures: good enough for loops, not for steps.
+        registration=RegistrationConfig(
+            rays=81, field_of_view_deg=106.0, noise_m=0.01, noise_share=0.03, last_tolerance=2.0, odometry=False
+        ),
         # Four frames on, at 0.24 m a frame, most pairs are out of the range that the pair head knows.
         loop_views=1,
         # With the kernel of the 2D world, which allows for drift at first, loops close worse here (docs/results.md).

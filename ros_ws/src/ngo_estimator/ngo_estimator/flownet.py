@@ -1,6 +1,7 @@
 """The convolutions of FlowNetS, for images and for row scans."""
 
 import math
+from itertools import islice
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,10 @@ _LAYERS = (
     (512, 3, 1),
     (1024, 3, 2),
 )
+
+
+_EARLY = 2
+"""Convolutions whose output still tells columns of the image from each other: it is a quarter as high and wide."""
 
 
 class FlowNetConvolutions(nn.Module):
@@ -39,19 +44,35 @@ class FlowNetConvolutions(nn.Module):
                 nn.LeakyReLU(0.1, inplace=True),
             ]
             channels = outputs
+            if len(layers) == 2 * _EARLY:
+                self.early_channels = outputs
         self.layers = nn.Sequential(*layers)
         for module in self.layers:
             if isinstance(module, (nn.Conv1d, nn.Conv2d)):
                 nn.init.kaiming_normal_(module.weight, a=0.1)
                 nn.init.zeros_(module.bias)  # type: ignore[arg-type]
         sizes = list(image_size[1:]) if self.is_scan else list(image_size)
-        for _, _, stride in _LAYERS:
+        for number, (_, _, stride) in enumerate(_LAYERS, start=1):
             sizes = [-(-size // stride) for size in sizes]
+            if number == _EARLY:
+                self.early_size = tuple(sizes)
         self.output_size = channels * math.prod(sizes)
 
     def forward(self, image: Tensor) -> Tensor:
+        return self.late(self.early(image))
+
+    def early(self, image: Tensor) -> Tensor:
+        """What the first two convolutions make of an image: ``(batch, early_channels, *early_size)``."""
         if self.is_scan:
             image = image.squeeze(2)
         else:
             image = image.contiguous(memory_format=torch.channels_last)
-        return torch.flatten(self.layers(image), 1)
+        for layer in islice(self.layers, 2 * _EARLY):
+            image = layer(image)
+        return image
+
+    def late(self, early: Tensor) -> Tensor:
+        """What the others make of that: ``(batch, output_size)``."""
+        for layer in islice(self.layers, 2 * _EARLY, None):
+            early = layer(early)
+        return torch.flatten(early, 1)

@@ -82,11 +82,6 @@ class NeuralGraphOptimizerConfig:
                 f"the smoother takes {self.smoother.motion_feature_size} motion features; expected "
                 f"{self.aggregation.motion_feature_size}, as the aggregation"
             )
-        if self.smoother is not None and self.registrations:
-            raise ValueError(
-                f"registrations is {self.registrations} beside a smoother; expected 0, as what smooths odometry learned"
-                " from steps that are not registered"
-            )
         if min(self.correction_std) <= 0.0:
             raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
         if not 0.0 < self.covariance_scale < math.inf:

@@ -101,6 +101,16 @@ class OnlineTrajectory:
             raise ValueError("an optimizer with loops needs a pair head")
         if optimizer.config.registrations and (pair_head is None or pair_head.config.registration is None):
             raise ValueError("an optimizer that registers scans needs a pair head whose codes hold them")
+        registration = None if pair_head is None else pair_head.config.registration
+        if (
+            optimizer.config.smoother is not None
+            and optimizer.config.registrations
+            and registration is not None
+            and registration.odometry
+        ):
+            raise ValueError(
+                "a smoother learned from steps that are not registered; expected a registration of loops alone"
+            )
         self._optimizer, self._pair_head = optimizer.eval(), pair_head
         self._block = block
         self._window = window_frames // block * block

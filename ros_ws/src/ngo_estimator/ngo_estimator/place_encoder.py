@@ -5,14 +5,18 @@ encoder of its own, and a small head that compares two of its codes.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import leaky_relu, normalize
 
 from ngo_estimator.flownet import FlowNetConvolutions
 from ngo_estimator.images import ImageFormat, to_network
 from ngo_estimator.scan_registration import RegistrationConfig, register
+
+_UNSURE = -2.0
+"""Logarithm of the scale from which on a range that was learned to see is left out: an eighth of itself."""
 
 
 @dataclass(frozen=True)
@@ -20,8 +24,8 @@ class PlaceConfig:
     """What a place encoder is made of.
 
     ``offset_scale_m`` is the typical distance of two frames of one place: the unit of the pair head's output.
-    A code has ``code_size`` learned numbers; with ``registration`` the ranges of the frame follow (m, 0 where nothing
-    came back), so that pairs can be measured by these.
+    A code has ``code_size`` learned numbers; with ``registration`` ranges follow (m, 0 where there is none), so that
+    pairs can be measured by these: those of a row with depth, or what a network says of a picture.
     """
 
     image: ImageFormat
@@ -39,17 +43,63 @@ class PlaceConfig:
             raise ValueError(f"offset_scale_m is {self.offset_scale_m}; expected a positive distance")
         if min(self.code_size, self.embedding_size, self.pair_hidden_size) < 1:
             raise ValueError("code_size, embedding_size and pair_hidden_size must be at least 1")
-        if self.registration is not None and (self.image.height != 1 or not self.image.has_depth):
-            raise ValueError(f"registration is given for images {self.image.shape}; expected a row with depth")
-        if self.registration is not None and self.registration.rays != self.image.width:
+        if self.registration is None or self.sees_ranges:
+            return
+        if not self.image.has_depth:
+            raise ValueError(f"registration is given for images {self.image.shape}; expected a picture, or depth")
+        if self.registration.rays != self.image.width:
             raise ValueError(
                 f"registration has {self.registration.rays} rays; expected {self.image.width}, the image's"
             )
 
     @property
+    def sees_ranges(self) -> bool:
+        """Whether the ranges in a code are what a network says of a picture."""
+        return self.registration is not None and self.image.height > 1
+
+    @property
     def code_length(self) -> int:
         """Numbers in a code, with the ranges behind those that are learned."""
         return self.code_size + (0 if self.registration is None else self.registration.rays)
+
+
+class SeenRanges(NamedTuple):
+    """How far the walls are, each ``(batch, rays)``: logarithm of the range (m), and of its scale.
+
+    The scale is that of a Laplace distribution of the logarithm, and so a share of the range.
+    """
+
+    log_range: Tensor
+    log_scale: Tensor
+
+    @property
+    def ranges(self) -> Tensor:
+        """Ranges ``(batch, rays)`` in m, 0 where they are too uncertain."""
+        return self.log_range.exp() * (self.log_scale < _UNSURE)
+
+
+class RangeHead(nn.Module):
+    """How far the walls of a picture are, from its early features, column by column."""
+
+    CHANNELS, HIDDEN = 48, 128
+
+    def __init__(self, channels: int, size: tuple[int, ...], rays: int) -> None:
+        super().__init__()
+        height, width = size
+        self.rows = nn.Conv2d(channels, self.CHANNELS, 3, (2, 1), 1)
+        columns: list[nn.Module] = []
+        inputs = self.CHANNELS * -(-height // 2)
+        for outputs, dilation in ((self.HIDDEN, 1), (self.HIDDEN, 2), (self.HIDDEN // 2, 1)):
+            columns += [nn.Conv1d(inputs, outputs, 3, 1, dilation, dilation), nn.LeakyReLU(0.1)]
+            inputs = outputs
+        self.columns = nn.Sequential(*columns)
+        self.out = nn.Linear(inputs * width, 2 * rays)
+
+    def forward(self, early: Tensor) -> SeenRanges:
+        """Early features ``(batch, channels, height, width)`` to ranges."""
+        by_column = leaky_relu(self.rows(early), 0.1).flatten(1, 2)
+        log_range, log_scale = self.out(self.columns(by_column).flatten(1)).float().chunk(2, dim=-1)
+        return SeenRanges(log_range.clamp(-4.0, 5.0), log_scale.clamp(-7.0, 1.0))
 
 
 class PlaceEncoder(nn.Module):
@@ -61,14 +111,25 @@ class PlaceEncoder(nn.Module):
         image = config.image
         self.convolutions = FlowNetConvolutions(image.channels, (image.height, image.width), config.width)
         self.code = nn.Linear(self.convolutions.output_size, config.code_size)
+        if config.registration is not None and config.sees_ranges:
+            rays = config.registration.rays
+            self.ranges = RangeHead(self.convolutions.early_channels, self.convolutions.early_size, rays)
 
     def forward(self, images: Tensor) -> Tensor:
         """Observations ``(batch, height, width, channels)`` to codes ``(batch, code_length)``."""
-        code = self.code(self.convolutions(to_network(images, self.config.image))).float()
+        code, seen = self.see(images)
         if self.config.registration is None:
             return code
+        if seen is not None:
+            return torch.cat((code, seen.ranges), dim=-1)
         ranges = images[:, 0, :, -1].float()
         return torch.cat((code, torch.where(ranges.isfinite(), ranges, 0.0)), dim=-1)
+
+    def see(self, images: Tensor) -> tuple[Tensor, SeenRanges | None]:
+        """What is learned of observations: the first ``code_size`` numbers of their codes, and ranges of pictures."""
+        early = self.convolutions.early(to_network(images, self.config.image))
+        code = self.code(self.convolutions.late(early)).float()
+        return code, self.ranges(early) if self.config.sees_ranges else None
 
 
 class PairHead(nn.Module):

@@ -31,14 +31,16 @@ def registered_steps(
         relative: steps ``(batch, steps, 3)`` of the odometry (m, m, rad), a whole number of blocks; log_std: logarithm
             of their deviations.
         codes: place codes ``(batch, steps, code_length)`` of the frame after each step.
-        registrations: steps of each registration; with 0 everything stays as it is.
+        registrations: steps of each registration; with 0, or ranges that are not good enough for it, everything stays
+            as it is.
         origin_code: that of the first frame ``(batch, code_length)``; without it the first step stays as it is.
 
     Returns:
         Steps and logarithms of deviations in the shape of the ones given. The deviations are such that a block has
         those of its registration.
     """
-    if registrations == 0:
+    registration = pair_head.config.registration
+    if registrations == 0 or (registration is not None and not registration.odometry):
         return relative, log_std
     steps, deviations, ends = (x.unflatten(1, (-1, block)) for x in (relative, log_std, codes))
     before = ends[:, :-1, -1]

@@ -29,9 +29,6 @@ _SEEN_BY_BOTH = 0.15
 _FARTHEST = 25.0
 """Squared deviations of the prior, over three components, from which on scans and start contradict each other."""
 
-_LAST_TOLERANCE = 5.0
-"""The smallest tolerance, in deviations of a range."""
-
 _TOGETHER = 1024  # pairs that are registered at once
 
 
@@ -40,14 +37,19 @@ class RegistrationConfig:
     """How scans are registered.
 
     ``rays`` ranges from left to right over ``field_of_view_deg``, straight ahead in the middle; ``noise_m`` is the
-    deviation of a range. A point counts less the farther it is from its line: a quarter at a tolerance, which is as
-    wide as the start is uncertain, at most ``widest_tolerance_m``, and a quarter of that in every further step.
+    deviation of a range, beside ``noise_share`` of itself. A point counts less the farther it is from its line: a
+    quarter at a tolerance, which is as wide as the start is uncertain, at most ``widest_tolerance_m``, and a quarter of
+    that in every further step, at least ``last_tolerance`` deviations of its range. With ``odometry`` the ranges are
+    good enough to measure steps again, and not loops alone.
     """
 
     rays: int
     field_of_view_deg: float
     noise_m: float
     widest_tolerance_m: float = 0.2
+    noise_share: float = 0.0
+    last_tolerance: float = 5.0
+    odometry: bool = True
 
     def __post_init__(self) -> None:
         if self.rays < 8 or not 0.0 < self.field_of_view_deg <= 360.0:
@@ -60,6 +62,17 @@ class RegistrationConfig:
                 f"noise_m, widest_tolerance_m are {self.noise_m}, {self.widest_tolerance_m}; expected positive "
                 "distances, the noise no larger than the tolerance"
             )
+        if not (0.0 <= self.noise_share < 1.0 and 0.0 < self.last_tolerance < math.inf):
+            raise ValueError(
+                f"noise_share, last_tolerance are {self.noise_share}, {self.last_tolerance}; expected a share of 0 to "
+                "below 1, and a positive number of deviations"
+            )
+
+    @property
+    def angles_rad(self) -> Tensor:
+        """The angles of the rays ``(rays,)``, counter-clockwise from straight ahead, leftmost first."""
+        half = math.radians(self.field_of_view_deg) / 2.0
+        return torch.linspace(half, -half, self.rays)
 
 
 def register(
@@ -101,7 +114,7 @@ def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Te
     a, b, start, log_std = pairs
     half = math.radians(config.field_of_view_deg) / 2.0
     increment = 2.0 * half / (config.rays - 1)
-    angles = torch.linspace(half, -half, config.rays, dtype=a.dtype, device=a.device)
+    angles = config.angles_rad.to(a)
     directions = torch.stack((angles.cos(), angles.sin()), dim=-1)
     lines, points, normals, there = _surfaces(a, b, directions)
     prior = torch.exp(-2.0 * log_std)[:, [0, 0, 1]]
@@ -111,7 +124,8 @@ def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Te
     pose = start
     information = torch.diag_embed(prior)
     share = torch.zeros_like(start[:, 0])
-    least = _LAST_TOLERANCE * config.noise_m
+    variance = config.noise_m**2 + points.square().sum(-1) * config.noise_share**2
+    least = config.last_tolerance * variance.sqrt()
     for step in range(steps):
         turned = se2.rotate(pose[:, 2:], points)
         seen = turned + pose[:, None, :2]
@@ -123,11 +137,11 @@ def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Te
         distance = (normal * seen).sum(-1) - line[..., 2]
         both = inside & there & (line[..., 2] != 0.0)
         alike = (se2.rotate(pose[:, 2:], normals) * normal).sum(-1) > _ALIKE
-        tolerance = (2.0 * 0.25**step * farthest.clamp(max=0.5 * config.widest_tolerance_m)).clamp(min=least)
+        tolerance = torch.maximum(2.0 * 0.25**step * farthest.clamp(max=0.5 * config.widest_tolerance_m), least)
         weight = (both & alike) / (1.0 + (distance / tolerance).square()).square()
         lever = normal[..., 1] * turned[..., 0] - normal[..., 0] * turned[..., 1]
         jacobian = torch.cat((normal, lever.unsqueeze(-1)), dim=-1)
-        weighted = jacobian * (weight / config.noise_m**2).unsqueeze(-1)
+        weighted = jacobian * (weight / variance).unsqueeze(-1)
         moved = se2.wrapped(start - pose)
         information = weighted.mT @ jacobian + torch.diag_embed(prior)
         gradient = -(weighted * distance.unsqueeze(-1)).sum(1) + prior * moved
