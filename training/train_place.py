@@ -240,6 +240,9 @@ def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetwork
         )
         return PlaceNetworks(config), {}
     networks, description = load_place(arguments.recordings.from_weights)
+    if networks.config.sees_ranges and domain.registration is None:
+        print(f"ranges that {arguments.recordings.from_weights} sees in pictures are left out: recordings hold none")
+        networks = networks.without_ranges()
     return networks.requires_grad_(True).train(), {"began_with_sha256": description["sha256"]}
 
 

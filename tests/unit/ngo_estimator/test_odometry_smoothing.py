@@ -101,11 +101,7 @@ def test_impossible_smoothers_are_refused(changes: dict[str, object], message: s
         SmootherConfig(**{"motion_feature_size": 6, "relative_std": STD, **changes})  # type: ignore[arg-type]
 
 
-def test_a_smoother_of_other_features_or_beside_registrations_is_refused() -> None:
+def test_a_smoother_of_other_features_is_refused() -> None:
     aggregation = PoseAggregationConfig(motion_feature_size=5)
     with pytest.raises(ValueError, match="the smoother takes 6 motion features; expected 5, as the aggregation"):
         NeuralGraphOptimizerConfig(aggregation, smoother=CONFIG)
-    search = small_optimizer().config.search
-    registering = type(search)(**{**vars(search), "registrations": 2})
-    with pytest.raises(ValueError, match="registrations is 2 beside a smoother; expected 0"):
-        NeuralGraphOptimizerConfig(PoseAggregationConfig(6), smoother=CONFIG, search=registering)

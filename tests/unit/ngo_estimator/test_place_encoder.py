@@ -3,7 +3,9 @@
 import pytest
 import torch
 
+from ngo_estimator.checkpoint import PlaceNetworks
 from ngo_estimator.place_encoder import PairHead, PlaceEncoder
+from ngo_estimator.scan_registration import RegistrationConfig
 from tests.unit.ngo_estimator.samples import WORLDS, observations, place_config
 
 
@@ -28,6 +30,30 @@ def test_batch_is_as_many_singles(world: str) -> None:
     codes = encoder(images)
     for k in range(4):
         assert torch.allclose(codes[k], encoder(images[k : k + 1])[0], atol=1e-5, rtol=1e-4)
+
+
+def test_a_code_of_a_picture_ends_with_the_ranges_that_are_seen_in_it() -> None:
+    registration = RegistrationConfig(9, 90.0, 0.01, odometry=False)
+    config = place_config("maze3d", code_size=12, registration=registration)
+    encoder = PlaceEncoder(config).eval()
+    images = observations("maze3d", 3)
+    code, seen = encoder.see(images)
+    assert seen is not None and seen.log_range.shape == seen.log_scale.shape == (3, 9)
+    with torch.no_grad():
+        encoder.ranges.out.bias[9:] = -5.0  # sure of all
+        encoder.ranges.out.bias[9] = 5.0  # but the leftmost ray
+    codes = encoder(images)
+    assert codes.shape == (3, config.code_length) == (3, 21)
+    assert torch.equal(codes[:, :12], code)
+    assert (codes[:, 12] == 0.0).all() and torch.allclose(codes[:, 13:], seen.log_range[:, 1:].exp())
+
+
+def test_networks_do_without_the_ranges_that_they_see() -> None:
+    registration = RegistrationConfig(9, 90.0, 0.01, odometry=False)
+    networks = PlaceNetworks(place_config("maze3d", code_size=12, registration=registration)).eval()
+    plain, images = networks.without_ranges().eval(), observations("maze3d", 2)
+    assert plain.config.registration is None
+    assert torch.equal(plain.encoder(images), networks.encoder(images)[:, :12])
 
 
 def test_offsets_scale_with_the_worlds_unit() -> None:

@@ -10,7 +10,7 @@ from ngo_estimator import se2
 from ngo_estimator.images import ImageFormat
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import OnlineTrajectory, optimize_offline
-from ngo_estimator.place_encoder import PlaceConfig, PlaceEncoder
+from ngo_estimator.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.pose_aggregation import block_variances, poses_in_blocks
 from ngo_estimator.registered_odometry import registered_steps
 from ngo_estimator.relative_step import RejectedStep, RelativeStep
@@ -131,7 +131,55 @@ def test_a_code_ends_with_the_ranges_of_its_frame() -> None:
     assert plain.config.code_length == plain(frames).shape[1] == 12
 
 
-@pytest.mark.parametrize("image", [ImageFormat(60, 80, 3, "uint8"), ImageFormat(1, 100, 4, "float32")])
-def test_only_scans_of_as_many_rays_can_be_registered(image: ImageFormat) -> None:
-    with pytest.raises(ValueError, match="registration"):
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (ImageFormat(1, 80, 3, "uint8"), r"images \(1, 80, 3\); expected a picture, or depth"),
+        (ImageFormat(1, 100, 4, "float32"), "241 rays; expected 100"),
+    ],
+)
+def test_rows_without_as_many_ranges_cannot_be_registered(image: ImageFormat, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         PlaceConfig(image, 0.1, 0.5, registration=CONFIG)
+
+
+def test_ranges_for_loops_alone_leave_the_odometry_as_it_is() -> None:
+    pair_head = registering_pair_head()
+    relative, log_std, codes, origin, _ = (value.unsqueeze(0) for value in drive_in_the_room(32))
+    registered = registered_steps(pair_head, relative, log_std, codes, 8, 3, origin[:, 0])
+    assert not torch.equal(registered[0], relative)
+    coarse = loops_alone(pair_head)
+    steps, deviations = registered_steps(coarse, relative, log_std, codes, 8, 3, origin[:, 0])
+    assert steps is relative and deviations is log_std
+    start, prior = torch.tensor([0.1, 0.0, 0.0]), torch.tensor([0.1, 0.05]).log()
+    measured, _ = coarse.register(codes[0, 0], codes[0, 1], start, prior, 3)
+    assert torch.equal(measured, pair_head.register(codes[0, 0], codes[0, 1], start, prior, 3)[0])
+    assert not torch.equal(measured, start)
+
+
+def loops_alone(pair_head: PairHead) -> PairHead:
+    """The same, but for ranges that are not good enough for steps."""
+    coarse = PairHead(dataclasses.replace(pair_head.config, registration=dataclasses.replace(CONFIG, odometry=False)))
+    coarse.load_state_dict(pair_head.state_dict())
+    return coarse.eval().requires_grad_(False)
+
+
+def test_smoothed_online_is_offline_with_loops_that_are_registered() -> None:
+    optimizer, pair_head = small_optimizer("smoothed", search=SEARCH), loops_alone(registering_pair_head())
+    core = OnlineTrajectory(optimizer, pair_head, 2 * STEPS)
+    steps = relative_steps(STEPS)
+    for step in steps:
+        core.update(step)
+    relative, log_std, codes, *_ = drive_in_the_room(STEPS)
+    motion = torch.from_numpy(np.stack([step.motion_feature for step in steps]))
+    offline = optimize_offline(optimizer, pair_head, relative, log_std, motion, codes, None)
+    trajectory = core.trajectory()
+    assert trajectory is not None and offline.loop_weights is not None and offline.loop_weights.max() > 0.1
+    np.testing.assert_allclose(trajectory.poses_xyyaw[1:, :2], offline.poses[0, :, :2], atol=2e-4)
+
+
+def test_a_smoother_beside_odometry_that_is_registered_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match="learned from steps that are not registered; expected a registration of loops"
+    ):
+        OnlineTrajectory(small_optimizer("smoothed", search=SEARCH), registering_pair_head())

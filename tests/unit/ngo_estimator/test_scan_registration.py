@@ -112,6 +112,8 @@ def test_no_steps_and_no_pairs_give_back_what_came() -> None:
         ({"field_of_view_deg": 361.0}, "over 0 to 360"),
         ({"noise_m": 0.0}, "expected positive"),
         ({"noise_m": 0.5}, "no larger than the tolerance"),
+        ({"noise_share": 1.0}, "expected a share of 0 to below 1"),
+        ({"last_tolerance": 0.0}, "a positive number of deviations"),
     ],
 )
 def test_a_registration_that_cannot_be_is_refused(change: dict[str, float], message: str) -> None:

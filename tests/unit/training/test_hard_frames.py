@@ -13,7 +13,7 @@ from training.hard_frames import Arguments
 from training.hard_frames_page import draw, page
 from training.hard_steps import QUANTITIES, Drive, bins_json, drive_of, hard_frames, odometry_json, turning_json
 from training.validation_steps import odometry_error, step_errors
-from training.wall_view import EYE_M, column_angles_rad, filled_depth_m, wall_view
+from training.wall_view import EYE_M, column_angles_rad, filled_depth_m, wall_ranges, wall_view
 
 CAMERA = Maze3DConfig()
 # One straight corridor of 3 m, free for x in [3, 18] and y in [3, 6].
@@ -39,6 +39,11 @@ def test_distances_in_a_corridor_are_those_of_trigonometry() -> None:
     # The end, and on both sides the blocks at x in [9, 18].
     assert view.faces.tolist() == [7]
     assert not hard_frames(view, CAMERA).any_near.any()
+
+
+def test_ranges_along_rays_are_those_of_trigonometry() -> None:
+    ranges = wall_ranges(CORRIDOR, np.array([[9.0, MIDDLE_Y, 0.0]]), np.radians([90.0, 45.0, 0.0, -30.0]))
+    np.testing.assert_allclose(ranges, [[1.5, 1.5 * math.sqrt(2.0), 9.0, 3.0]], rtol=1e-5)
 
 
 def test_frames_before_a_wall_are_hard() -> None:

@@ -205,6 +205,17 @@ def test_place_pairs_are_near_in_space_apart_in_time_and_from_both_mazes() -> No
     assert all(same(a, b) for a, b in zip(batches, again, strict=True))
 
 
+def test_where_ranges_are_learned_place_pairs_come_with_the_true_ones() -> None:
+    world = WORLDS["maze3d"]
+    registration = world.registration
+    assert registration is not None
+    batch, in_mirror = list(PlaceStream(world, TRAIN_SEEDS, 0, 16, 4))[:2]
+    assert batch["ranges"].shape == (8, 2, registration.rays) and batch["ranges"].min() > 0.3
+    assert batch["ranges"].max() < 60.0
+    assert torch.equal(mirrored(in_mirror)["ranges"], in_mirror["ranges"].flip(-1))
+    assert "ranges" not in next(iter(PlaceStream(WORLD, TRAIN_SEEDS, 0, 16, 4)))
+
+
 def test_mazes_without_any_place_seen_twice_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PlaceStream, "FRAMES", 60)
     monkeypatch.setattr(PlaceStream, "MIN_STEPS_APART", 55)

@@ -61,6 +61,12 @@ class PlaceNetworks(nn.Module):
         self.encoder = PlaceEncoder(config)
         self.pair_head = PairHead(config)
 
+    def without_ranges(self) -> "PlaceNetworks":
+        """The same networks, but for the ranges that they see in pictures."""
+        changed = PlaceNetworks(dataclasses.replace(self.config, registration=None))
+        changed.load_state_dict({k: v for k, v in self.state_dict().items() if not k.startswith("encoder.ranges.")})
+        return changed
+
 
 def config_from_dict(kind: type[Config], values: Any) -> Config:
     """Build a (nested) configuration dataclass from JSON values; unknown and missing keys are errors."""
