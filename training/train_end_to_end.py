@@ -92,6 +92,8 @@ class EndToEndTraining(lightning.LightningModule):
         self.local, self.place, self.optimizer = local, place, optimizer
         self.requires_grad_(True)
         self.place.requires_grad_(optimizer.config.loops)  # the paper's form has no use for them
+        if place.config.sees_ranges:
+            self.place.encoder.keep_ranges()  # no gradient comes through a registration
 
     def forward(self, batch: Batch) -> tuple[Tensor, Tensor, OptimizedTrajectory]:
         """Relative poses and logarithms of their deviations ``(batch, steps, 3)``, and the corrected trajectories."""

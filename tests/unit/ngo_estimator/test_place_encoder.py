@@ -48,6 +48,20 @@ def test_a_code_of_a_picture_ends_with_the_ranges_that_are_seen_in_it() -> None:
     assert (codes[:, 12] == 0.0).all() and torch.allclose(codes[:, 13:], seen.log_range[:, 1:].exp())
 
 
+def test_ranges_can_be_kept_while_the_rest_learns() -> None:
+    registration = RegistrationConfig(9, 90.0, 0.01, odometry=False)
+    encoder = PlaceEncoder(place_config("maze3d", code_size=12, registration=registration))
+    encoder.keep_ranges()
+    optimizer = torch.optim.SGD([p for p in encoder.parameters() if p.requires_grad], 0.1)
+    images = observations("maze3d", 2)
+    code, seen = encoder.see(images)
+    code.square().sum().backward()
+    optimizer.step()
+    changed, again = encoder.see(images)
+    assert seen is not None and again is not None
+    assert torch.equal(seen.log_range, again.log_range) and not torch.equal(code, changed)
+
+
 def test_networks_do_without_the_ranges_that_they_see() -> None:
     registration = RegistrationConfig(9, 90.0, 0.01, odometry=False)
     networks = PlaceNetworks(place_config("maze3d", code_size=12, registration=registration)).eval()

@@ -61,6 +61,11 @@ class FlowNetConvolutions(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         return self.late(self.early(image))
 
+    @property
+    def early_layers(self) -> nn.Module:
+        """The first two convolutions with what follows each."""
+        return self.layers[: 2 * _EARLY]
+
     def early(self, image: Tensor) -> Tensor:
         """What the first two convolutions make of an image: ``(batch, early_channels, *early_size)``."""
         if self.is_scan:

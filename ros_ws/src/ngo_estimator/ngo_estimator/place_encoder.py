@@ -131,6 +131,11 @@ class PlaceEncoder(nn.Module):
         code = self.code(self.convolutions.late(early)).float()
         return code, self.ranges(early) if self.config.sees_ranges else None
 
+    def keep_ranges(self) -> None:
+        """Let no training change how the ranges of pictures are seen."""
+        self.ranges.requires_grad_(False)
+        self.convolutions.early_layers.requires_grad_(False)
+
 
 class PairHead(nn.Module):
     """Compares place codes: an embedding to retrieve with, and the relative pose of a pair with its uncertainty."""
