@@ -60,6 +60,11 @@ class Domain:
         return self.registration is not None and self.registration.odometry
 
     @property
+    def sees_ranges(self) -> bool:
+        """Whether the place encoder learns to see the ranges of its pictures, which do not hold them."""
+        return self.registration is not None and self.image.height > 1
+
+    @property
     def loss_scale_m(self) -> float:
         """Errors of position below are counted by their square."""
         return self.loss_scale * self.block_m

@@ -76,7 +76,7 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
     place, description = load_place(sources.networks, sources.world.name)
     if row == "registered":
         return [Estimator(lambda arrays: registered(arrays, place.pair_head), f"{row} {description['sha256']}")]
-    identity, smoother = f"{row} {description['sha256']}", None
+    identity, smoother = f"{row} {description['sha256']} {place.config.registration}", None
     if kind.smoothed:
         smoother, smooths = load_smoother(sources.networks, sources.world.name)
         identity += f" {smooths['sha256']}"
@@ -145,7 +145,7 @@ def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None
         raise ValueError(
             f"{optimizer_folder} has another smoother than the one in {sources.networks}; remove it to make it anew"
         )
-    identity = f"{trained['sha256']} {description['sha256']}"
+    identity = f"{trained['sha256']} {description['sha256']} {place.config.registration}"
     return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m, prepared), identity)
 
 

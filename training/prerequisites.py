@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER, load_description
 from ngo_estimator.compass import COMPASS
 from training import (
     featurise,
@@ -141,7 +141,16 @@ def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
         changes = {**common, "form": form}
         arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
         what = "tuning of the pose graph" + ("" if form == "loops" else f", {form}")
-        yield Step(what, sources.settings_file(form).exists, _call(tune_pose_graph.main, arguments))
+        yield Step(what, partial(_is_tuned, sources, form), _call(tune_pose_graph.main, arguments))
+
+
+def _is_tuned(sources: Sources, form: str) -> bool:
+    """Whether there are settings, and for the place encoder that is there, where they say for which."""
+    path = sources.settings_file(form)
+    if not path.exists():
+        return False
+    tuned_for = json.loads(path.read_text()).get("place_encoder_sha256")
+    return tuned_for in (None, load_description(sources.networks / f"{PLACE}.safetensors", PLACE)["sha256"])
 
 
 def _optimizers(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:

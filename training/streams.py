@@ -259,8 +259,8 @@ class PlaceStream(_Stream):
                 f"{self.frames} frames, {self.MIN_STEPS_APART} or more apart; expected longer episodes or smaller mazes"
             )
         images = [images_of(self.world, episode) for episode, _ in usable]
-        registration = self.world.registration
-        angles = None if registration is None or self.world.image.has_depth else registration.angles_rad.numpy()
+        registration = self.world.registration if self.world.sees_ranges else None
+        angles = None if registration is None else registration.angles_rad.double().numpy()
         for count in range(self.batches_a_group):
             parts: list[Batch] = []
             for maze, (episode, found) in enumerate(usable):

@@ -3,8 +3,10 @@
     python -m training.train_end_to_end --world maze2d
 
 Worker processes simulate the trajectories, each in a maze of its own and each used once. The loss of the corrected
-trajectory reaches back through optimizer, loop measurements and aggregation into both encoders. Run again, it goes on
-where it was stopped. It ends with a set of weights of its own that the estimator takes like those of the stages.
+trajectory reaches back through optimizer, loop measurements and aggregation into both encoders; not through a
+registration, so that where loops are registered the place encoder learns which are loops alone, and the ranges that it
+sees stay as they are. Run again, it goes on where it was stopped. It ends with a set of weights of its own that the
+estimator takes like those of the stages.
 """
 
 from dataclasses import dataclass

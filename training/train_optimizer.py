@@ -228,7 +228,7 @@ def config_of(
         most=chosen.max_loops,
         min_apart=domain.loops_apart,
         views=domain.loop_views,
-        # Where the place codes hold scans, every iteration also measures once more.
+        # Where the place codes hold ranges, every iteration also measures loops once more.
         registrations=0 if place.config.registration is None else arguments.iterations,
     )
     return NeuralGraphOptimizerConfig(
@@ -256,6 +256,12 @@ def main(arguments: Arguments) -> dict[str, float]:
         about["data"] = recorded.about
     if NO_LOOPS in place_description:
         return _without_loops(arguments, domain, about, str(place_description[NO_LOOPS]))
+    registration = place.config.registration
+    if arguments.smoothing and arguments.form != "paper" and registration is not None and registration.odometry:
+        raise runs.RunError(
+            f"smoothing is asked for in {domain.name}, whose odometry is registered; expected one of the two, as what "
+            "smooths odometry learned from steps that are not"
+        )
     features = arguments.runs / domain.name / "features"
     stores = training_stores(features, domain, local_description, place_description)
     smoother: OdometrySmoother | None = None
@@ -263,11 +269,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         smoother, described = load_smoother(folder, domain.name)
         smooths["odometry_smoother_sha256"] = described["sha256"]
     began = arguments.recordings.from_weights
-    optimizer = None if began is None else load_optimizer(began)[0]
-    if optimizer is not None:
-        if optimizer.config.smoother is not None:  # it knows the odometry of another local network
-            print(f"the smoother in {began} is left out{'' if smoother is None else ': the one trained here is taken'}")
-        optimizer = optimizer.with_smoother(smoother)
+    optimizer = None if began is None else begun_optimizer(began, smoother, registration is not None)
     made_of = None if smoother is None else smoother.config
     config = config_of(arguments, domain, (1.0, 1.0, 1.0), made_of) if optimizer is None else optimizer.config
     search = config.search if config.loops else None
@@ -307,6 +309,20 @@ def main(arguments: Arguments) -> dict[str, float]:
     path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
     save_checkpoint(path, optimizer.cpu(), OPTIMIZER, domain.name, details)
     return metrics
+
+
+def begun_optimizer(folder: Path, smoother: OdometrySmoother | None, registers: bool) -> NeuralGraphOptimizer:
+    """The optimizer of the weights to begin with, but for its smoother, which knows the odometry of another network.
+
+    Without ``registers`` place codes hold no ranges any more, and it registers nothing.
+    """
+    optimizer = load_optimizer(folder)[0]
+    if optimizer.config.smoother is not None:
+        print(f"the smoother in {folder} is left out{'' if smoother is None else ': the one trained here is taken'}")
+    optimizer = optimizer.with_smoother(smoother)
+    if optimizer.config.registrations and not registers:
+        optimizer = optimizer.with_registrations(0)
+    return optimizer
 
 
 def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], why: str) -> dict[str, float]:

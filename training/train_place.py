@@ -8,6 +8,7 @@ places: then it says so and writes the encoder untrained, and the optimizer will
 weights written into the estimator's package.
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -209,7 +210,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "validation_loss",
         data=None if recorded is None else recorded.sha256,
-        settings=world.stream_settings if recorded is None else None,
+        settings=settings_of(world) if recorded is None else None,
     )
     networks, begun = initial_networks(arguments, domain)
     training = PlaceTraining(arguments, domain, networks)
@@ -229,8 +230,20 @@ def main(arguments: Arguments) -> dict[str, float]:
     return metrics
 
 
+def settings_of(world: World) -> dict[str, Any]:
+    """What a training depends on beside its arguments."""
+    settings = world.stream_settings
+    if world.sees_ranges and world.registration is not None:
+        settings["registration"] = dataclasses.asdict(world.registration)
+    return settings
+
+
 def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetworks, dict[str, str]]:
-    """Fresh networks, or those of the weights to begin with, and what is to be said of them in the JSON."""
+    """Fresh networks, or those of the weights to begin with, and what is to be said of them in the JSON.
+
+    Ranges that the weights see in pictures are left out where there are none to learn from. Raises ``RunError`` where a
+    world is registered in another way than the weights.
+    """
     if arguments.recordings.from_weights is None:
         config = PlaceConfig(
             image=domain.image,
@@ -243,6 +256,11 @@ def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetwork
     if networks.config.sees_ranges and domain.registration is None:
         print(f"ranges that {arguments.recordings.from_weights} sees in pictures are left out: recordings hold none")
         networks = networks.without_ranges()
+    if (networks.config.sees_ranges or domain.sees_ranges) and networks.config.registration != domain.registration:
+        raise runs.RunError(
+            f"{arguments.recordings.from_weights} has the registration {networks.config.registration}; expected "
+            f"{domain.registration}, that of {domain.name}"
+        )
     return networks.requires_grad_(True).train(), {"began_with_sha256": description["sha256"]}
 
 

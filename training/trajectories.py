@@ -105,9 +105,13 @@ def found_loops(
 ) -> dict[str, np.ndarray]:
     """The fields of ``Loops`` for all trajectories of a store, found now or when they were first asked for.
 
-    Where scans are registered, also ``relative`` and ``log_std`` ``(trajectories, steps, 3)`` after that.
+    Where the odometry is registered, too, also ``relative`` and ``log_std`` ``(trajectories, steps, 3)`` after that.
     """
-    path = store / "loops" / ("-".join(str(value) for value in dataclasses.astuple(search)) + f"-{block}.npz")
+    registration = pair_head.config.registration
+    made_with = [*dataclasses.astuple(search), block]
+    if search.registrations and registration is not None:
+        made_with += dataclasses.astuple(registration)
+    path = store / "loops" / ("-".join(str(value) for value in made_with) + ".npz")
     if not path.exists():
         path.parent.mkdir(exist_ok=True)
         whole = arrays["relative"].shape[1] // block * block
@@ -122,7 +126,7 @@ def found_loops(
                 parts.append(find_loops(pair_head, codes, poses_in_blocks(steps[0], block), search))
         fields = [field.name for field in dataclasses.fields(Loops) if getattr(parts[0], field.name) is not None]
         values = {_LOOP + name: torch.cat([getattr(part, name) for part in parts]).numpy() for name in fields}
-        if search.registrations:
+        if search.registrations and registration is not None and registration.odometry:
             columns = zip(*odometry, strict=True)
             values |= {name: torch.cat(steps).numpy() for name, steps in zip(_REGISTERED, columns, strict=True)}
         partial = path.with_name(f"{path.name}.{os.getpid()}.npz")

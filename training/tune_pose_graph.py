@@ -75,7 +75,7 @@ _OF_FORM = {"smoothed": ("motion",), "compass": _COMPASS}
 """What is read of a feature store for a form beside these."""
 FORMS = ("loops", "registered", "smoothed", "compass")
 REGISTRATIONS = 5
-"""Steps of each registration for the pose graph, where scans are registered: as many as for our optimizer."""
+"""Steps of each registration for the pose graph, where ranges are registered: as many as for our optimizer."""
 
 _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was there first stays
 
@@ -237,7 +237,8 @@ def main(arguments: Arguments) -> PoseGraphSettings:
         for name in (*_ARRAYS, *_OF_FORM.get(arguments.form, ()))
     }
     path = arguments.out / f"{world.name}.gtsam.json"
-    pair_head = load_place(arguments.weights / world.name, world.name)[0].pair_head
+    place, described = load_place(arguments.weights / world.name, world.name)
+    pair_head = place.pair_head
     registrations = 0 if pair_head.config.registration is None else REGISTRATIONS
     start = PoseGraphSettings()
     start = replace(start, search=replace(start.search, registrations=registrations))
@@ -262,6 +263,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     odometry = objective.error(se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy())
     result = {
         "settings": dataclasses.asdict(best),
+        "place_encoder_sha256": described["sha256"],
         "validation": {
             "trajectories": len(arrays["truth"]),
             "position_rmse_m": least,

@@ -325,6 +325,17 @@ def test_a_signal_ends_it_cleanly(probe: Probe, world: str, number: signal.Signa
         assert "Traceback" not in node.log
 
 
+@pytest.mark.parametrize("numbers", [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGTERM)])
+def test_signals_while_it_starts_end_it_cleanly(probe: Probe, numbers: tuple[signal.Signals, ...]) -> None:
+    """The node is in the graph before it makes its world."""
+    with simulator("maze3d") as node:
+        probe.spin_until(lambda: "maze3d" in probe.node.get_node_names(), "the node")
+        for number in numbers:
+            node.send(number)
+        assert node.wait() == 0, node.log
+        assert "Traceback" not in node.log
+
+
 def test_a_killed_maze3d_takes_its_engine_along(probe: Probe) -> None:
     images = probe.collect(Image, "image")
     with simulator("maze3d", rate=50) as node:

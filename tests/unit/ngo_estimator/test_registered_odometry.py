@@ -113,7 +113,7 @@ def test_the_first_frames_code_is_checked_like_the_others() -> None:
 def test_codes_without_scans_cannot_be_registered() -> None:
     with pytest.raises(ValueError, match="expected a registration"):
         small_pair_head().register(torch.zeros(12), torch.zeros(12), torch.zeros(3), torch.zeros(2), 3)
-    with pytest.raises(ValueError, match="registers scans needs a pair head whose codes hold them"):
+    with pytest.raises(ValueError, match="registers ranges needs a pair head whose codes hold them"):
         OnlineTrajectory(small_optimizer(search=SEARCH), small_pair_head())
 
 

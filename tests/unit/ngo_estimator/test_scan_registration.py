@@ -47,12 +47,17 @@ def test_more_steps_are_nearer() -> None:
     assert errors[-1] < 0.02 * errors[0]
 
 
-def test_deviations_are_those_of_the_errors_that_noise_makes() -> None:
+@pytest.mark.parametrize("share", [0.0, 0.002])
+def test_deviations_are_those_of_the_errors_that_noise_makes(share: float) -> None:
     generator = torch.Generator().manual_seed(0)
     count, noise = 200, 0.002
     a, b = pose(1.5, 1.2, 0.3).expand(count, 3), pose(1.7, 1.0, 0.7).expand(count, 3)
-    config = RegistrationConfig(RAYS, 300.0, noise)
-    scans = [ranges_at(x[:1]) + noise * torch.randn(count, RAYS, generator=generator) for x in (a, b)]
+    config = RegistrationConfig(RAYS, 300.0, noise, noise_share=share)
+    exact = [ranges_at(x[:1]) for x in (a, b)]
+    scans = [
+        ranges + (noise + share * ranges) * torch.randn(count, RAYS, generator=generator) / (2.0 if share else 1.0)
+        for ranges in exact
+    ]
     found, log_std = register(config, *scans, se2.between(a, b), PRIOR, 5)
     errors = found - se2.between(a, b)
     squares = torch.stack((errors[:, :2].square().sum(-1) / 2.0, errors[:, 2].square()), dim=-1).mean(0)

@@ -4,6 +4,7 @@ No GPU is needed: on torch's ``meta`` device, which has shapes but no numbers, m
 """
 
 import contextlib
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import lightning
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import load_local, load_optimizer, load_place, write_untrained
+from ngo_estimator.checkpoint import PlaceNetworks, load_local, load_optimizer, load_place, write_untrained
+from ngo_estimator.scan_registration import RegistrationConfig
 from training import train_end_to_end, train_local, train_place
 from training.streams import Batch, mirrored
 from training.worlds import WORLDS
@@ -58,9 +60,13 @@ def test_the_local_networks_loss_stays_on_its_device(weights: Path) -> None:
     assert step(module, batch).device.type == "meta"
 
 
-def test_the_place_encoders_loss_stays_on_its_device(weights: Path) -> None:
-    module = train_place.PlaceTraining(train_place.Arguments("maze3d"), WORLD, load_place(weights)[0].requires_grad_())
+@pytest.mark.parametrize("sees_ranges", [False, True])
+def test_the_place_encoders_loss_stays_on_its_device(weights: Path, sees_ranges: bool) -> None:
+    registration = RegistrationConfig(9, 90.0, 0.01, odometry=False) if sees_ranges else None
+    config = dataclasses.replace(load_place(weights)[0].config, registration=registration)
+    module = train_place.PlaceTraining(train_place.Arguments("maze3d"), WORLD, PlaceNetworks(config))
     batch = {
+        "ranges": torch.ones(BATCH, 2, 9),
         "a": images(BATCH),
         "b": images(BATCH),
         "poses": torch.zeros(BATCH, 2, 3),

@@ -21,6 +21,7 @@ from training.streams import (
     Share,
     TrajectoryStream,
     action_histories,
+    episodes_in,
     images_of,
     loader,
     mirrored,
@@ -29,7 +30,8 @@ from training.streams import (
     revisits,
     simulate,
 )
-from training.worlds import TRAIN_SEEDS, WORLDS, World
+from training.wall_view import wall_ranges
+from training.worlds import DRAWN, TRAIN_SEEDS, WORLDS, World
 
 WORLD = WORLDS["maze2d"]
 
@@ -209,10 +211,22 @@ def test_where_ranges_are_learned_place_pairs_come_with_the_true_ones() -> None:
     world = WORLDS["maze3d"]
     registration = world.registration
     assert registration is not None
-    batch, in_mirror = list(PlaceStream(world, TRAIN_SEEDS, 0, 16, 4))[:2]
+    stream = PlaceStream(world, TRAIN_SEEDS, 0, 16, 4)
+    batch, in_mirror = list(stream)[:2]
     assert batch["ranges"].shape == (8, 2, registration.rays) and batch["ranges"].min() > 0.3
     assert batch["ranges"].max() < 60.0
-    assert torch.equal(mirrored(in_mirror)["ranges"], in_mirror["ranges"].flip(-1))
+    mazes = [
+        episode.maze for episode in episodes_in(world, *2 * [stream.groups[0]], 400, DRAWN, world.stream_drivers[0])
+    ]
+    for row in range(8):
+        maze, poses = mazes[int(batch["maze"][row])], batch["poses"][row].double().numpy()
+        assert maze is not None
+        seen = wall_ranges(maze, poses, registration.angles_rad.double().numpy())
+        np.testing.assert_allclose(np.median(np.abs(batch["ranges"][row] - seen), axis=-1), 0.0, atol=1e-3)
+    turned = mirrored(in_mirror)
+    assert torch.equal(turned["ranges"], in_mirror["ranges"].flip(-1)) and torch.equal(
+        turned["a"], in_mirror["a"].flip(-2)
+    )
     assert "ranges" not in next(iter(PlaceStream(WORLD, TRAIN_SEEDS, 0, 16, 4)))
 
 

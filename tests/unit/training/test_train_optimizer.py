@@ -1,14 +1,24 @@
 """What an optimizer is made of in each world, unless it is said otherwise."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import load_optimizer, load_smoother
+from ngo_estimator.checkpoint import OPTIMIZER, load_optimizer, load_place, load_smoother, save_checkpoint
+from ngo_estimator.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.runs import WEIGHTS
-from training.train_optimizer import Arguments, Choices, OptimizerTraining, choices, config_of
+from training.runs import WEIGHTS, RunError
+from training.train_optimizer import (
+    Arguments,
+    Choices,
+    OptimizerTraining,
+    begun_optimizer,
+    choices,
+    config_of,
+    main,
+)
 from training.worlds import WORLDS, world_named
 
 
@@ -33,9 +43,26 @@ def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None
     arguments = Arguments(world=world)
     made = config_of(arguments, world_named(world), shipped.correction_std, shipped.smoother)  # type: ignore[arg-type]
     assert replace(made, covariance_scale=shipped.covariance_scale) == shipped
+    assert load_place(WEIGHTS / world, world)[0].config.registration == world_named(world).registration
     assert (shipped.smoother is not None) == choices(arguments, world_named(world)).smoothing
     if shipped.smoother is not None:
         load_smoother(WEIGHTS / world, world)  # for whoever trains an optimizer anew; of the local network beside it
+
+
+def test_an_optimizer_to_begin_with_does_without_what_is_not_there(tmp_path: Path) -> None:
+    search = LoopSearch(2, 8, 2, 0, 3, registrations=5)
+    optimizer = small_optimizer("smoothed", trained=True, search=search)
+    save_checkpoint(tmp_path / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, "maze3d", {})
+    assert begun_optimizer(tmp_path, None, registers=True).config.registrations == 5
+    begun = begun_optimizer(tmp_path, None, registers=False)
+    assert begun.config == replace(optimizer.config, smoother=None, search=replace(search, registrations=0))
+    kept = {name: value for name, value in optimizer.state_dict().items() if not name.startswith("smoother.")}
+    assert all(torch.equal(begun.state_dict()[name], value) for name, value in kept.items())
+
+
+def test_smoothing_of_odometry_that_is_registered_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="smoothing is asked for in maze2d, whose odometry is registered"):
+        main(Arguments(world="maze2d", smoothing=True, runs=tmp_path))
 
 
 @pytest.mark.parametrize(("form", "iterations"), [("learned", (1, 1, 3, 3)), ("paper", (3, 3, 3, 3))])

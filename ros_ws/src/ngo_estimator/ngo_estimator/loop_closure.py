@@ -29,7 +29,7 @@ class LoopSearch:
     ``per_pose`` candidates for each meta-pose, at least ``min_separation`` meta-poses older and more than
     ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief. Each
     is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
-    place codes hold scans; so are the steps of the odometry (``registered_odometry``).
+    place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
     """
 
     per_pose: int = 4

@@ -96,7 +96,7 @@ class NeuralGraphOptimizerConfig:
 
     @property
     def registrations(self) -> int:
-        """Steps in which scans are registered, 0 where they are not."""
+        """Steps in which ranges are registered, 0 where they are not."""
         return self.search.registrations if self.loops else 0
 
     @classmethod
@@ -224,6 +224,13 @@ class NeuralGraphOptimizer(nn.Module):
         changed.load_state_dict(values)
         return changed
 
+    def with_registrations(self, registrations: int) -> "NeuralGraphOptimizer":
+        """The same optimizer with another number of steps in which each loop is registered."""
+        search = replace(self.config.search, registrations=registrations)
+        changed = NeuralGraphOptimizer(replace(self.config, search=search))
+        changed.load_state_dict(self.state_dict())
+        return changed
+
     def attend(self, features: Tensor, place_similarity: Tensor | None) -> Tensor:
         """Attention weights ``(batch, poses, poses)`` of features ``(batch, poses, width)`` ("Attention Phase")."""
         queries = self.query(features)
@@ -264,7 +271,8 @@ class NeuralGraphOptimizer(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The odometry ``relative`` and ``log_std`` ``(batch, steps, 3)`` as this optimizer takes it, and its loops.
 
-        Measured again by the scans in the codes, as ``registered_steps`` does, or where it registers nothing as it is.
+        Measured again by the ranges in the codes, as ``registered_steps`` does, or as it is where none or loops alone
+        are registered.
         """
         registrations = self.config.registrations
         return registered_steps(pair_head, relative, log_std, place_codes, self.block, registrations, origin_code)

@@ -100,7 +100,7 @@ class OnlineTrajectory:
         if optimizer.config.loops and pair_head is None:
             raise ValueError("an optimizer with loops needs a pair head")
         if optimizer.config.registrations and (pair_head is None or pair_head.config.registration is None):
-            raise ValueError("an optimizer that registers scans needs a pair head whose codes hold them")
+            raise ValueError("an optimizer that registers ranges needs a pair head whose codes hold them")
         registration = None if pair_head is None else pair_head.config.registration
         if (
             optimizer.config.smoother is not None

@@ -21,27 +21,20 @@ def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | N
     0 in both cases, 2 after a bad parameter, which one line on stderr names.
     """
     # rclpy's own handlers shut down from another thread while this one publishes, which now and then ends in a crash,
-    # and so does an exception that a handler raises while rclpy makes a node. While it starts these only say that it is
-    # to end; once it runs they raise in this thread: it waits for short times only, so they are never late.
-    ended = started = False
+    # and so does an exception that a handler raises within rclpy. These only say that it is to end: the node looks
+    # between any two frames, and waits for short times only.
+    node, ended = None, False
 
     def end(*_: object) -> None:
         nonlocal ended
         ended = True
-        if started:
-            raise KeyboardInterrupt
 
     for number in _SIGNALS:
         signal.signal(number, end)
-    node = None
     try:
         _initialise(args)
         node = node_type(name)
-        started = True
-        if not ended:
-            node.run()
-        return 0
-    except KeyboardInterrupt:
+        node.run(lambda: ended)
         return 0
     except BadParameter as error:
         print(f"{name}: bad parameter: {error}", file=sys.stderr)
@@ -49,11 +42,8 @@ def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | N
     except Exception:
         if not ended:
             raise
-        return 0  # what rclpy or ViZDoom, which a terminal tells as well, makes of a signal
+        return 0  # the engine, which a terminal tells to end as well, was sooner
     finally:
-        # A second signal, as from a terminal and a launcher together, must not interrupt the cleaning up.
-        for number in _SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 from builtin_interfaces.msg import Time
@@ -81,19 +82,21 @@ class SimulatorNode(Node):
     def publish_sensors(self, frame: Frame, stamp: Time) -> None:
         """Publish what the robot sees."""
 
-    def run(self) -> None:
-        """Publish frames until there are enough and all are taken; a KeyboardInterrupt ends it earlier."""
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Publish frames until there are enough and all are taken, or until ``ended`` says so."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         listened_s = 0.0
-        while True:
+        while not ended():
             now_s = time.monotonic()
             if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
                 self._looked_s = now_s
                 self._consumers.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
-                    break
+                    self.image_publisher.wait_for_all_acked(Duration(seconds=5))
+                    self.get_logger().info(f"published all {self._published} frames")
+                    return
                 idle_s = _IDLE_S
             elif (idle_s := self._idle_s(now_s)) == 0.0:
                 self._publish_next(now_s)
@@ -101,8 +104,6 @@ class SimulatorNode(Node):
             if idle_s > 0.0 or now_s - listened_s >= _LISTEN_S:
                 listened_s = now_s
                 executor.spin_once(timeout_sec=idle_s)
-        self.image_publisher.wait_for_all_acked(Duration(seconds=5))
-        self.get_logger().info(f"published all {self._published} frames")
 
     def _idle_s(self, now_s: float) -> float:
         """How long nothing is to be done before the next frame, 0 where it is due; messages end the wait earlier."""
