@@ -190,5 +190,5 @@ class PairHead(nn.Module):
             return start, log_std
         config = self.config.registration
         if config is None:
-            raise ValueError("scans are to be registered, but the place codes hold none; expected a registration")
+            raise ValueError("ranges are to be registered, but the place codes hold none; expected a registration")
         return register(config, a[..., self.config.code_size :], b[..., self.config.code_size :], start, log_std, steps)
