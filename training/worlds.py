@@ -244,17 +244,9 @@ WORLDS = {
         ),
         # Four frames on, at 0.24 m a frame, most pairs are out of the range that the pair head knows.
         loop_views=1,
-        # With the kernel of the 2D world, which allows for drift at first, loops close worse here (docs/results.md).
-        robust=False,
-        loops_per_pose=2,
-        max_loops=96,
-        loops_apart=0,
         # What moves the robot sideways shows in the steps around a turn (docs/results.md).
         smoothing=True,
-        # With the scale of the 2D world the gates hardly move, with all iterations at once some trainings never do
-        # (docs/results.md).
-        optimizer_epochs=40,
-        single_share=0.5,
+        optimizer_epochs=20,
         loss_scale=0.3,
         # The robot's turn rate falls by a quarter a step: after twelve 3 % of it is left.
         action_history=12,
