@@ -175,8 +175,8 @@ def main(arguments: Arguments) -> None:
     """Make the arrays ``WORLD/features/STORE/NAME.npy`` of shape ``(trajectories, steps, ...)``.
 
     The stores are ``train``, where odometry is smoothed ``train_optimizer`` and, for each table of results,
-    ``validation_TABLE`` and ``test_TABLE``; of recordings ``train`` and ``validation``, stretches that overlap, and their
-    mirror images.
+    ``validation_TABLE`` and ``test_TABLE``; of recordings ``train`` and ``validation``, stretches that overlap, and
+    their mirror images.
     """
     if arguments.world is None:
         _main_recorded(arguments)

@@ -23,13 +23,13 @@ from training.worlds import WORLDS, world_named
 
 
 def test_a_world_says_what_suits_it() -> None:
-    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(False, True, 2, 96, 40)
+    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(True, True, 4, 512, 20)
     assert choices(Arguments(world="maze2d"), world_named("maze2d")) == Choices(True, False, 4, 512, 6)
 
 
 def test_what_is_given_counts() -> None:
-    given = Arguments(world="maze3d", robust=True, smoothing=False, loops_per_pose=3, max_loops=7, epochs=1)
-    assert choices(given, world_named("maze3d")) == Choices(True, False, 3, 7, 1)
+    given = Arguments(world="maze3d", robust=False, smoothing=False, loops_per_pose=3, max_loops=7, epochs=1)
+    assert choices(given, world_named("maze3d")) == Choices(False, False, 3, 7, 1)
 
 
 def test_the_papers_form_does_not_smooth_by_itself() -> None:
