@@ -144,16 +144,20 @@ def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
         changes = {**common, "form": form}
         arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
         what = "tuning of the pose graph" + ("" if form == "loops" else f", {form}")
-        yield Step(what, partial(_is_tuned, sources, form), _call(tune_pose_graph.main, arguments))
+        yield Step(what, partial(is_tuned, sources, form), _call(tune_pose_graph.main, arguments))
 
 
-def _is_tuned(sources: Sources, form: str) -> bool:
-    """Whether there are settings, and for the place encoder that is there, where they say for which."""
+def is_tuned(sources: Sources, form: str) -> bool:
+    """Whether there are settings, and for the networks that are there, where they say for which."""
     path = sources.settings_file(form)
     if not path.exists():
         return False
-    tuned_for = json.loads(path.read_text()).get("place_encoder_sha256")
-    return tuned_for in (None, load_description(sources.networks / f"{PLACE}.safetensors", PLACE)["sha256"])
+    settings = json.loads(path.read_text())
+    return all(
+        settings[f"{kind}_sha256"] == load_description(sources.networks / f"{kind}.safetensors", kind)["sha256"]
+        for kind in (PLACE, SMOOTHER)
+        if f"{kind}_sha256" in settings
+    )
 
 
 def _optimizers(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:

@@ -244,10 +244,12 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     start = replace(start, search=replace(start.search, registrations=registrations))
     grid = [[_registering(change, registrations) for change in group] for group in GRID]
     smoother: OdometrySmoother | None = None
+    tuned_for = {"place_encoder_sha256": described["sha256"]}
     if arguments.form in ("registered", "smoothed"):
         path = arguments.out / f"{world.name}.gtsam_{arguments.form}.json"
         if arguments.form == "smoothed":
-            smoother, _ = load_smoother(arguments.weights / world.name, world.name)
+            smoother, smooths = load_smoother(arguments.weights / world.name, world.name)
+            tuned_for["odometry_smoother_sha256"] = smooths["sha256"]
     else:
         grid.append([fit_calibration(arrays["relative"], arrays["truth"])])
     compass: list[CompassFixes] | None = None
@@ -263,7 +265,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     odometry = objective.error(se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy())
     result = {
         "settings": dataclasses.asdict(best),
-        "place_encoder_sha256": described["sha256"],
+        **tuned_for,
         "validation": {
             "trajectories": len(arrays["truth"]),
             "position_rmse_m": least,

@@ -19,6 +19,8 @@ from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from tests.unit.ngo_estimator.samples import small_pair_head
 from training.compass_factors import found_fixes
 from training.pose_graph import PoseGraphSettings
+from training.prerequisites import is_tuned
+from training.rows import Sources
 from training.runs import WEIGHTS
 from training.tune_pose_graph import (
     COMPASS_GRID,
@@ -163,6 +165,10 @@ def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
     assert load_settings(tmp_path / "maze2d.gtsam_smoothed.json") == smoothed
     validation = json.loads((tmp_path / "maze2d.gtsam_smoothed.json").read_text())["validation"]
     assert validation["position_rmse_m"] < 0.7 * validation["odometry_position_rmse_m"]
+    sources = Sources(world_named("maze2d"), tmp_path / "weights", tmp_path, tmp_path)
+    assert is_tuned(sources, "loops") and is_tuned(sources, "smoothed")
+    save_checkpoint(weights / f"{SMOOTHER}.safetensors", OdometrySmoother(smoother.config), SMOOTHER, "maze2d", of)
+    assert is_tuned(sources, "loops") and not is_tuned(sources, "smoothed")
 
 
 def test_settings_survive_a_file(tmp_path: Path) -> None:
