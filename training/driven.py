@@ -13,24 +13,20 @@ if TYPE_CHECKING:
 
 
 class Driven(NamedTuple):
-    """Trajectories: the seed of each one's maze and that of its episode, the mazes' size, and the drivers' names.
-
-    The drivers take turns, group by group.
-    """
+    """Trajectories: the seed of each one's maze and that of its episode, the mazes' size, and the driver's name."""
 
     mazes: list[int]
     seeds: list[int]
     size: MazeSize
-    drivers: tuple[str, ...]
+    driver: str
 
     def episodes(self, world: World, group: slice) -> Iterator[Episode]:
         """Those of a group of mazes of one size, of the world's number of steps."""
         frames = world.episode_frames + 1
-        driver = self.drivers[group.start // (group.stop - group.start) % len(self.drivers)]
-        return episodes_in(world, self.mazes[group], self.seeds[group], frames, self.size, driver)
+        return episodes_in(world, self.mazes[group], self.seeds[group], frames, self.size, self.driver)
 
 
 def driven_in_table(world: World, table: str, split: str, count: int) -> Driven:
     """The first ``count`` trajectories of a table of results."""
     mazes, seeds = (list(of(table, split)[:count]) for of in (world.table_mazes, world.table_seeds))
-    return Driven(mazes, seeds, world.tables[table].size, (world.table_driver(table),))
+    return Driven(mazes, seeds, world.tables[table].size, world.table_driver(table))

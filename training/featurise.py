@@ -48,8 +48,6 @@ _MADE_WITH = "networks.json"
 _COMPASS = ("compass", "compass_log_scale")
 STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
 """The arrays of a feature store, without those of a compass."""
-SMOOTHED_TRAIN = "train_optimizer"
-"""Store of what optimizers learn from whose odometry is smoothed."""
 _MOST_STEPS = 1000  # of a stretch of a recording
 _BLOCK = PoseAggregationConfig(1).block
 
@@ -64,8 +62,6 @@ class Arguments:
     """Recordings to train on instead."""
     trajectories: int = 960
     """Trajectories for training, each in a maze of its own that the local network has not seen."""
-    optimizer_trajectories: int = 240
-    """Where odometry is smoothed, so many more for the optimizer, which the smoother has not seen either."""
     validation_trajectories: int = 24
     """Trajectories of the validation split for each table of results."""
     test_trajectories: int = 0
@@ -155,11 +151,7 @@ def readings_of(world: World, compass: Compass, episode: Episode) -> dict[str, n
 def driven_in(arguments: Arguments, world: World) -> dict[str, Driven]:
     """The trajectories of each store that is to be made."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
-    found = {"train": Driven(seeds, seeds, DRAWN, world.stream_drivers)}
-    if world.smoothing:
-        # The smoother knows those above by heart in part: they would say too much of what is left to correct.
-        unknown = list(OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 4 :][: arguments.optimizer_trajectories])
-        found[SMOOTHED_TRAIN] = Driven(unknown, unknown, DRAWN, world.stream_drivers)
+    found = {"train": Driven(seeds, seeds, DRAWN, world.driver)}
     for split, count in (("validation", arguments.validation_trajectories), ("test", arguments.test_trajectories)):
         for table in world.tables:
             found[f"{split}_{table}"] = driven_in_table(world, table, split, count)
@@ -174,9 +166,8 @@ def _groups(count: int, part: int, parts: int) -> list[int]:
 def main(arguments: Arguments) -> None:
     """Make the arrays ``WORLD/features/STORE/NAME.npy`` of shape ``(trajectories, steps, ...)``.
 
-    The stores are ``train``, where odometry is smoothed ``train_optimizer`` and, for each table of results,
-    ``validation_TABLE`` and ``test_TABLE``; of recordings ``train`` and ``validation``, stretches that overlap, and
-    their mirror images.
+    The stores are ``train`` and, for each table of results, ``validation_TABLE`` and ``test_TABLE``; of recordings
+    ``train`` and ``validation``, stretches that overlap, and their mirror images.
     """
     if arguments.world is None:
         _main_recorded(arguments)
@@ -252,14 +243,10 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
 
 
 def training_stores(
-    folder: Path,
-    domain: Domain,
-    local_description: dict[str, Any],
-    place_description: dict[str, Any],
-    name: str = "train",
+    folder: Path, domain: Domain, local_description: dict[str, Any], place_description: dict[str, Any]
 ) -> tuple[list[Path], list[Path]]:
     """The stores in ``folder`` to train on, and those to be measured on; raises ``RunError`` as ``check_networks``."""
-    train, validation = [folder / name], [folder / name for name in domain.validation_stores]
+    train, validation = [folder / "train"], [folder / name for name in domain.validation_stores]
     for store in (*train, *validation):
         check_networks(store, local_description, place_description)
     return train, validation

@@ -116,12 +116,9 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
             count = max(count, wanted.trajectories)
         changes: dict[str, Any] = {name: count if name == _COUNTS[split] else 0 for name in _COUNTS.values()}
         changes["world"] = sources.world.name
-        if split != _TRAIN:
-            changes["optimizer_trajectories"] = 0
         compass = sources.compass_weights if sources.has_compass else None
         arguments = replace(scripts.features, weights=sources.weights, out=sources.runs, compass=compass, **changes)
-        train = [_TRAIN, *([featurise.SMOOTHED_TRAIN] if sources.world.smoothing else [])]
-        for store in train if split == _TRAIN else [f"{split}_{table}" for table in sources.world.tables]:
+        for store in [_TRAIN] if split == _TRAIN else [f"{split}_{table}" for table in sources.world.tables]:
             yield Step(f"the feature store {store}", _whole(sources, store), _call(featurise.main, arguments))
 
 

@@ -33,7 +33,7 @@ from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
 from training.domains import Domain
-from training.featurise import SMOOTHED_TRAIN, training_stores
+from training.featurise import training_stores
 from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
 from training.streams import Batch
 from training.trajectories import StoredTrajectories, StretchData, correction_scale, fixes_of, loops_of, rmse_figures
@@ -263,8 +263,7 @@ def main(arguments: Arguments) -> dict[str, float]:
             "smooths odometry learned from steps that are not"
         )
     features = arguments.runs / domain.name / "features"
-    store = SMOOTHED_TRAIN if arguments.smoothing and domain.smoothing else "train"
-    stores = training_stores(features, domain, local_description, place_description, store)
+    stores = training_stores(features, domain, local_description, place_description)
     smoother: OdometrySmoother | None = None
     if arguments.smoothing:
         smoother, described = load_smoother(folder, domain.name)

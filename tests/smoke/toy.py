@@ -99,12 +99,7 @@ def place(world: str, folder: Path, epochs: int = 1) -> train_place.Arguments:
 
 def features(world: str, folder: Path) -> featurise.Arguments:
     return featurise.Arguments(
-        world=world,
-        trajectories=4,
-        optimizer_trajectories=3,
-        validation_trajectories=2,
-        weights=folder / "weights",
-        out=folder / "runs",
+        world=world, trajectories=4, validation_trajectories=2, weights=folder / "weights", out=folder / "runs"
     )
 
 

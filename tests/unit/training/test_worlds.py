@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from training import featurise
-from training.driven import Driven, driven_in_table
+from training.driven import driven_in_table
 from training.featurise import _GROUP
-from training.streams import PairStream, PlaceStream, episodes_in, simulate
+from training.streams import PairStream, PlaceStream, simulate
 from training.train_local import Arguments
 from training.worlds import (
     DEMO_SEEDS,
-    DRAWN,
     OPTIMIZER_TRAIN_SEEDS,
     TEST_SEEDS,
     TRAIN_SEEDS,
@@ -131,28 +129,6 @@ def test_a_table_of_another_driver_has_the_same_mazes_and_starts() -> None:
     np.testing.assert_array_equal(ours.maze.walls, by_chance.maze.walls)
     np.testing.assert_array_equal(ours.poses_xyyaw[0], by_chance.poses_xyyaw[0])
     assert not np.array_equal(ours.actions, by_chance.actions)
-
-
-def test_drivers_take_turns_group_by_group() -> None:
-    world = dataclasses.replace(WORLDS["maze2d"], episode_frames=30)
-    seeds = list(OPTIMIZER_TRAIN_SEEDS[:6])
-    driven = Driven(seeds, seeds, DRAWN, ("corners", "random"))
-    for first, driver in ((0, "corners"), (2, "random"), (4, "corners")):
-        found = driven.episodes(world, slice(first, first + 2))
-        group = seeds[first : first + 2]
-        for one, other in zip(found, episodes_in(world, group, group, 31, DRAWN, driver), strict=True):
-            np.testing.assert_array_equal(one.actions, other.actions)
-
-
-def test_optimizers_of_smoothed_odometry_learn_from_mazes_of_their_own() -> None:
-    world = WORLDS["maze3d"]
-    driven = featurise.driven_in(featurise.Arguments(world="maze3d"), world)
-    train, more = driven["train"], driven[featurise.SMOOTHED_TRAIN]
-    assert (len(train.seeds), len(more.seeds)) == (960, 240)
-    assert not set(train.seeds) & set(more.seeds)
-    assert max(more.seeds) < OPTIMIZER_TRAIN_SEEDS[len(OPTIMIZER_TRAIN_SEEDS) // 2]  # from there on all learn together
-    assert train.drivers == more.drivers == world.training_drivers
-    assert featurise.SMOOTHED_TRAIN not in featurise.driven_in(featurise.Arguments(world="maze2d"), WORLDS["maze2d"])
 
 
 @pytest.mark.parametrize(
