@@ -256,8 +256,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         about["data"] = recorded.about
     if NO_LOOPS in place_description:
         return _without_loops(arguments, domain, about, str(place_description[NO_LOOPS]))
-    registration = place.config.registration
-    if arguments.smoothing and arguments.form != "paper" and registration is not None and registration.odometry:
+    if arguments.smoothing and arguments.form != "paper" and place.config.registers_odometry:
         raise runs.RunError(
             f"smoothing is asked for in {domain.name}, whose odometry is registered; expected one of the two, as what "
             "smooths odometry learned from steps that are not"
@@ -269,7 +268,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         smoother, described = load_smoother(folder, domain.name)
         smooths["odometry_smoother_sha256"] = described["sha256"]
     began = arguments.recordings.from_weights
-    optimizer = None if began is None else begun_optimizer(began, smoother, registration is not None)
+    optimizer = None if began is None else begun_optimizer(began, smoother, place.config.registration is not None)
     made_of = None if smoother is None else smoother.config
     config = config_of(arguments, domain, (1.0, 1.0, 1.0), made_of) if optimizer is None else optimizer.config
     search = config.search if config.loops else None

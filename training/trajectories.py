@@ -126,7 +126,7 @@ def found_loops(
                 parts.append(find_loops(pair_head, codes, poses_in_blocks(steps[0], block), search))
         fields = [field.name for field in dataclasses.fields(Loops) if getattr(parts[0], field.name) is not None]
         values = {_LOOP + name: torch.cat([getattr(part, name) for part in parts]).numpy() for name in fields}
-        if search.registrations and registration is not None and registration.odometry:
+        if search.registrations and pair_head.config.registers_odometry:
             columns = zip(*odometry, strict=True)
             values |= {name: torch.cat(steps).numpy() for name, steps in zip(_REGISTERED, columns, strict=True)}
         partial = path.with_name(f"{path.name}.{os.getpid()}.npz")

@@ -69,8 +69,7 @@ class MetaGraph:
         self._kept = np.zeros((0, 3))  # poses of key frames when some were let go last
         self._gone = np.zeros(0, np.int64)  # nodes between these
         self._loops: OnlineLoops | None = None
-        registration = None if pair_head is None else pair_head.config.registration
-        registers = registration is not None and registration.odometry
+        registers = pair_head is not None and pair_head.config.registers_odometry
         self._registrations = optimizer.config.registrations if registers else 0  # of steps of the odometry
         self._origin_code: np.ndarray | None = None
         if optimizer.config.loops:

@@ -101,13 +101,8 @@ class OnlineTrajectory:
             raise ValueError("an optimizer with loops needs a pair head")
         if optimizer.config.registrations and (pair_head is None or pair_head.config.registration is None):
             raise ValueError("an optimizer that registers ranges needs a pair head whose codes hold them")
-        registration = None if pair_head is None else pair_head.config.registration
-        if (
-            optimizer.config.smoother is not None
-            and optimizer.config.registrations
-            and registration is not None
-            and registration.odometry
-        ):
+        registers = optimizer.config.registrations and pair_head is not None and pair_head.config.registers_odometry
+        if registers and optimizer.config.smoother is not None:
             raise ValueError(
                 "a smoother learned from steps that are not registered; expected a registration of loops alone"
             )

@@ -58,6 +58,11 @@ class PlaceConfig:
         return self.registration is not None and self.image.height > 1
 
     @property
+    def registers_odometry(self) -> bool:
+        """Whether the ranges in a code are good enough to measure steps of the odometry again, and not loops alone."""
+        return self.registration is not None and self.registration.odometry
+
+    @property
     def code_length(self) -> int:
         """Numbers in a code, with the ranges behind those that are learned."""
         return self.code_size + (0 if self.registration is None else self.registration.rays)
