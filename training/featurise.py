@@ -49,6 +49,7 @@ _COMPASS = ("compass", "compass_log_scale")
 STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
 """The arrays of a feature store, without those of a compass."""
 _MOST_STEPS = 1000  # of a stretch of a recording
+_CHUNK = 64  # steps at once: their activations stay in a CPU's cache (a fifth faster than 256)
 _BLOCK = PoseAggregationConfig(1).block
 
 
@@ -124,7 +125,7 @@ def step_features(
         poses_xyyaw: ``(steps + 1, 3)``.
     """
     parts: list[tuple[Tensor, ...]] = []
-    for chunk in torch.arange(len(poses_xyyaw) - 1).split(256):
+    for chunk in torch.arange(len(poses_xyyaw) - 1).split(_CHUNK):
         images = frames(slice(int(chunk[0]), int(chunk[-1]) + 2))
         side = {name: value[chunk] for name, value in told_steps.items()}
         relative, log_std, motion = networks.local(images[:-1], images[1:], side.get("action"), side.get("twist"))
