@@ -25,7 +25,8 @@ class Domain:
 
     What an optimizer here begins with: ``robust`` says whether the loops' gates start from a robust kernel or from
     nothing, ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart`` meta-poses from each other and
-    ``max_loops`` of a trajectory, and ``smoothing`` says whether its odometry is smoothed. It is trained for
+    ``max_loops`` of a trajectory, ``overlaps`` more are looked for under its poses, where ranges are registered, and
+    ``smoothing`` says whether its odometry is smoothed. It is trained for
     ``optimizer_epochs``, the first ``single_share`` of them with one iteration where it closes loops, and errors count
     by their square below ``loss_scale``: so many corridor widths, and as many fifths of a radian.
     """
@@ -49,6 +50,7 @@ class Domain:
     loops_per_pose: int = LoopSearch.per_pose
     max_loops: int = LoopSearch.most
     loops_apart: int = LoopSearch.min_apart
+    overlaps: int = 0
     smoothing: bool = False
     optimizer_epochs: int = 6
     single_share: float = 0.0

@@ -8,6 +8,7 @@ of the validation part is replaced by one that closes no loops and leaves the od
 weights written into the estimator's package.
 """
 
+import dataclasses
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -28,9 +29,10 @@ from ngo_estimator.checkpoint import (
     save_checkpoint,
 )
 from ngo_estimator.loop_closure import LoopSearch
-from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.neural_graph_optimizer import OVERLAPS_AFTER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.scan_registration import RegistrationConfig
 from training import runs
 from training.domains import Domain
 from training.featurise import training_stores
@@ -126,15 +128,23 @@ def step_loss(relative: Tensor, truth: Tensor, std: Tensor) -> Tensor:
 class OptimizerTraining(lightning.LightningModule):
     """``trajectory_loss`` on stretches of trajectories; on the validation split, errors of whole ones."""
 
-    def __init__(self, arguments: Arguments, optimizer: NeuralGraphOptimizer, domain: Domain) -> None:
+    def __init__(
+        self,
+        arguments: Arguments,
+        optimizer: NeuralGraphOptimizer,
+        domain: Domain,
+        registration: RegistrationConfig | None = None,
+    ) -> None:
         super().__init__()
         self.arguments, self.optimizer, self.domain = arguments, optimizer, domain
+        self.registration = registration
         if optimizer.config.smoother is not None:
             optimizer.smoother.requires_grad_(False)  # it has learned what it can, at a rate of its own
 
     def forward(self, batch: Batch) -> Any:
         fixes = fixes_of(batch, self.optimizer.block, self.domain.block_m)
-        return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops_of(batch), fixes)
+        loops = loops_of(batch, self.registration)
+        return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops, fixes)
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         block = self.optimizer.block
@@ -154,7 +164,7 @@ class OptimizerTraining(lightning.LightningModule):
         single = optimizer.config.loops and self.current_epoch < self.domain.single_share * (self.arguments.epochs or 0)
         steps = optimizer.aggregate(batch["relative"], batch["log_std"], batch["motion"])
         fixes = fixes_of(batch, optimizer.block, self.domain.block_m)
-        results = optimizer.iterate(steps, loops_of(batch), fixes)
+        results = optimizer.iterate(steps, loops_of(batch, self.registration), fixes)
         if single:
             return next(results).meta_relative
         *_, last = results
@@ -230,6 +240,7 @@ def config_of(
         views=domain.loop_views,
         # Where the place codes hold ranges, every iteration also measures loops once more.
         registrations=0 if place.config.registration is None else arguments.iterations,
+        overlaps=0 if place.config.registration is None or arguments.iterations <= OVERLAPS_AFTER else domain.overlaps,
     )
     return NeuralGraphOptimizerConfig(
         aggregation=aggregation,
@@ -284,12 +295,17 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "corrected_m",
         data=None if recorded is None else recorded.sha256,
-        settings={"single_share": domain.single_share, "loss_scale": domain.loss_scale, **smooths},
+        settings={
+            "single_share": domain.single_share,
+            "loss_scale": domain.loss_scale,
+            "search": dataclasses.asdict(search) if search is not None else None,
+            **smooths,
+        },
     )
     if optimizer is None:
         fresh = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train), made_of))
         optimizer = fresh.with_smoother(smoother)
-    training = OptimizerTraining(arguments, optimizer, domain)
+    training = OptimizerTraining(arguments, optimizer, domain, place.config.registration)
     few = recorded is not None
     data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)

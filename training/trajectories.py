@@ -17,6 +17,7 @@ from ngo_estimator.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
 from ngo_estimator.registered_odometry import registered_steps
+from ngo_estimator.scan_registration import RegistrationConfig, Scans
 from training.featurise import open_store
 from training.streams import ALL, Batch, Share
 
@@ -26,6 +27,7 @@ _FEWEST_BATCHES = 8  # of an epoch
 _STEPWISE = ("relative", "log_std", "motion", "truth")
 _REGISTERED = ("relative", "log_std")
 _COMPASS = ("compass", "compass_log_scale")
+_RANGES = "ranges"
 
 
 class StoredTrajectories:
@@ -49,7 +51,9 @@ class StoredTrajectories:
             odometry = {"odometry": arrays["relative"]}
             arrays = {**arrays, **{name: found.pop(name) for name in _REGISTERED if name in found}}
             compass = {name: arrays[name] for name in _COMPASS} if with_compass else {}
-            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **odometry, **compass})
+            codes = {"codes": arrays["codes"]} if search is not None and search.overlaps else {}
+            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **odometry, **compass, **codes})
+        self._code_size = pair_head.config.code_size
         self.block, self.with_compass = block, with_compass
         self.steps = min(part["relative"].shape[1] for part in self.parts) // block * block
         self.index = [(p, row) for p, part in enumerate(self.parts) for row in range(len(part["relative"]))]
@@ -62,7 +66,8 @@ class StoredTrajectories:
 
         Holds ``relative``, ``log_std``, ``motion`` and ``truth`` ``(batch, length, ...)``, float32, and the fields of
         ``Loops``, which ``loops_of`` puts together. ``relative`` and ``log_std`` are as the optimizer takes them, where
-        it registers scans, and ``odometry`` ``(batch, length, 3)`` what they were before.
+        it registers scans, and ``odometry`` ``(batch, length, 3)`` what they were before. With overlaps to be looked
+        for, ``ranges`` ``(batch, length, rays)`` are of the frame after each step.
         """
         rows = [self._row(*self.index[k], start, length) for k in chosen]
         return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
@@ -78,18 +83,22 @@ class StoredTrajectories:
         values = {name: value.float() for name, value in values.items()}
         loops = {name: torch.from_numpy(array[row].copy()) for name, array in arrays.items() if name.startswith(_LOOP)}
         frames = {}
+        if "codes" in arrays:
+            ranges = arrays["codes"][row, start : start + length, self._code_size :]
+            frames[_RANGES] = torch.from_numpy(ranges.astype(np.float32))
         if _COMPASS[0] in arrays:
             if start:
                 raise ValueError(f"a stretch begins at step {start}; expected 0, where a compass reads")
             count = len(frames_to_read(length, self.block))
-            frames = {name: torch.from_numpy(arrays[name][row, :count].copy()) for name in _COMPASS}
+            frames |= {name: torch.from_numpy(arrays[name][row, :count].copy()) for name in _COMPASS}
         return {**values, **frames, **_cropped(loops, start // self.block, length // self.block, self.block)}
 
 
-def loops_of(batch: Batch) -> Loops | None:
-    """The loop candidates in a batch, None without."""
+def loops_of(batch: Batch, registration: RegistrationConfig | None = None) -> Loops | None:
+    """The loop candidates in a batch, None without; ``registration`` is that of the ranges, if there are any."""
     fields = {name.removeprefix(_LOOP): value for name, value in batch.items() if name.startswith(_LOOP)}
-    return Loops(**fields) if fields else None
+    scans = None if registration is None or _RANGES not in batch else Scans(batch[_RANGES], registration)
+    return Loops(**{**fields, "scans": scans}) if fields else None  # type: ignore[arg-type]
 
 
 def fixes_of(batch: Batch, block: int, block_m: float) -> CompassFixes | None:
@@ -124,7 +133,7 @@ def found_loops(
                 steps = registered_steps(pair_head, relative, log_std, codes, block, search.registrations, origin[:, 0])
                 odometry.append(steps)
                 parts.append(find_loops(pair_head, codes, poses_in_blocks(steps[0], block), search))
-        fields = [field.name for field in dataclasses.fields(Loops) if getattr(parts[0], field.name) is not None]
+        fields = [f.name for f in dataclasses.fields(Loops) if isinstance(getattr(parts[0], f.name), torch.Tensor)]
         values = {_LOOP + name: torch.cat([getattr(part, name) for part in parts]).numpy() for name in fields}
         if search.registrations and pair_head.config.registers_odometry:
             columns = zip(*odometry, strict=True)

@@ -244,6 +244,9 @@ WORLDS = {
         ),
         # Four frames on, at 0.24 m a frame, most pairs are out of the range that the pair head knows.
         loop_views=1,
+        # Places look alike to few frames; more share walls, also with frames that face them.
+        max_loops=128,
+        overlaps=256,
         # What moves the robot sideways shows in the steps around a turn (docs/results.md).
         smoothing=True,
         optimizer_epochs=20,

@@ -23,7 +23,7 @@ from training.worlds import WORLDS, world_named
 
 
 def test_a_world_says_what_suits_it() -> None:
-    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(True, True, 4, 512, 20)
+    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(True, True, 4, 128, 20)
     assert choices(Arguments(world="maze2d"), world_named("maze2d")) == Choices(True, False, 4, 512, 6)
 
 

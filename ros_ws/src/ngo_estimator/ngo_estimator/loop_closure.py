@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ngo_estimator import se2
 from ngo_estimator.gauss_newton import pick
 from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.scan_registration import Scans
 
 VIEWS = ((0, 0), (-4, -4), (4, -4), (-2, -2), (2, -2), (-4, 0), (4, 0), (0, -3), (0, -6))
 """Steps from the frames of a candidate to those of its views: at the earlier frame, and at the later one."""
@@ -30,6 +31,7 @@ class LoopSearch:
     ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief. Each
     is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
     place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
+    With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
     """
 
     per_pose: int = 4
@@ -38,6 +40,7 @@ class LoopSearch:
     min_apart: int = 1
     views: int = 5
     registrations: int = 0
+    overlaps: int = 0
 
     def __post_init__(self) -> None:
         if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
@@ -49,6 +52,11 @@ class LoopSearch:
             raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
         if self.registrations < 0:
             raise ValueError(f"registrations is {self.registrations}; expected 0 (none) or more")
+        if self.overlaps < 0 or (self.overlaps and not self.registrations):
+            raise ValueError(
+                f"overlaps, registrations are {self.overlaps}, {self.registrations}; expected 0 (none) or more, and "
+                "with overlaps steps in which they are registered"
+            )
 
 
 @dataclass(frozen=True)
@@ -64,7 +72,8 @@ class Loops:
     ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
 
     ``length`` ``(batch, loops)`` counts the meta-poses on a loop, where those between its ends stand for several each;
-    ``most_drift`` ``(batch, loops, 3)`` is how far at most its residual varies by what is known without it.
+    ``most_drift`` ``(batch, loops, 3)`` is how far at most its residual varies by what is known without it. ``scans``
+    are the frames' ranges, where overlaps are still to be looked for.
     """
 
     start: Tensor
@@ -79,6 +88,13 @@ class Loops:
     embeddings: Tensor
     length: Tensor | None = None
     most_drift: Tensor | None = None
+    scans: Scans | None = None
+
+    def and_also(self, others: "Loops") -> "Loops":
+        """These and, behind them, others of the same trajectories; both without ``length`` and ``most_drift``."""
+        names = ("start", "end", "frame", "measured", "log_scale", "spread", "logit", "similarity", "valid")
+        both = {name: torch.cat((getattr(self, name), getattr(others, name)), dim=1) for name in names}
+        return Loops(**both, embeddings=self.embeddings)  # type: ignore[arg-type]
 
     @cached_property
     def description(self) -> Tensor:
@@ -140,6 +156,7 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
         similarity=similarity,
         valid=logit > -1e3,
         embeddings=at_ends,
+        scans=pair_head.scans(codes) if search.overlaps else None,
     )
 
 
@@ -164,7 +181,7 @@ def fused_measurements(
         As ``fuse_views``.
     """
     steps = codes.shape[1]
-    poses = _with_starts(in_blocks)
+    poses = frame_odometry(in_blocks)
     start = pick(poses, earlier)
     results, log_scales = [], []
     for number, (at_earlier, at_later) in enumerate(VIEWS[:views]):
@@ -203,7 +220,7 @@ def fuse_views(measured: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor, Ten
     return se2.wrapped(measured[0] + mean), -0.5 * weight.sum(0).log(), spread
 
 
-def _with_starts(in_blocks: Tensor) -> Tensor:
+def frame_odometry(in_blocks: Tensor) -> Tensor:
     """Global poses ``(batch, steps, 3)`` of all frames by odometry."""
     ends = se2.r2g(in_blocks[..., -1, :])
     starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
@@ -220,14 +237,24 @@ def _most_similar(at_ends: Tensor, embeddings: Tensor, block: int, search: LoopS
     best, best_step = similarity.max(dim=-1)
     index = torch.arange(blocks, device=at_ends.device)
     best = best.masked_fill(index[:, None] - index < search.min_separation, _NONE)
+    values, chosen = each_from_elsewhere(best, min(search.per_pose, blocks), search.min_apart, _NONE)
+    frames = chosen * block + best_step.gather(-1, chosen)
+    return values.flatten(1), frames.flatten(1), index.repeat_interleave(chosen.shape[-1]).expand(batch, -1)
+
+
+def each_from_elsewhere(values: Tensor, count: int, apart: int, none: float) -> tuple[Tensor, Tensor]:
+    """The ``count`` best of each row ``(..., n)``, and their indices, both ``(..., count)``.
+
+    Neighbours of one would say the same again: the next one is more than ``apart`` away, or ``none``.
+    """
+    index = torch.arange(values.shape[-1], device=values.device)
     chosen = []
-    for _ in range(min(search.per_pose, blocks)):
-        # Neighbours of a candidate would say the same again: the next one comes from elsewhere.
-        top = best.max(dim=-1, keepdim=True)
-        chosen.append((top.values, top.indices * block + best_step.gather(-1, top.indices)))
-        best = best.masked_fill((index - top.indices).abs() <= search.min_apart, _NONE)
-    values, frames = (torch.cat(parts, dim=-1).flatten(1) for parts in zip(*chosen, strict=True))
-    return values, frames, index.repeat_interleave(len(chosen)).expand(batch, -1)
+    for _ in range(count):
+        top = values.max(dim=-1, keepdim=True)
+        chosen.append((top.values, top.indices))
+        values = values.masked_fill((index - top.indices).abs() <= apart, none)
+    best, at = (torch.cat(parts, dim=-1) for parts in zip(*chosen, strict=True))
+    return best, at
 
 
 def loop_residuals(loops: Loops, poses: Tensor) -> Tensor:

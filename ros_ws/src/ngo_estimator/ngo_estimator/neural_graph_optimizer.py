@@ -21,6 +21,7 @@ from ngo_estimator.loop_closure import (
 from ngo_estimator.loop_gates import LearnedLoopGate, RobustLoopGate
 from ngo_estimator.normal_equations import GraphStructure, NormalEquations
 from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.overlaps import find_overlaps
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import (
     PoseAggregation,
@@ -30,6 +31,9 @@ from ngo_estimator.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.registered_odometry import registered_steps
+
+OVERLAPS_AFTER = 2
+"""Iterations after which poses are good enough to look for frames that see the same walls."""
 
 _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 """Deviations of a relative meta-pose, before anything is learned, in units of what its steps' deviations make it."""
@@ -42,7 +46,8 @@ class NeuralGraphOptimizerConfig:
     ``iterations`` attend-optimise iterations share their weights. ``attention`` is ``softmax``, or ``sum``, the
     paper's C / sum(C). ``dilations`` holds one number a convolution; with ``residual`` each is added to its input, and
     normalised over its channels. With ``loops`` every iteration sees the residuals of the loop candidates under the
-    current poses and takes a Gauss-Newton step that reduces them; ``search`` says which candidates there are. Without
+    current poses and takes a Gauss-Newton step that reduces them; ``search`` says which candidates there are, and how
+    many more are looked for under the poses after ``OVERLAPS_AFTER`` iterations. Without
     ``network`` this step is all there is: no attention and no convolutions, one learned factor for the odometry's
     deviations. With a ``smoother``, meta-poses are made of odometry that it has smoothed.
     ``correction_std`` (m, m, rad), the typical error of a relative meta-pose as the local odometry has it, is the unit
@@ -118,12 +123,14 @@ class MetaSteps:
     ``relative`` ``(batch, poses, 3)`` and ``std``, their standard deviations along the axes of the pose before. The
     last ``blocks`` of them are blocks of steps, with ``features`` ``(batch, blocks, width)`` where the optimizer has a
     network; those in front, if any, lead from the origin to the first block and may stand for many steps each.
+    ``in_blocks`` ``(batch, blocks, block, 3)`` are the poses within blocks, without which no overlaps are looked for.
     """
 
     relative: Tensor
     std: Tensor
     features: Tensor | None
     blocks: int
+    in_blocks: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -225,8 +232,9 @@ class NeuralGraphOptimizer(nn.Module):
         return changed
 
     def with_registrations(self, registrations: int) -> "NeuralGraphOptimizer":
-        """The same optimizer with another number of steps in which each loop is registered."""
-        search = replace(self.config.search, registrations=registrations)
+        """The same optimizer with another number of steps in which each loop is registered; with 0 without overlaps."""
+        overlaps = self.config.search.overlaps if registrations else 0
+        search = replace(self.config.search, registrations=registrations, overlaps=overlaps)
         changed = NeuralGraphOptimizer(replace(self.config, search=search))
         changed.load_state_dict(self.state_dict())
         return changed
@@ -288,7 +296,7 @@ class NeuralGraphOptimizer(nn.Module):
         in_blocks = poses_in_blocks(relative, self.block)
         features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
         std = block_variances(in_blocks, log_std).sqrt()
-        return MetaSteps(in_blocks[..., -1, :], std, features, in_blocks.shape[1])
+        return MetaSteps(in_blocks[..., -1, :], std, features, in_blocks.shape[1], in_blocks)
 
     def forward(
         self,
@@ -340,6 +348,10 @@ class NeuralGraphOptimizer(nn.Module):
         equations: NormalEquations | None = None
         for iteration in range(self.config.iterations):
             poses = _with_origin(se2.r2g(adjusted + deviation))
+            if iteration == OVERLAPS_AFTER and loops is not None:
+                more = self._overlaps(loops, steps.in_blocks, poses)
+                loops = loops if more is None else loops.and_also(more)
+                structure = self._structure(loops, odometry) if fixes is None and more is not None else structure
             inputs: list[Tensor] = []
             if loops is not None:
                 residuals = loop_residuals(loops, poses)
@@ -392,6 +404,13 @@ class NeuralGraphOptimizer(nn.Module):
                 lattice = None if lattice is None else lattice + step[:, nodes]
             results.append(adjusted + deviation)
             yield OptimizedMetaPoses(list(results), loops, weights, information, step_std, equations)
+
+    def _overlaps(self, loops: Loops, in_blocks: Tensor | None, poses: Tensor) -> Loops | None:
+        """Loops under these poses between frames that see the same, where they are to be looked for."""
+        search = self.config.search
+        if search.overlaps == 0 or loops.scans is None or in_blocks is None:
+            return None
+        return find_overlaps(loops.scans, in_blocks, poses, loops.embeddings, search, search.registrations)
 
     def _structure(self, loops: Loops | None, odometry: Tensor) -> GraphStructure | None:
         """Of the graph that every iteration solves, where a single one is optimised and no gradient asked for."""

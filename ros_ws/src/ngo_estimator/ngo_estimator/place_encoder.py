@@ -13,7 +13,7 @@ from torch.nn.functional import leaky_relu, normalize
 
 from ngo_estimator.flownet import FlowNetConvolutions
 from ngo_estimator.images import ImageFormat, to_network
-from ngo_estimator.scan_registration import RegistrationConfig, register
+from ngo_estimator.scan_registration import RegistrationConfig, Scans, register
 
 _UNSURE = -2.0
 """Logarithm of the scale from which on a range that was learned to see is left out: an eighth of itself."""
@@ -176,6 +176,11 @@ class PairHead(nn.Module):
         scale_offset = out.new_tensor([self.config.offset_scale_m, 1.0]).log()
         log_scale = out[..., 4:6].clamp(-6.0, 3.0) + scale_offset
         return torch.cat((xy, yaw.unsqueeze(-1)), dim=-1), log_scale, out[..., 6]
+
+    def scans(self, codes: Tensor) -> Scans | None:
+        """The ranges in codes ``(batch, steps, code_length)``; None where they hold none."""
+        config = self.config.registration
+        return None if config is None else Scans(codes[..., self.config.code_size :].detach(), config)
 
     def register(self, a: Tensor, b: Tensor, start: Tensor, log_std: Tensor, steps: int) -> tuple[Tensor, Tensor]:
         """Measure pairs of codes ``(..., code_length)`` by their ranges, from what is known of them already.

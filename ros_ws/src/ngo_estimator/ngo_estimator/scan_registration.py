@@ -75,6 +75,15 @@ class RegistrationConfig:
         return torch.linspace(half, -half, self.rays)
 
 
+@dataclass(frozen=True)
+class Scans:
+    """Ranges ``(batch, steps, rays)`` of the frame after each step (m, 0 where nothing is known), and how they are
+    registered."""
+
+    ranges: Tensor
+    registration: RegistrationConfig
+
+
 def register(
     config: RegistrationConfig, a: Tensor, b: Tensor, start: Tensor, log_std: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,165 @@
+"""Frames that see the same walls are found by their poses, and measured by their ranges."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from ngo_estimator import se2
+from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.overlaps import OVERLAP_LOGIT, find_overlaps, measure_overlaps, shared_views
+from ngo_estimator.place_encoder import PairHead
+from ngo_estimator.pose_aggregation import poses_in_blocks
+from ngo_estimator.scan_registration import Scans
+from tests.unit.ngo_estimator.rooms import CONFIG, drive_in_the_room, ranges_at, registering_pair_head
+from tests.unit.ngo_estimator.samples import small_optimizer, with_origin
+
+# As a camera sees: much less than all around.
+CAMERA = dataclasses.replace(CONFIG, rays=81, field_of_view_deg=106.0, odometry=False)
+SEARCH = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
+
+
+def view(x: float, y: float, yaw_deg: float) -> Tensor:
+    return torch.tensor([[x, y, math.radians(yaw_deg)]], dtype=torch.float64)
+
+
+def seen(pose: Tensor) -> Tensor:
+    return ranges_at(pose, CAMERA.rays, CAMERA.field_of_view_deg).float()
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "least", "most"),
+    [
+        pytest.param(view(1.0, 1.0, 10.0), view(1.0, 1.0, 10.0), 0.95, 1.0, id="the same"),
+        pytest.param(view(0.6, 1.2, 0.0), view(5.2, 1.2, 180.0), 0.25, 0.8, id="face to face"),
+        pytest.param(view(2.0, 1.2, 180.0), view(3.0, 1.2, 0.0), 0.0, 0.1, id="back to back"),
+        pytest.param(view(1.5, 1.2, 0.0), view(1.5, 1.2, 90.0), 0.0, 0.2, id="another side"),
+    ],
+)
+def test_frames_share_what_both_see(a: Tensor, b: Tensor, least: float, most: float) -> None:
+    relative = se2.between(a, b).float()
+    shared = shared_views(CAMERA, seen(a), seen(b), relative)
+    assert least <= shared.item() <= most
+    torch.testing.assert_close(shared, shared_views(CAMERA, seen(b), seen(a), se2.inverse(relative)))
+
+
+def test_under_a_wrong_pose_less_is_shared_and_without_ranges_nothing() -> None:
+    a, b = view(0.6, 1.2, 0.0), view(5.2, 1.2, 180.0)
+    right = se2.between(a, b).float()
+    wrong = right + torch.tensor([[0.0, 0.0, math.radians(40.0)]])
+    shared, less = (shared_views(CAMERA, seen(a), seen(b), relative).item() for relative in (right, wrong))
+    assert less < 0.5 * shared
+    assert shared_views(CAMERA, seen(a), torch.zeros(1, CAMERA.rays), right).item() == 0.0
+
+
+def test_frames_that_face_each_other_are_measured_by_the_walls_between_them() -> None:
+    a, b = view(0.6, 1.2, 5.0), view(5.2, 1.3, 176.0)
+    near_a, near_b = (se2.compose(pose, torch.tensor([[0.2, 0.0, 0.05]], dtype=torch.float64)) for pose in (a, b))
+    truth = se2.between(a, b)
+    start = (truth + torch.tensor([[0.2, -0.2, math.radians(3.0)]])).float()
+    ranges = [torch.stack([seen(x), seen(y)]) for x, y in ((a, near_a), (b, near_b))]
+    from_a = torch.stack([se2.between(a, x) for x in (a, near_a)]).float()
+    to_b = torch.stack([se2.between(x, b) for x in (b, near_b)]).float()
+    measured, log_scale, spread, found = measure_overlaps(CAMERA, *ranges, from_a, to_b, start, 6)
+    assert found.all()
+    # Where along the corridor they are, its walls do not say.
+    along, across, turned = (measured - truth)[0].abs().tolist()
+    assert along < 0.3 and across < 0.03 and turned < math.radians(0.3)
+    assert log_scale[0, 0].exp() > 0.2 and log_scale[0, 1].exp() < math.radians(1.0) and (spread.exp() < 0.05).all()
+    # Of frames that cannot be registered nothing is found.
+    nothing = [torch.zeros_like(x) for x in ranges]
+    *_, found = measure_overlaps(CAMERA, *nothing, from_a, to_b, start, 6)
+    assert not found.any()
+
+
+def driven(steps: int = 160, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Odometry ``(1, steps, 3)``, true poses ``(1, steps, 3)`` from the first frame, and the camera's ranges."""
+    relative, *_, truth = drive_in_the_room(steps, seed)
+    start = view(2.0, 0.7, 0.0)
+    return relative[None], truth[None], seen(se2.compose(start, truth))[None]
+
+
+def test_overlaps_are_found_under_poses_and_measured_nearer_the_truth() -> None:
+    relative, truth, ranges = driven()
+    in_blocks = poses_in_blocks(relative, 8)
+    true_nodes = with_origin(truth[:, 7::8])
+    drift = torch.tensor([0.1, 0.1, math.radians(2.0)]) * torch.randn(
+        1, 21, 3, generator=torch.Generator().manual_seed(2)
+    )
+    nodes = true_nodes + drift
+    loops = find_overlaps(Scans(ranges, CAMERA), in_blocks, nodes, torch.ones(1, 20, 4), SEARCH, 5)
+    assert loops.start.shape == (1, SEARCH.overlaps) and loops.valid.sum() > 8
+    found = loops.valid[0]
+    start, end = loops.start[0][found], loops.end[0][found] + 1
+    assert (end - start >= SEARCH.min_separation).all() and (start >= 1).all()
+    assert torch.bincount(end).max() <= SEARCH.per_pose
+    assert (loops.frame[0][found] == 8 * start - 1).all()
+    assert (loops.logit == OVERLAP_LOGIT).all() and (loops.similarity == 4.0).all()
+
+    def errors(relative_poses: Tensor) -> Tensor:
+        return se2.wrapped(relative_poses.double() - se2.between(true_nodes[0, start], true_nodes[0, end])).abs()
+
+    before, after = errors(se2.between(nodes[0, start], nodes[0, end])), errors(loops.measured[0][found])
+    assert (after.median(0).values < 0.2 * before.median(0).values).all()
+    # What is not found is a loop like any other, of no weight.
+    assert (loops.start <= loops.end).all() and loops.measured.isfinite().all() and loops.log_scale.isfinite().all()
+
+
+def test_each_trajectory_of_a_batch_has_its_own() -> None:
+    both = [torch.cat(parts) for parts in zip(driven(seed=0), driven(seed=1), strict=True)]
+    both[2][1, 40:] = 0.0  # what it sees is lost
+    nodes = with_origin(both[1][:, 7::8])
+
+    def found(which: slice) -> tuple[Tensor, Tensor, Tensor]:
+        relative, _, ranges = (part[which] for part in both)
+        scans = Scans(ranges, CAMERA)
+        embeddings = torch.ones(len(relative), 20, 4)
+        loops = find_overlaps(scans, poses_in_blocks(relative, 8), nodes[which], embeddings, SEARCH, 5)
+        return loops.valid, loops.end, loops.measured
+
+    together = found(slice(0, 2))
+    assert together[0][0].sum() > 8 > together[0][1].sum()
+    for k in (0, 1):
+        for one, many in zip(found(slice(k, k + 1)), together, strict=True):
+            torch.testing.assert_close(one[0], many[k], atol=1e-4, rtol=1e-4)
+
+
+def camera_pair_head() -> PairHead:
+    plain = registering_pair_head()
+    head = PairHead(dataclasses.replace(plain.config, image=dataclasses.replace(plain.config.image, width=81),
+                                        registration=CAMERA))  # fmt: skip
+    return head.eval().requires_grad_(False)
+
+
+@pytest.mark.parametrize("iterations", [2, 5])
+def test_an_optimizer_of_more_than_two_iterations_takes_them(iterations: int) -> None:
+    relative, truth, ranges = driven()
+    std = torch.tensor([0.003, 0.003, 0.01])
+    relative = relative + std * torch.randn(relative.shape, generator=torch.Generator().manual_seed(3))
+    log_std = std.log().expand_as(relative)
+    codes = torch.cat((torch.zeros(1, 160, 12), ranges), dim=-1)
+    motion = torch.zeros(1, 160, 6)
+    errors = {}
+    for overlaps in (0, 20):
+        search = dataclasses.replace(SEARCH, overlaps=overlaps)
+        optimizer = small_optimizer("gauss_newton", iterations=iterations, search=search)
+        loops = optimizer.find_loops(relative, codes, camera_pair_head())
+        # Places are not recognised at all.
+        loops = dataclasses.replace(loops, valid=torch.zeros_like(loops.valid))
+        result = optimizer(relative, log_std, motion, loops)
+        assert result.loops is not None and result.loop_weights is not None
+        taken = overlaps if iterations > 2 else 0
+        assert result.loops.start.shape[1] == result.loop_weights.shape[1] == loops.start.shape[1] + taken
+        errors[overlaps] = (result.poses - truth)[..., :2].norm(dim=-1).square().mean().sqrt().item()
+    assert errors[20] < 0.3 * errors[0] if iterations > 2 else errors[20] == errors[0]
+
+
+def test_without_registrations_there_are_no_overlaps() -> None:
+    optimizer = small_optimizer(search=SEARCH)
+    assert optimizer.with_registrations(3).config.search.overlaps == SEARCH.overlaps
+    assert optimizer.with_registrations(0).config.search.overlaps == 0
+    for wrong in ({"overlaps": -1}, {"overlaps": 5, "registrations": 0}):
+        with pytest.raises(ValueError, match=r"overlaps, registrations are .*; expected 0"):
+            dataclasses.replace(SEARCH, **wrong)
