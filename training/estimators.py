@@ -23,7 +23,7 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import loop_factors
 from training.compass_factors import found_fixes
 from training.featurise import open_store
-from training.loop_factors import LoopFactors, Seen
+from training.loop_factors import LoopFactors, MoreLoops, Seen
 from training.pose_graph import PoseGraphSettings, optimize, optimize_exact
 from training.rows import ROWS, Sources
 from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
@@ -235,12 +235,21 @@ def pose_graph(
             if ROWS[row].compass:
                 reading, scale = (whole[name] for name in COMPASS_ARRAYS)
                 fixes = found_fixes(reading, scale, seen.relative, whole["log_std"], settings.block, block_m)
-            added = zip(odometry, loops, fixes, strict=True)
-            solved = [optimize(*one, found, settings, fix) for one, found, fix in added]
+            more: Sequence[MoreLoops | None] = [None] * len(truth)
+            if settings.search.overlaps and row != "true_pairs":
+                more = loop_factors.overlaps_of(pair_head, whole["codes"], steps[0], settings.search, settings.block)
+            if known is not None:
+                more = [of and _known(of, known, true) for of, true in zip(more, truth, strict=True)]
+            added = zip(odometry, loops, fixes, more, strict=True)
+            solved = [optimize(*one, found, settings, fix, of) for one, found, fix, of in added]
         left = torch.from_numpy(settings.calibrated(arrays["relative"]))
         return _with_tail(torch.from_numpy(np.stack(solved)), left).numpy()
 
     return poses
+
+
+def _known(more: MoreLoops, known: Callable[[LoopFactors, np.ndarray], LoopFactors], truth: np.ndarray) -> MoreLoops:
+    return lambda nodes: known(more(nodes), truth)
 
 
 def _whole(steps: int, block: int) -> int:

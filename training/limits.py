@@ -121,7 +121,7 @@ def told(arrays: Arrays, limit: Limit) -> Arrays:
 
 
 def exact_loops(loops: Loops, truth: Tensor, block: int) -> Loops:
-    """Loops with the true relative poses of what they connect.
+    """Loops with the true relative poses of what they connect, and of the overlaps that are still to be found.
 
     Args:
         truth: true poses after each step ``(batch, steps, 3)``.
@@ -129,7 +129,10 @@ def exact_loops(loops: Loops, truth: Tensor, block: int) -> Loops:
     nodes = _nodes(truth, block)
     rows = torch.arange(len(nodes)).unsqueeze(1)
     measured = se2.between(nodes[rows, loops.start], nodes[rows, loops.end + 1])
-    return replace(loops, measured=measured.to(loops.measured.dtype), log_scale=loops.log_scale - _MORE_BELIEF)
+    scans = loops.scans and replace(loops.scans, known=lambda overlaps: exact_loops(overlaps, truth, block))
+    return replace(
+        loops, measured=measured.to(loops.measured.dtype), log_scale=loops.log_scale - _MORE_BELIEF, scans=scans
+    )
 
 
 def exact_factors(found: LoopFactors, truth: np.ndarray, block: int) -> LoopFactors:

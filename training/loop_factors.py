@@ -5,7 +5,9 @@ tell how much of the error that remains lies in retrieval, and how much in measu
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from torch import Tensor
 from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch, find_loops, fused_measurements
 from ngo_estimator.odometry_smoothing import OdometrySmoother
+from ngo_estimator.overlaps import find_overlaps
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
 from ngo_estimator.registered_odometry import registered_steps
@@ -37,6 +40,11 @@ class LoopFactors:
     measured: np.ndarray
     log_scale: np.ndarray
     logit: np.ndarray
+
+    def and_also(self, others: "LoopFactors") -> "LoopFactors":
+        """These and, behind them, the others."""
+        both = zip(vars(self).values(), vars(others).values(), strict=True)
+        return LoopFactors(*(np.concatenate(pair) for pair in both))
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,40 @@ def found_loops(pair_head: PairHead, seen: Seen, search: LoopSearch, block: int 
         for number, valid in enumerate(loops.valid):
             found.append(LoopFactors(*(column[number][valid].numpy() for column in columns)))
     return found
+
+
+MoreLoops = Callable[[np.ndarray], LoopFactors]
+"""Further loops of one trajectory, under the meta-poses ``(blocks + 1, 3)`` that a graph has come to."""
+
+
+def overlaps_of(
+    pair_head: PairHead, codes: np.ndarray, relative: np.ndarray, search: LoopSearch, block: int = 8
+) -> list[MoreLoops]:
+    """What ``find_overlaps`` gives for each trajectory, once there are poses.
+
+    Args:
+        codes: place codes ``(trajectories, steps, code_length)``; relative: steps of the odometry ``(trajectories,
+            steps, 3)``.
+
+    Raises:
+        ValueError: codes that hold no ranges.
+    """
+    if pair_head.config.registration is None:
+        raise ValueError("overlaps are looked for, but the place codes hold no ranges; expected a registration")
+
+    def more(nodes: np.ndarray, number: int) -> LoopFactors:
+        of_one = slice(number, number + 1)
+        seen, poses = _float32(codes[of_one]), _float32(nodes).unsqueeze(0)
+        scans = pair_head.scans(seen)
+        assert scans is not None
+        with torch.inference_mode():
+            in_blocks = poses_in_blocks(_float32(relative[of_one]), block)
+            embeddings = pair_head.embed(seen[:, block - 1 :: block])
+            loops = find_overlaps(scans, in_blocks, poses, embeddings, search, search.registrations)
+        columns = (loops.start, loops.end, loops.measured, loops.log_scale, loops.logit)
+        return LoopFactors(*(column[loops.valid].numpy() for column in columns))
+
+    return [partial(more, number=number) for number in range(len(codes))]
 
 
 def true_revisits(

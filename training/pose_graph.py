@@ -19,7 +19,7 @@ from ngo_estimator.compass_closure import CompassFixes
 from ngo_estimator.lattice import snapped
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.pose_aggregation import block_variances, frame_poses, poses_in_blocks
-from training.loop_factors import LoopFactors, exact_revisits
+from training.loop_factors import LoopFactors, MoreLoops, exact_revisits
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
 _KERNELS: dict[str, Callable[[float], Any]] = {
@@ -100,6 +100,7 @@ def optimize(
     loops: LoopFactors,
     settings: PoseGraphSettings,
     compass: CompassFixes | None = None,
+    more: MoreLoops | None = None,
 ) -> np.ndarray:
     """Poses ``(steps, 3)`` after each step, seen from the first frame, float64.
 
@@ -108,11 +109,15 @@ def optimize(
         log_std: logarithm of their standard deviations ``(steps, 3)``.
         loops: loop candidates, from ``found_loops`` of the calibrated odometry.
         compass: readings of this trajectory alone, a batch of one.
+        more: gives further loops, of the meta-poses ``(blocks + 1, 3)`` that the graph comes to without them.
     """
     steps = torch.from_numpy(settings.calibrated(relative)).unsqueeze(0)
     in_blocks = poses_in_blocks(steps, settings.block)
     variances = block_variances(in_blocks, torch.from_numpy(np.asarray(log_std, dtype=np.float64)).unsqueeze(0))
-    graph = _Graph(in_blocks[0, :, -1], variances[0].sqrt().numpy(), loops, settings)
+    odometry = in_blocks[0, :, -1], variances[0].sqrt().numpy()
+    graph = _Graph(*odometry, loops, settings)
+    if more is not None:
+        graph = _Graph(*odometry, loops.and_also(more(graph.solve())), settings)
     poses = torch.from_numpy(graph.solve() if compass is None else graph.solve_with(compass))
     meta_relative = se2.between(poses[:-1], poses[1:])
     return frame_poses(in_blocks, meta_relative.unsqueeze(0))[0].numpy()

@@ -28,7 +28,15 @@ from ngo_estimator.place_encoder import PairHead
 from training import runs
 from training.compass_factors import found_fixes
 from training.featurise import open_store
-from training.loop_factors import LoopFactors, Seen, found_loops, registered_odometry, smoothed_odometry
+from training.loop_factors import (
+    LoopFactors,
+    MoreLoops,
+    Seen,
+    found_loops,
+    overlaps_of,
+    registered_odometry,
+    smoothed_odometry,
+)
 from training.metrics import trajectory_error
 from training.pose_graph import PoseGraphSettings, optimize
 from training.worlds import world_named
@@ -147,10 +155,14 @@ class Objective:
         return self._odometry
 
     def __call__(self, settings: PoseGraphSettings) -> float:
-        odometry = zip(*self._steps(settings), strict=True)
-        added = zip(self.loops(settings), self._compass, strict=True)
+        odometry, search = self._steps(settings), settings.search
+        more: Sequence[MoreLoops | None] = [None] * len(self._compass)
+        if search.overlaps:
+            more = overlaps_of(self._pair_head, self.arrays["codes"], odometry[0], search, settings.block)
+        added = zip(self.loops(settings), self._compass, more, strict=True)
         return self.error(
-            optimize(*steps, loops, settings, compass) for steps, (loops, compass) in zip(odometry, added, strict=True)
+            optimize(*steps, loops, settings, compass, overlaps)
+            for steps, (loops, compass, overlaps) in zip(zip(*odometry, strict=True), added, strict=True)
         )
 
     def error(self, poses: Iterable[np.ndarray]) -> float:
@@ -210,9 +222,9 @@ def tune(
     return best, least
 
 
-def _registering(change: dict[str, Any], registrations: int) -> dict[str, Any]:
-    searches = {name: replace(v, registrations=registrations) for name, v in change.items() if name == "search"}
-    return {**change, **searches}
+def _searching(change: dict[str, Any], **how: int) -> dict[str, Any]:
+    """The change, where it is one of the search, with what all searches have in common."""
+    return {name: replace(value, **how) if name == "search" else value for name, value in change.items()}
 
 
 def load_settings(path: Path) -> PoseGraphSettings:
@@ -241,8 +253,14 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     pair_head = place.pair_head
     registrations = 0 if pair_head.config.registration is None else REGISTRATIONS
     start = PoseGraphSettings()
-    start = replace(start, search=replace(start.search, registrations=registrations))
-    grid = [[_registering(change, registrations) for change in group] for group in GRID]
+    # Overlaps are looked for as in our optimizer; whether they help is one more thing to try, with each search.
+    counts = dict.fromkeys((world.overlaps if registrations else 0, 0))
+    ways = [{"registrations": registrations, "overlaps": count} for count in counts]
+    start = replace(start, search=replace(start.search, **ways[0]))
+    grid = [
+        [_searching(change, **way) for change in group for way in (ways if "search" in change else ways[:1])]
+        for group in GRID
+    ]
     smoother: OdometrySmoother | None = None
     tuned_for = {"place_encoder_sha256": described["sha256"]}
     if arguments.form in ("registered", "smoothed"):

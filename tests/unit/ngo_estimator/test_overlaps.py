@@ -3,15 +3,18 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.online_trajectory import OnlineTrajectory
 from ngo_estimator.overlaps import OVERLAP_LOGIT, find_overlaps, measure_overlaps, shared_views
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
+from ngo_estimator.relative_step import RelativeStep
 from ngo_estimator.scan_registration import Scans
 from tests.unit.ngo_estimator.rooms import CONFIG, drive_in_the_room, ranges_at, registering_pair_head
 from tests.unit.ngo_estimator.samples import small_optimizer, with_origin
@@ -163,3 +166,45 @@ def test_without_registrations_there_are_no_overlaps() -> None:
     for wrong in ({"overlaps": -1}, {"overlaps": 5, "registrations": 0}):
         with pytest.raises(ValueError, match=r"overlaps, registrations are .*; expected 0"):
             dataclasses.replace(SEARCH, **wrong)
+
+
+def online(overlaps: int, window: int, steps: int = 320, first: int = 0) -> float:
+    """Position RMSE (m) in the end of what is corrected online from step ``first`` on, where no place is recognised."""
+    relative, truth, ranges = driven(steps)
+    std = torch.tensor([0.003, 0.003, 0.01])
+    relative = relative + std * torch.randn(relative.shape, generator=torch.Generator().manual_seed(3))
+    odometry = se2.r2g(relative[0].double()).numpy()
+    code = torch.cat((torch.zeros(steps, 12), ranges[0]), dim=-1).numpy()
+    search = dataclasses.replace(SEARCH, most=1, per_pose=2, overlaps=overlaps)
+    core = OnlineTrajectory(
+        small_optimizer("gauss_newton", iterations=5, search=search), camera_pair_head(), window, key_frames=12
+    )
+    for k in range(steps):
+        step = RelativeStep(
+            stamp_ns=k + 1,
+            from_stamp_ns=k,
+            relative_xyyaw=relative[0, k].double().numpy(),
+            covariance=np.diag(std.double().square()),
+            origin_stamp_ns=0,
+            odom_xyyaw=odometry[k],
+            motion_feature=np.zeros(6, np.float32),
+            place_code=code[k],
+        )
+        core.update(step, optimize=k >= first)
+    trajectory = core.trajectory()
+    assert trajectory is not None
+    errors = trajectory.poses_xyyaw[1:, :2] - truth[0, :, :2].numpy()
+    return float(np.sqrt(np.square(errors).sum(1).mean()))
+
+
+@pytest.mark.parametrize("window", [640, 96])
+def test_online_the_newest_frame_is_registered_to_those_it_shares_walls_with(window: int) -> None:
+    without, with_overlaps = online(0, window), online(40, window)
+    assert with_overlaps < 0.3 * without
+
+
+def test_in_a_pause_none_are_looked_for() -> None:
+    # Poses that nothing has corrected say nothing; of the last step alone, all are corrected at once.
+    errors = [online(overlaps, 640, 160, first=159) for overlaps in (0, 40)]
+    assert errors[0] == errors[1]
+    assert online(40, 640, 160) < 0.7 * errors[0]

@@ -23,6 +23,9 @@ from ngo_estimator.rows import GrowingRows, SlidingRows
 _MOST_DRIFT = 4.0
 """How much the variance between a key frame and the newest pose is taken to be more than the graph says."""
 
+_FRESH = 2
+"""Blocks since the last optimisation up to which poses say what frames share."""
+
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
 
@@ -139,6 +142,8 @@ class MetaGraph:
             self._aggregate(block)
         if self._loops is not None:
             found = self._loops.find(block, self._first, self._keys)
+            if self.blocks - self._result_last <= _FRESH:
+                found = found.and_also(self._loops.find_overlaps(block, self._first, self._keys, self._nodes.values))
             if len(self._keys):
                 self._loops.limit_drift(found, self._drift(found))
         while self.blocks - self._first > self._window:

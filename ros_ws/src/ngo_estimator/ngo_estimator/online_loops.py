@@ -12,6 +12,7 @@ from torch import Tensor
 from ngo_estimator import se2
 from ngo_estimator.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.loop_closure import SMALLEST_SPREAD, VIEWS, Loops, LoopSearch, fuse_views
+from ngo_estimator.overlaps import LEAST_SHARED, OVERLAP_LOGIT, OVERLAP_VIEWS, measure_overlaps, shared_views
 from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.rows import GrowingRows, SlidingRows
 
@@ -30,6 +31,8 @@ _BELIEVED = 0.1
 _UNWEIGHED = -1.0
 """Weight of a loop that no optimisation has seen."""
 
+_EARLIER, _LATER = (np.array([view[k] for view in OVERLAP_VIEWS]) for k in (0, 1))
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -37,7 +40,8 @@ class Candidates:
 
     ``frame`` is the earlier frame, as a number of steps before it; ``measured`` ``(n, 3)``, ``log_scale``, ``spread``
     ``(n, 2)``, ``logit`` and ``similarity`` as in ``Loops``; ``most_drift`` ``(n, 3)`` likewise, infinite where the
-    odometry says enough; ``weight`` what the optimizer gave it last, negative before it did.
+    odometry says enough; ``weight`` what the optimizer gave it last, negative before it did; ``overlap`` whether it was
+    found by poses.
     """
 
     start: np.ndarray
@@ -50,14 +54,15 @@ class Candidates:
     similarity: np.ndarray
     most_drift: np.ndarray
     weight: np.ndarray
+    overlap: np.ndarray
 
     @classmethod
     def none(cls) -> "Candidates":
         """No candidates."""
         widths = {"measured": 3, "most_drift": 3, "log_scale": 2, "spread": 2}
-        integers = ("start", "end", "frame")
+        types = {"start": np.int64, "end": np.int64, "frame": np.int64, "overlap": np.bool_}
         shapes = [(f.name, (0, widths[f.name]) if f.name in widths else (0,)) for f in fields(cls)]
-        return cls(**{name: np.zeros(shape, np.int64 if name in integers else np.float64) for name, shape in shapes})
+        return cls(**{name: np.zeros(shape, types.get(name, np.float64)) for name, shape in shapes})
 
     def __len__(self) -> int:
         return len(self.start)
@@ -187,7 +192,98 @@ class OnlineLoops:
             similarity=np.array([pair.similarity for pair in pairs]),
             most_drift=np.full((count, 3), np.inf),
             weight=np.full(count, _UNWEIGHED),
+            overlap=np.zeros(count, np.bool_),
         )
+
+    @torch.inference_mode()
+    def find_overlaps(self, block: int, first: int, keys: KeyFrames, nodes: np.ndarray) -> Candidates:
+        """Candidates that end behind the block of this number, the newest, at nodes that share what is seen there.
+
+        What ``overlaps.find_overlaps`` finds in a whole trajectory; arguments as of ``find``.
+
+        Args:
+            nodes: poses of all nodes in the map ``(block + 2, 3)``.
+        """
+        scans = self._pair_head.config.registration
+        if scans is None or self._search.overlaps == 0:
+            return Candidates.none()
+        end, last = block + 1, (block + 1) * self._block - 1
+        in_window = np.arange(max(1, first), end - self._search.min_separation + 1)
+        key_codes = [keys.frame(k).codes[MARGIN - 1] for k in range(len(keys))]
+        codes = np.concatenate((*[c[None] for c in key_codes], self._codes.at(in_window * self._block - 1)))
+        earlier = np.concatenate((keys.nodes, in_window))
+        if len(earlier) == 0:
+            return Candidates.none()
+        relative = torch.from_numpy(_seen_from(nodes[earlier], nodes[end])).float()
+        at_end = self._codes.slice(last)[0]
+        ranges, newest = (torch.from_numpy(self._ranges(c)) for c in (codes, at_end))
+        share = shared_views(scans, ranges, newest.expand_as(ranges), relative).numpy()
+        # The origin has no code of its own.
+        share[(earlier == 0) | (earlier > end - self._search.min_separation)] = -np.inf
+        chosen = [
+            index
+            for index, _, value in self._most_similar(share[:, None], earlier, self._search.per_pose)
+            if value >= LEAST_SHARED
+        ]
+        found = Candidates.none()
+        if chosen:
+            pairs = [
+                self._key_node(keys.frame(k)) if k < len(keys) else self._node_in_window(int(earlier[k]), last)
+                for k in chosen
+            ]
+            found = self._measured_overlaps(pairs, end, relative[chosen])
+        self._candidates = self._candidates.and_also(found)
+        return found
+
+    def _ranges(self, codes: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(codes[..., self._pair_head.config.code_size :])
+
+    def _node_in_window(self, node: int, last: int) -> "_Pair":
+        frame = node * self._block - 1
+        at = np.clip(frame + _EARLIER, 0, last)
+        odometry = self._odometry.values
+        poses = _seen_from(odometry[frame + 1], odometry[at + 1])
+        return _Pair(node, frame, 0.0, self._codes.at(at), poses, np.zeros(3))
+
+    def _key_node(self, key: KeyFrame) -> "_Pair":
+        at = np.clip(MARGIN - 1 + _EARLIER, max(0, MARGIN - key.node * self._block), len(key.codes) - 1)
+        return _Pair(key.node, key.node * self._block - 1, 0.0, key.codes[at], key.poses[at], np.zeros(3))
+
+    def _measured_overlaps(self, pairs: list["_Pair"], node: int, start: Tensor) -> Candidates:
+        """Register pairs whose later frame is the one before ``node``, as seen from the earlier one at first."""
+        scans = self._pair_head.config.registration
+        assert scans is not None
+        last = node * self._block - 1
+        at = np.clip(last + _LATER, 0, last)
+        odometry = self._odometry.values
+        to_end = torch.from_numpy(_seen_from(odometry[at + 1], odometry[last + 1])).float().unsqueeze(1)
+        codes = np.stack([pair.codes for pair in pairs], axis=1)  # (views, n, code_length)
+        newest = np.broadcast_to(self._codes.at(at)[:, None], codes.shape)
+        measured, log_scale, spread, registered = measure_overlaps(
+            scans,
+            torch.from_numpy(self._ranges(codes)),
+            torch.from_numpy(self._ranges(newest)),
+            torch.from_numpy(np.stack([pair.poses for pair in pairs], axis=1)).float(),
+            to_end.expand(-1, len(pairs), -1),
+            start,
+            self._search.registrations,
+        )
+        embeddings = [self._pair_head.embed(torch.from_numpy(c[0].copy())) for c in (codes, newest)]
+        count = len(pairs)
+        found = Candidates(
+            start=np.array([pair.node for pair in pairs]),
+            end=np.full(count, node),
+            frame=np.array([pair.frame for pair in pairs]),
+            measured=measured.double().numpy(),
+            log_scale=log_scale.double().numpy(),
+            spread=spread.double().numpy(),
+            logit=np.full(count, OVERLAP_LOGIT),
+            similarity=(embeddings[0] * embeddings[1]).sum(-1).double().numpy(),
+            most_drift=np.full((count, 3), np.inf),
+            weight=np.full(count, _UNWEIGHED),
+            overlap=np.ones(count, np.bool_),
+        )
+        return found.where(registered.numpy())
 
     def limit_drift(self, found: Candidates, most_drift: np.ndarray) -> None:
         """Say of the candidates that ``find`` gave last how far they may be off at most: ``(n, 3)``, variances."""
@@ -262,11 +358,13 @@ class OnlineLoops:
             blocks: blocks of the whole trajectory.
         """
         within, behind = self._candidates.start >= first, self._candidates.end <= first
+        overlap = self._candidates.overlap
         numbers = np.concatenate(
             (
                 np.flatnonzero(behind),
                 self._best(np.flatnonzero(~within & ~behind), _MOST_TO_KEY_FRAMES),
-                self._best(np.flatnonzero(within), self._search.most),
+                self._best(np.flatnonzero(within & ~overlap), self._search.most),
+                self._best(np.flatnonzero(within & overlap), self._search.overlaps),
             )
         )
         c = self._candidates.where(numbers)
@@ -289,10 +387,11 @@ class OnlineLoops:
         return loops, numbers
 
     def _best(self, numbers: np.ndarray, most: int) -> np.ndarray:
-        """Those with the highest belief, in their present order."""
+        """Those with the highest belief, of equal ones those that are measured best, in their present order."""
         if len(numbers) <= most:
             return numbers
-        best: np.ndarray = np.sort(numbers[np.argpartition(-self._candidates.logit[numbers], most - 1)[:most]])
+        logit, heading = self._candidates.logit[numbers], self._candidates.log_scale[numbers, 1]
+        best: np.ndarray = np.sort(numbers[np.lexsort((heading, -logit))[:most]])
         return best
 
     def weigh(self, numbers: np.ndarray, weights: np.ndarray) -> None:

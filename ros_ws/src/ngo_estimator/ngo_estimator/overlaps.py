@@ -76,7 +76,7 @@ def find_overlaps(
         )
         similarity = (pick(embeddings, earlier) * pick(embeddings, later)).sum(-1)
     valid = found & (share >= LEAST_SHARED)
-    return Loops(
+    loops = Loops(
         start=torch.where(valid, earlier + 1, later),
         end=later,
         frame=frame,
@@ -88,6 +88,7 @@ def find_overlaps(
         valid=valid,
         embeddings=embeddings,
     )
+    return loops if scans.known is None else scans.known(loops)
 
 
 def _shared(config: RegistrationConfig, ranges: Tensor, poses: Tensor, min_separation: int) -> Tensor:
