@@ -12,24 +12,17 @@ from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import OnlineTrajectory
 from ngo_estimator.overlaps import OVERLAP_LOGIT, find_overlaps, measure_overlaps, shared_views
-from ngo_estimator.place_encoder import PairHead
 from ngo_estimator.pose_aggregation import poses_in_blocks
 from ngo_estimator.relative_step import RelativeStep
 from ngo_estimator.scan_registration import Scans
-from tests.unit.ngo_estimator.rooms import CONFIG, drive_in_the_room, ranges_at, registering_pair_head
+from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera, seen_by_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, with_origin
 
-# As a camera sees: much less than all around.
-CAMERA = dataclasses.replace(CONFIG, rays=81, field_of_view_deg=106.0, odometry=False)
 SEARCH = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
 
 
 def view(x: float, y: float, yaw_deg: float) -> Tensor:
     return torch.tensor([[x, y, math.radians(yaw_deg)]], dtype=torch.float64)
-
-
-def seen(pose: Tensor) -> Tensor:
-    return ranges_at(pose, CAMERA.rays, CAMERA.field_of_view_deg).float()
 
 
 @pytest.mark.parametrize(
@@ -43,18 +36,22 @@ def seen(pose: Tensor) -> Tensor:
 )
 def test_frames_share_what_both_see(a: Tensor, b: Tensor, least: float, most: float) -> None:
     relative = se2.between(a, b).float()
-    shared = shared_views(CAMERA, seen(a), seen(b), relative)
+    shared = shared_views(CAMERA, seen_by_camera(a), seen_by_camera(b), relative)
     assert least <= shared.item() <= most
-    torch.testing.assert_close(shared, shared_views(CAMERA, seen(b), seen(a), se2.inverse(relative)))
+    torch.testing.assert_close(
+        shared, shared_views(CAMERA, seen_by_camera(b), seen_by_camera(a), se2.inverse(relative))
+    )
 
 
 def test_under_a_wrong_pose_less_is_shared_and_without_ranges_nothing() -> None:
     a, b = view(0.6, 1.2, 0.0), view(5.2, 1.2, 180.0)
     right = se2.between(a, b).float()
     wrong = right + torch.tensor([[0.0, 0.0, math.radians(40.0)]])
-    shared, less = (shared_views(CAMERA, seen(a), seen(b), relative).item() for relative in (right, wrong))
+    shared, less = (
+        shared_views(CAMERA, seen_by_camera(a), seen_by_camera(b), relative).item() for relative in (right, wrong)
+    )
     assert less < 0.5 * shared
-    assert shared_views(CAMERA, seen(a), torch.zeros(1, CAMERA.rays), right).item() == 0.0
+    assert shared_views(CAMERA, seen_by_camera(a), torch.zeros(1, CAMERA.rays), right).item() == 0.0
 
 
 def test_frames_that_face_each_other_are_measured_by_the_walls_between_them() -> None:
@@ -62,7 +59,7 @@ def test_frames_that_face_each_other_are_measured_by_the_walls_between_them() ->
     near_a, near_b = (se2.compose(pose, torch.tensor([[0.2, 0.0, 0.05]], dtype=torch.float64)) for pose in (a, b))
     truth = se2.between(a, b)
     start = (truth + torch.tensor([[0.2, -0.2, math.radians(3.0)]])).float()
-    ranges = [torch.stack([seen(x), seen(y)]) for x, y in ((a, near_a), (b, near_b))]
+    ranges = [torch.stack([seen_by_camera(x), seen_by_camera(y)]) for x, y in ((a, near_a), (b, near_b))]
     from_a = torch.stack([se2.between(a, x) for x in (a, near_a)]).float()
     to_b = torch.stack([se2.between(x, b) for x in (b, near_b)]).float()
     measured, log_scale, spread, found = measure_overlaps(CAMERA, *ranges, from_a, to_b, start, 6)
@@ -77,22 +74,15 @@ def test_frames_that_face_each_other_are_measured_by_the_walls_between_them() ->
     assert not found.any()
 
 
-def driven(steps: int = 160, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Odometry ``(1, steps, 3)``, true poses ``(1, steps, 3)`` from the first frame, and the camera's ranges."""
-    relative, *_, truth = drive_in_the_room(steps, seed)
-    start = view(2.0, 0.7, 0.0)
-    return relative[None], truth[None], seen(se2.compose(start, truth))[None]
-
-
 def test_overlaps_are_found_under_poses_and_measured_nearer_the_truth() -> None:
-    relative, truth, ranges = driven()
-    in_blocks = poses_in_blocks(relative, 8)
+    *_, codes, truth = drive_with_a_camera(160)
+    in_blocks = poses_in_blocks(se2.g2r(truth).float(), 8)
     true_nodes = with_origin(truth[:, 7::8])
     drift = torch.tensor([0.1, 0.1, math.radians(2.0)]) * torch.randn(
         1, 21, 3, generator=torch.Generator().manual_seed(2)
     )
     nodes = true_nodes + drift
-    loops = find_overlaps(Scans(ranges, CAMERA), in_blocks, nodes, torch.ones(1, 20, 4), SEARCH, 5)
+    loops = find_overlaps(Scans(codes[..., 12:], CAMERA), in_blocks, nodes, torch.ones(1, 20, 4), SEARCH, 5)
     assert loops.start.shape == (1, SEARCH.overlaps) and loops.valid.sum() > 8
     found = loops.valid[0]
     start, end = loops.start[0][found], loops.end[0][found] + 1
@@ -111,13 +101,13 @@ def test_overlaps_are_found_under_poses_and_measured_nearer_the_truth() -> None:
 
 
 def test_each_trajectory_of_a_batch_has_its_own() -> None:
-    both = [torch.cat(parts) for parts in zip(driven(seed=0), driven(seed=1), strict=True)]
+    both = [torch.cat(parts) for parts in zip(*(drive_with_a_camera(160, seed) for seed in (0, 1)), strict=True)]
     both[2][1, 40:] = 0.0  # what it sees is lost
-    nodes = with_origin(both[1][:, 7::8])
+    nodes = with_origin(both[3][:, 7::8])
 
     def found(which: slice) -> tuple[Tensor, Tensor, Tensor]:
-        relative, _, ranges = (part[which] for part in both)
-        scans = Scans(ranges, CAMERA)
+        relative, _, codes, _ = (part[which] for part in both)
+        scans = Scans(codes[..., 12:], CAMERA)
         embeddings = torch.ones(len(relative), 20, 4)
         loops = find_overlaps(scans, poses_in_blocks(relative, 8), nodes[which], embeddings, SEARCH, 5)
         return loops.valid, loops.end, loops.measured
@@ -129,20 +119,9 @@ def test_each_trajectory_of_a_batch_has_its_own() -> None:
             torch.testing.assert_close(one[0], many[k], atol=1e-4, rtol=1e-4)
 
 
-def camera_pair_head() -> PairHead:
-    plain = registering_pair_head()
-    head = PairHead(dataclasses.replace(plain.config, image=dataclasses.replace(plain.config.image, width=81),
-                                        registration=CAMERA))  # fmt: skip
-    return head.eval().requires_grad_(False)
-
-
 @pytest.mark.parametrize("iterations", [2, 5])
 def test_an_optimizer_of_more_than_two_iterations_takes_them(iterations: int) -> None:
-    relative, truth, ranges = driven()
-    std = torch.tensor([0.003, 0.003, 0.01])
-    relative = relative + std * torch.randn(relative.shape, generator=torch.Generator().manual_seed(3))
-    log_std = std.log().expand_as(relative)
-    codes = torch.cat((torch.zeros(1, 160, 12), ranges), dim=-1)
+    relative, log_std, codes, truth = drive_with_a_camera(160)
     motion = torch.zeros(1, 160, 6)
     errors = {}
     for overlaps in (0, 20):
@@ -170,11 +149,9 @@ def test_without_registrations_there_are_no_overlaps() -> None:
 
 def online(overlaps: int, window: int, steps: int = 320, first: int = 0) -> float:
     """Position RMSE (m) in the end of what is corrected online from step ``first`` on, where no place is recognised."""
-    relative, truth, ranges = driven(steps)
-    std = torch.tensor([0.003, 0.003, 0.01])
-    relative = relative + std * torch.randn(relative.shape, generator=torch.Generator().manual_seed(3))
+    relative, log_std, codes, truth = drive_with_a_camera(steps)
     odometry = se2.r2g(relative[0].double()).numpy()
-    code = torch.cat((torch.zeros(steps, 12), ranges[0]), dim=-1).numpy()
+    covariance = np.diag(torch.exp(2.0 * log_std[0, 0].double()))
     search = dataclasses.replace(SEARCH, most=1, per_pose=2, overlaps=overlaps)
     core = OnlineTrajectory(
         small_optimizer("gauss_newton", iterations=5, search=search), camera_pair_head(), window, key_frames=12
@@ -184,11 +161,11 @@ def online(overlaps: int, window: int, steps: int = 320, first: int = 0) -> floa
             stamp_ns=k + 1,
             from_stamp_ns=k,
             relative_xyyaw=relative[0, k].double().numpy(),
-            covariance=np.diag(std.double().square()),
+            covariance=covariance,
             origin_stamp_ns=0,
             odom_xyyaw=odometry[k],
             motion_feature=np.zeros(6, np.float32),
-            place_code=code[k],
+            place_code=codes[0, k].numpy(),
         )
         core.update(step, optimize=k >= first)
     trajectory = core.trajectory()

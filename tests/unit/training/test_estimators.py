@@ -14,7 +14,12 @@ from ngo_estimator.compass_closure import frames_to_read
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import optimize_offline
 from ngo_estimator.place_encoder import PairHead
-from tests.unit.ngo_estimator.rooms import drive_in_the_room, registering_pair_head
+from tests.unit.ngo_estimator.rooms import (
+    camera_pair_head,
+    drive_in_the_room,
+    drive_with_a_camera,
+    registering_pair_head,
+)
 from tests.unit.ngo_estimator.samples import place_config, small_optimizer, small_pair_head, trajectory_inputs
 from training.estimators import (
     Arrays,
@@ -27,6 +32,8 @@ from training.estimators import (
     prefix,
     registered,
 )
+from training.limits import exact_factors
+from training.loop_factors import LoopFactors
 from training.pose_graph import PoseGraphSettings
 from training.rows import ROWS, Sources, rows_of, trainings_of
 from training.worlds import WORLDS, world_named
@@ -177,3 +184,34 @@ def test_what_is_registered_is_what_our_optimizer_takes() -> None:
     ]
     without, with_registered = (np.linalg.norm((g(some) - truth)[0, :steps, :2], axis=1).max() for g in graphs)
     assert with_registered < without
+
+
+def test_frames_that_share_walls_help_our_optimizer_and_the_classical_graph() -> None:
+    relative, log_std, codes, truth = (value.numpy() for value in drive_with_a_camera(160))
+    some = {"relative": relative, "log_std": log_std, "codes": codes, "origin_code": codes[:, :1], "truth": truth}
+    some["motion"] = np.zeros((1, 160, 6), np.float32)
+    head, errors = camera_pair_head(), {}
+    asked: list[LoopFactors] = []
+
+    def exact(found: LoopFactors, true: np.ndarray) -> LoopFactors:
+        asked.append(exact_factors(found, true, 8))
+        return asked[-1]
+
+    for overlaps in (0, 20):
+        # No place is recognised.
+        search = LoopSearch(2, 1, 3, 0, 1, registrations=5, overlaps=overlaps)
+        settings = PoseGraphSettings(
+            odometry_position_scale=1.0, odometry_heading_scale=1.0, min_logit=4.0, search=search
+        )
+        ours = small_optimizer("gauss_newton", iterations=5, search=search)
+        for name, poses in (
+            ("ours", optimized_by(ours, head, 1.0)),
+            ("gtsam", pose_graph("gtsam", settings, head, 1.0)),
+            ("gtsam known", pose_graph("gtsam", dataclasses.replace(settings, kernel="none"), head, 1.0, exact)),
+        ):
+            errors[name, overlaps] = float(np.linalg.norm((poses(some) - truth)[..., :2], axis=-1).mean())
+    for name in ("ours", "gtsam"):
+        assert errors[name, 20] < 0.5 * errors[name, 0]
+    # Places at first, and overlaps behind them, are what is known.
+    assert len(asked) == 3 and len(asked[2].start) > 8
+    assert errors["gtsam known", 20] < 0.7 * errors["gtsam", 0]

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from ngo_estimator import se2
+from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.place_encoder import PairHead
+from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.estimators import Arrays, local, optimized_by, pose_graph, seen_in
 from training.limits import LIMITS, Limit, apart, exact_factors, exact_loops, right_factors, told
@@ -81,6 +83,19 @@ def test_exact_loops_agree_with_the_true_poses(pair_head: PairHead) -> None:
     poses = optimized_by(optimizer, pair_head, 1.0)(some)
     informed = optimized_by(optimizer, pair_head, 1.0, known=exact_loops)(some)
     assert informed.shape == poses.shape and not np.allclose(informed, poses, atol=1e-4)
+
+
+def test_overlaps_that_are_found_later_are_exact_too() -> None:
+    relative, log_std, codes, truth = drive_with_a_camera(160)
+    search = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
+    optimizer = small_optimizer("gauss_newton", iterations=5, search=search)
+    exact = exact_loops(optimizer.find_loops(relative, codes, camera_pair_head()), truth, BLOCK)
+    result = optimizer(relative, log_std, torch.zeros(1, 160, 6), exact)
+    overlaps = slice(exact.start.shape[1], None)
+    assert result.loops.valid[:, overlaps].sum() > 8
+    nodes = torch.cat((torch.zeros(1, 3).double(), truth[0, BLOCK - 1 :: BLOCK]))
+    expected = se2.between(nodes[result.loops.start[0, overlaps]], nodes[result.loops.end[0, overlaps] + 1])
+    torch.testing.assert_close(result.loops.measured[0, overlaps], expected.float(), atol=1e-5, rtol=1e-5)
 
 
 def test_exact_factors_are_what_the_oracle_would_measure() -> None:

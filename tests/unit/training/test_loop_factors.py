@@ -3,13 +3,24 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch, find_loops
+from ngo_estimator.overlaps import find_overlaps
 from ngo_estimator.pose_aggregation import poses_in_blocks
-from tests.unit.ngo_estimator.samples import small_pair_head
-from training.loop_factors import EXACT_SCALE, Seen, exact_revisits, found_loops, measured_revisits, true_revisits
+from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
+from tests.unit.ngo_estimator.samples import small_pair_head, with_origin
+from training.loop_factors import (
+    EXACT_SCALE,
+    Seen,
+    exact_revisits,
+    found_loops,
+    measured_revisits,
+    overlaps_of,
+    true_revisits,
+)
 
 SEARCH = LoopSearch(per_pose=3, most=1000, min_separation=6, min_apart=1)
 
@@ -128,3 +139,23 @@ def test_a_place_that_is_found_and_true_is_measured_alike() -> None:
     for k, candidate in both:
         np.testing.assert_allclose(loops.measured[k], found.measured[0, candidate], atol=1e-4)
         np.testing.assert_allclose(loops.log_scale[k], found.log_scale[0, candidate], atol=1e-4)
+
+
+def test_overlaps_are_those_of_the_optimizer_under_the_graphs_poses() -> None:
+    parts = [drive_with_a_camera(160, seed) for seed in (0, 1)]
+    relative, _, codes, truth = (torch.cat(columns) for columns in zip(*parts, strict=True))
+    search, head = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20), camera_pair_head()
+    nodes = with_origin(truth[:, 7::8])
+    scans = head.scans(codes)
+    assert scans is not None
+    expected = find_overlaps(scans, poses_in_blocks(relative, 8), nodes, head.embed(codes[:, 7::8]), search, 5)
+    more = overlaps_of(head, codes.numpy(), relative.numpy(), search)
+    assert len(more) == 2
+    for k in (1, 0):
+        found = more[k](nodes[k].numpy())
+        valid = expected.valid[k]
+        assert len(found.start) == valid.sum() > 8
+        for name, value in vars(found).items():
+            np.testing.assert_allclose(value, getattr(expected, name)[k][valid], atol=1e-4, err_msg=name)
+    with pytest.raises(ValueError, match="the place codes hold no ranges; expected a registration"):
+        overlaps_of(small_pair_head(), codes.numpy(), relative.numpy(), search)

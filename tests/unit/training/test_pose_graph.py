@@ -223,3 +223,19 @@ def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measure
 def test_a_drift_below_zero_is_refused() -> None:
     with pytest.raises(ValueError, match=r"drift_m is -1\.0; expected 0 or more"):
         PoseGraphSettings(drift_m=-1.0)
+
+
+def test_further_loops_are_asked_for_under_the_poses_without_them() -> None:
+    true_steps = laps(3)
+    truth, steps = driven(true_steps), noisy(true_steps, 0.02)
+    exact = exact_revisits(truth, SEARCH, 8)
+    asked: list[np.ndarray] = []
+
+    def more(nodes: np.ndarray) -> LoopFactors:
+        asked.append(nodes)
+        return exact
+
+    poses = optimize(steps, stds(steps, 0.02), NO_LOOPS, PLAIN, more=more)
+    (nodes,) = asked
+    np.testing.assert_allclose(nodes[1:, :2], driven(steps)[7::8, :2], atol=1e-6)
+    np.testing.assert_allclose(poses, optimize(steps, stds(steps, 0.02), exact, PLAIN), atol=1e-6)

@@ -8,6 +8,7 @@ import torch
 
 from ngo_estimator import se2
 from ngo_estimator.loop_closure import LoopSearch
+from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
 from training.streams import Share
 from training.trajectories import RandomStretches, StoredTrajectories, correction_scale, loops_of
@@ -86,3 +87,23 @@ def test_batches_are_a_function_of_seed_epoch_and_process(store: Path) -> None:
 def test_more_trajectories_than_there_are_cannot_be_drawn(store: Path) -> None:
     with pytest.raises(ValueError, match="batch_size is 11; expected at most 10"):
         RandomStretches(stored(store, None), 1, 11, 0, 0)
+
+
+def test_where_overlaps_are_looked_for_a_stretch_has_its_ranges(tmp_path: Path) -> None:
+    relative, log_std, codes, truth = (value.numpy() for value in drive_with_a_camera(48))
+    arrays = {"relative": relative, "log_std": log_std, "codes": codes.astype(np.float16), "truth": truth}
+    arrays |= {"origin_code": arrays["codes"][:, :1], "motion": np.zeros((1, 48, 6), np.float16)}
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    (tmp_path / "done.0of1.json").write_text("[0]")
+    search = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
+    data = StoredTrajectories([tmp_path], search, camera_pair_head(), 8)
+    batch = data.batch([0], 16, 24)
+    loops = loops_of(batch, CAMERA)
+    assert loops is not None and loops.scans is not None and loops.scans.registration is CAMERA
+    np.testing.assert_array_equal(loops.scans.ranges, arrays["codes"][:, 16:40, 12:].astype(np.float32))
+    without = loops_of(batch)
+    assert without is not None and without.scans is None
+    optimizer = small_optimizer("gauss_newton", iterations=3, search=search)
+    result = optimizer(batch["relative"], batch["log_std"], batch["motion"], loops)
+    assert result.loops.start.shape[1] > loops.start.shape[1]
