@@ -237,7 +237,8 @@ def pose_graph(
                 fixes = found_fixes(reading, scale, seen.relative, whole["log_std"], settings.block, block_m)
             more: Sequence[MoreLoops | None] = [None] * len(truth)
             if settings.search.overlaps and row != "true_pairs":
-                more = loop_factors.overlaps_of(pair_head, whole["codes"], steps[0], settings.search, settings.block)
+                moved = settings.calibrated(steps[0])
+                more = loop_factors.overlaps_of(pair_head, whole["codes"], moved, settings.search, settings.block)
             if known is not None:
                 more = [of and _known(of, known, true) for of, true in zip(more, truth, strict=True)]
             added = zip(odometry, loops, fixes, more, strict=True)

@@ -117,6 +117,7 @@ def found_loops(
     Where the odometry is registered, too, also ``relative`` and ``log_std`` ``(trajectories, steps, 3)`` after that.
     """
     registration = pair_head.config.registration
+    search = dataclasses.replace(search, overlaps=0)  # which are looked for under poses
     made_with = [*dataclasses.astuple(search), block]
     if search.registrations and registration is not None:
         made_with += dataclasses.astuple(registration)

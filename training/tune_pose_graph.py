@@ -135,9 +135,10 @@ class Objective:
 
     def loops(self, settings: PoseGraphSettings) -> list[LoopFactors]:
         """The loops of each trajectory under these settings."""
-        key = (settings.search, settings.block, settings.odometry_gain, settings.odometry_bias)
+        search = replace(settings.search, overlaps=0)  # which are looked for later
+        key = (search, settings.block, settings.odometry_gain, settings.odometry_bias)
         if key not in self._loops:
-            self._loops[key] = found_loops(self._pair_head, self._seen(settings), settings.search, settings.block)
+            self._loops[key] = found_loops(self._pair_head, self._seen(settings), search, settings.block)
         return self._loops[key]
 
     def _seen(self, settings: PoseGraphSettings) -> Seen:
@@ -158,11 +159,12 @@ class Objective:
         odometry, search = self._steps(settings), settings.search
         more: Sequence[MoreLoops | None] = [None] * len(self._compass)
         if search.overlaps:
-            more = overlaps_of(self._pair_head, self.arrays["codes"], odometry[0], search, settings.block)
+            steps = settings.calibrated(odometry[0])
+            more = overlaps_of(self._pair_head, self.arrays["codes"], steps, search, settings.block)
         added = zip(self.loops(settings), self._compass, more, strict=True)
         return self.error(
-            optimize(*steps, loops, settings, compass, overlaps)
-            for steps, (loops, compass, overlaps) in zip(zip(*odometry, strict=True), added, strict=True)
+            optimize(*one, loops, settings, compass, overlaps)
+            for one, (loops, compass, overlaps) in zip(zip(*odometry, strict=True), added, strict=True)
         )
 
     def error(self, poses: Iterable[np.ndarray]) -> float:

@@ -26,6 +26,9 @@ _MOST_DRIFT = 4.0
 _FRESH = 2
 """Blocks since the last optimisation up to which poses say what frames share."""
 
+_AGAIN = 8
+"""Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
+
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
 
@@ -143,7 +146,9 @@ class MetaGraph:
         if self._loops is not None:
             found = self._loops.find(block, self._first, self._keys)
             if self.blocks - self._result_last <= _FRESH:
-                found = found.and_also(self._loops.find_overlaps(block, self._first, self._keys, self._nodes.values))
+                if block - _AGAIN >= self._first:
+                    self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
+                found = found.and_also(self._loops.find_overlaps(block, self._first, self._nodes.values, self._keys))
             if len(self._keys):
                 self._loops.limit_drift(found, self._drift(found))
         while self.blocks - self._first > self._window:

@@ -196,30 +196,37 @@ class OnlineLoops:
         )
 
     @torch.inference_mode()
-    def find_overlaps(self, block: int, first: int, keys: KeyFrames, nodes: np.ndarray) -> Candidates:
-        """Candidates that end behind the block of this number, the newest, at nodes that share what is seen there.
+    def find_overlaps(self, block: int, first: int, nodes: np.ndarray, keys: KeyFrames | None = None) -> Candidates:
+        """Candidates that end behind the block of this number, at nodes that share what is seen there.
 
-        What ``overlaps.find_overlaps`` finds in a whole trajectory; arguments as of ``find``.
+        What ``overlaps.find_overlaps`` finds in a whole trajectory. Those to nodes of the window that were found under
+        earlier poses are let go.
 
         Args:
-            nodes: poses of all nodes in the map ``(block + 2, 3)``.
+            first: number of the first block in the window.
+            nodes: poses of the nodes in the map ``(n, 3)``, those behind this block among them.
+            keys: key frames to look among as well; by default there is none.
         """
         scans = self._pair_head.config.registration
         if scans is None or self._search.overlaps == 0:
             return Candidates.none()
         end, last = block + 1, (block + 1) * self._block - 1
+        before = self._candidates.overlap & (self._candidates.end == end) & (self._candidates.start >= first)
+        self._candidates = self._candidates.where(~before)
         in_window = np.arange(max(1, first), end - self._search.min_separation + 1)
-        key_codes = [keys.frame(k).codes[MARGIN - 1] for k in range(len(keys))]
-        codes = np.concatenate((*[c[None] for c in key_codes], self._codes.at(in_window * self._block - 1)))
-        earlier = np.concatenate((keys.nodes, in_window))
+        # The origin has no code of its own.
+        frames = [] if keys is None else [keys.frame(k) for k in range(len(keys)) if keys.nodes[k]]
+        earlier = np.concatenate((np.array([key.node for key in frames], np.int64), in_window))
         if len(earlier) == 0:
             return Candidates.none()
+        codes = np.concatenate(
+            (*[key.codes[MARGIN - 1 : MARGIN] for key in frames], self._codes.at(in_window * self._block - 1))
+        )
         relative = torch.from_numpy(_seen_from(nodes[earlier], nodes[end])).float()
-        at_end = self._codes.slice(last)[0]
+        at_end = self._codes.slice(last, last + 1)[0]
         ranges, newest = (torch.from_numpy(self._ranges(c)) for c in (codes, at_end))
         share = shared_views(scans, ranges, newest.expand_as(ranges), relative).numpy()
-        # The origin has no code of its own.
-        share[(earlier == 0) | (earlier > end - self._search.min_separation)] = -np.inf
+        share[earlier > end - self._search.min_separation] = -np.inf
         chosen = [
             index
             for index, _, value in self._most_similar(share[:, None], earlier, self._search.per_pose)
@@ -228,7 +235,7 @@ class OnlineLoops:
         found = Candidates.none()
         if chosen:
             pairs = [
-                self._key_node(keys.frame(k)) if k < len(keys) else self._node_in_window(int(earlier[k]), last)
+                self._key_node(frames[k]) if k < len(frames) else self._node_in_window(int(earlier[k]), last)
                 for k in chosen
             ]
             found = self._measured_overlaps(pairs, end, relative[chosen])
@@ -286,7 +293,7 @@ class OnlineLoops:
         return found.where(registered.numpy())
 
     def limit_drift(self, found: Candidates, most_drift: np.ndarray) -> None:
-        """Say of the candidates that ``find`` gave last how far they may be off at most: ``(n, 3)``, variances."""
+        """Say of the candidates that were found last how far they may be off at most: ``(n, 3)``, variances."""
         self._candidates.most_drift[len(self._candidates) - len(found) :] = most_drift
 
     def key_frame(self, node: int, relative: np.ndarray, variance: np.ndarray) -> KeyFrame:

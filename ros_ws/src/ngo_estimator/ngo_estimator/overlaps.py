@@ -151,6 +151,8 @@ def measure_overlaps(
         The pose ``(..., 3)``, logarithms of its deviations and of how far the views disagree ``(..., 2)``, and whether
         most views were registered ``(...)``.
     """
+    # In the digits of a registration: what it leaves alone has to be found the same.
+    from_a, to_b, start = from_a.float(), to_b.float(), start.float()
     guess = se2.compose(se2.compose(se2.inverse(from_a), start), se2.inverse(to_b))
     drift = guess.new_tensor([_DRIFT_M, _DRIFT_RAD]).log().expand(*guess.shape[:-1], 2)
     measured, after = register(config, a, b, guess, drift, steps)

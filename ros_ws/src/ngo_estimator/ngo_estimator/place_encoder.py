@@ -180,7 +180,7 @@ class PairHead(nn.Module):
     def scans(self, codes: Tensor) -> Scans | None:
         """The ranges in codes ``(batch, steps, code_length)``; None where they hold none."""
         config = self.config.registration
-        return None if config is None else Scans(codes[..., self.config.code_size :].detach(), config)
+        return None if config is None else Scans(codes[..., self.config.code_size :].detach().clone(), config)
 
     def register(self, a: Tensor, b: Tensor, start: Tensor, log_std: Tensor, steps: int) -> tuple[Tensor, Tensor]:
         """Measure pairs of codes ``(..., code_length)`` by their ranges, from what is known of them already.
