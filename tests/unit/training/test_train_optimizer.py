@@ -8,6 +8,7 @@ import torch
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_optimizer, load_place, load_smoother, save_checkpoint
 from ngo_estimator.loop_closure import LoopSearch
+from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.runs import WEIGHTS, RunError
 from training.train_optimizer import (
@@ -82,3 +83,18 @@ def test_where_loops_are_closed_the_first_epochs_have_one_iteration(
         found = training.optimized(batch)
         assert len(found) == expected
         torch.testing.assert_close(found, whole[:expected])
+
+
+def test_what_is_trained_looks_for_overlaps() -> None:
+    search = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
+    optimizer = small_optimizer("gauss_newton", iterations=5, search=search)
+    relative, log_std, codes, _ = drive_with_a_camera(160)
+    loops = optimizer.find_loops(relative, codes, camera_pair_head())
+    motion = torch.zeros(1, 160, 6)
+    batch = {"relative": relative, "log_std": log_std, "motion": motion, "ranges": codes[..., 12:]}
+    batch |= {f"loop_{k}": v for k, v in vars(loops).items() if isinstance(v, torch.Tensor)}
+    expected = optimizer(relative, log_std, motion, loops)
+    assert expected.loops.start.shape[1] == loops.start.shape[1] + 20
+    training = OptimizerTraining(Arguments(world="maze3d", epochs=4), optimizer, world_named("maze3d"), CAMERA)
+    torch.testing.assert_close(training.optimized(batch), expected.meta_relative)
+    torch.testing.assert_close(training(batch).poses, expected.poses)
