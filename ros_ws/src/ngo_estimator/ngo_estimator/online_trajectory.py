@@ -75,9 +75,10 @@ class OnlineTrajectory:
     """Keeps the trajectory and re-optimises it whenever a meta-pose is complete.
 
     Between two meta-poses the newest frames follow the last corrected one by odometry. The last ``window_frames`` are
-    optimised together; up to so many steps the result is that of ``optimize_offline``. Of the poses before, at most
-    ``key_frames`` (and a few more for a while) are optimised with them; all others move with these, and loops are
-    closed with their frames. So the cost of a step does not depend on how long the trajectory is.
+    optimised together; up to so many steps the result is that of ``optimize_offline``, but for overlaps, which are
+    looked for under the poses of then. Of the poses before, at most ``key_frames`` (and a few more for a while) are
+    optimised with them; all others move with these, and loops are closed with their frames. So the cost of a step does
+    not depend on how long the trajectory is.
 
     An optimisation takes several iterations. All are run at the step that completes a meta-pose, or, so that no step
     takes much longer than the others, ``iterations_per_step`` at it and at each of those after it: the same result, a
