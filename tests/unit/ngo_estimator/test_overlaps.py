@@ -174,7 +174,7 @@ def online(overlaps: int, window: int, steps: int = 320, first: int = 0) -> floa
     return float(np.sqrt(np.square(errors).sum(1).mean()))
 
 
-@pytest.mark.parametrize("window", [640, 96])
+@pytest.mark.parametrize("window", [640, 160, 96])
 def test_online_the_newest_frame_is_registered_to_those_it_shares_walls_with(window: int) -> None:
     without, with_overlaps = online(0, window), online(40, window)
     assert with_overlaps < 0.3 * without

@@ -144,10 +144,11 @@ class MetaGraph:
         if self._optimizer.config.network or self._optimizer.config.smoother is not None:
             self._aggregate(block)
         if self._loops is not None:
+            fresh = self.blocks - self._result_last <= _FRESH
+            if fresh and block - _AGAIN >= self._first:
+                self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
             found = self._loops.find(block, self._first, self._keys)
-            if self.blocks - self._result_last <= _FRESH:
-                if block - _AGAIN >= self._first:
-                    self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
+            if fresh:
                 found = found.and_also(self._loops.find_overlaps(block, self._first, self._nodes.values, self._keys))
             if len(self._keys):
                 self._loops.limit_drift(found, self._drift(found))

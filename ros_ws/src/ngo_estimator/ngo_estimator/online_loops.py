@@ -294,6 +294,9 @@ class OnlineLoops:
 
     def limit_drift(self, found: Candidates, most_drift: np.ndarray) -> None:
         """Say of the candidates that were found last how far they may be off at most: ``(n, 3)``, variances."""
+        newest = self._candidates.where(np.arange(len(self._candidates) - len(found), len(self._candidates)))
+        if not (np.array_equal(newest.start, found.start) and np.array_equal(newest.end, found.end)):
+            raise ValueError("others were found since; expected the candidates that were found last")
         self._candidates.most_drift[len(self._candidates) - len(found) :] = most_drift
 
     def key_frame(self, node: int, relative: np.ndarray, variance: np.ndarray) -> KeyFrame:
