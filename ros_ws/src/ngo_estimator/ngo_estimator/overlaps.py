@@ -33,7 +33,7 @@ _AGREEING = 5.0
 _EVERY = 3
 """One of so many rays tells whether frames share what they see."""
 
-_TOGETHER_M = 3.0
+_ERRING_TOGETHER = 3.0
 """A fused measurement's deviations in units of what its views say: rays of one picture, and views, err together."""
 
 
@@ -161,4 +161,4 @@ def measure_overlaps(
     after = torch.where(registered.unsqueeze(-1), after, drift + math.log(100.0))
     measured, log_scale, spread = fuse_views(se2.compose(se2.compose(from_a, measured), to_b), after)
     most = registered.to(start.dtype).mean(0) > 0.5
-    return measured, log_scale + math.log(_TOGETHER_M), spread, most
+    return measured, log_scale + math.log(_ERRING_TOGETHER), spread, most
