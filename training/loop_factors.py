@@ -132,7 +132,7 @@ def overlaps_of(
         with torch.inference_mode():
             in_blocks = poses_in_blocks(_float32(relative[of_one]), block)
             embeddings = pair_head.embed(seen[:, block - 1 :: block])
-            loops = find_overlaps(scans, in_blocks, poses, embeddings, search, search.registrations)
+            loops = find_overlaps(scans, in_blocks, poses, embeddings, search)
         columns = (loops.start, loops.end, loops.measured, loops.log_scale, loops.logit)
         return LoopFactors(*(column[loops.valid].numpy() for column in columns))
 

@@ -82,7 +82,7 @@ def test_overlaps_are_found_under_poses_and_measured_nearer_the_truth() -> None:
         1, 21, 3, generator=torch.Generator().manual_seed(2)
     )
     nodes = true_nodes + drift
-    loops = find_overlaps(Scans(codes[..., 12:], CAMERA), in_blocks, nodes, torch.ones(1, 20, 4), SEARCH, 5)
+    loops = find_overlaps(Scans(codes[..., 12:], CAMERA), in_blocks, nodes, torch.ones(1, 20, 4), SEARCH)
     assert loops.start.shape == (1, SEARCH.overlaps) and loops.valid.sum() > 8
     found = loops.valid[0]
     start, end = loops.start[0][found], loops.end[0][found] + 1
@@ -109,7 +109,7 @@ def test_each_trajectory_of_a_batch_has_its_own() -> None:
         relative, _, codes, _ = (part[which] for part in both)
         scans = Scans(codes[..., 12:], CAMERA)
         embeddings = torch.ones(len(relative), 20, 4)
-        loops = find_overlaps(scans, poses_in_blocks(relative, 8), nodes[which], embeddings, SEARCH, 5)
+        loops = find_overlaps(scans, poses_in_blocks(relative, 8), nodes[which], embeddings, SEARCH)
         return loops.valid, loops.end, loops.measured
 
     together = found(slice(0, 2))

@@ -148,7 +148,7 @@ def test_overlaps_are_those_of_the_optimizer_under_the_graphs_poses() -> None:
     nodes = with_origin(truth[:, 7::8])
     scans = head.scans(codes)
     assert scans is not None
-    expected = find_overlaps(scans, poses_in_blocks(relative, 8), nodes, head.embed(codes[:, 7::8]), search, 5)
+    expected = find_overlaps(scans, poses_in_blocks(relative, 8), nodes, head.embed(codes[:, 7::8]), search)
     more = overlaps_of(head, codes.numpy(), relative.numpy(), search)
     assert len(more) == 2
     for k in (1, 0):

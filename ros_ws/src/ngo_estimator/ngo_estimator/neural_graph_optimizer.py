@@ -410,7 +410,7 @@ class NeuralGraphOptimizer(nn.Module):
         search = self.config.search
         if search.overlaps == 0 or loops.scans is None or in_blocks is None:
             return None
-        return find_overlaps(loops.scans, in_blocks, poses, loops.embeddings, search, search.registrations)
+        return find_overlaps(loops.scans, in_blocks, poses, loops.embeddings, search)
 
     def _structure(self, loops: Loops | None, odometry: Tensor) -> GraphStructure | None:
         """Of the graph that every iteration solves, where a single one is optimised and no gradient asked for."""

@@ -179,21 +179,8 @@ class OnlineLoops:
         fused, fused_scale = self._pair_head.register(
             codes[0], later[0], fused, fused_scale, self._search.registrations
         )
-        of_frame = torch.from_numpy(np.stack([pair.pose for pair in pairs])).float()
-        count = len(pairs)
-        return Candidates(
-            start=np.array([pair.node for pair in pairs]),
-            end=np.full(count, node),
-            frame=np.array([pair.frame for pair in pairs]),
-            measured=se2.compose(of_frame, fused).double().numpy(),
-            log_scale=fused_scale.double().numpy(),
-            spread=spread.double().numpy(),
-            logit=logit[0].double().numpy(),
-            similarity=np.array([pair.similarity for pair in pairs]),
-            most_drift=np.full((count, 3), np.inf),
-            weight=np.full(count, _UNWEIGHED),
-            overlap=np.zeros(count, np.bool_),
-        )
+        similarity = np.array([pair.similarity for pair in pairs])
+        return _candidates(pairs, node, (fused, fused_scale, spread), logit[0].double().numpy(), similarity, False)
 
     @torch.inference_mode()
     def find_overlaps(self, block: int, first: int, nodes: np.ndarray, keys: KeyFrames | None = None) -> Candidates:
@@ -276,20 +263,9 @@ class OnlineLoops:
             self._search.registrations,
         )
         embeddings = [self._pair_head.embed(torch.from_numpy(c[0].copy())) for c in (codes, newest)]
-        count = len(pairs)
-        found = Candidates(
-            start=np.array([pair.node for pair in pairs]),
-            end=np.full(count, node),
-            frame=np.array([pair.frame for pair in pairs]),
-            measured=measured.double().numpy(),
-            log_scale=log_scale.double().numpy(),
-            spread=spread.double().numpy(),
-            logit=np.full(count, OVERLAP_LOGIT),
-            similarity=(embeddings[0] * embeddings[1]).sum(-1).double().numpy(),
-            most_drift=np.full((count, 3), np.inf),
-            weight=np.full(count, _UNWEIGHED),
-            overlap=np.ones(count, np.bool_),
-        )
+        similarity = (embeddings[0] * embeddings[1]).sum(-1).double().numpy()
+        logit = np.full(len(pairs), OVERLAP_LOGIT)
+        found = _candidates(pairs, node, (measured, log_scale, spread), logit, similarity, True)
         return found.where(registered.numpy())
 
     def limit_drift(self, found: Candidates, most_drift: np.ndarray) -> None:
@@ -428,6 +404,33 @@ class _Pair:
     codes: np.ndarray
     poses: np.ndarray
     pose: np.ndarray
+
+
+def _candidates(
+    pairs: list[_Pair],
+    node: int,
+    measurement: tuple[Tensor, Tensor, Tensor],
+    logit: np.ndarray,
+    similarity: np.ndarray,
+    overlap: bool,
+) -> Candidates:
+    """Candidates of pairs that end at ``node``; ``measurement`` as of ``fuse_views``, seen from the earlier frames."""
+    measured, log_scale, spread = measurement
+    of_frame = torch.from_numpy(np.stack([pair.pose for pair in pairs])).float()
+    count = len(pairs)
+    return Candidates(
+        start=np.array([pair.node for pair in pairs]),
+        end=np.full(count, node),
+        frame=np.array([pair.frame for pair in pairs]),
+        measured=se2.compose(of_frame, measured).double().numpy(),
+        log_scale=log_scale.double().numpy(),
+        spread=spread.double().numpy(),
+        logit=logit,
+        similarity=similarity,
+        most_drift=np.full((count, 3), np.inf),
+        weight=np.full(count, _UNWEIGHED),
+        overlap=np.full(count, overlap),
+    )
 
 
 def _index(nodes: np.ndarray, keys: np.ndarray, first: int) -> np.ndarray:

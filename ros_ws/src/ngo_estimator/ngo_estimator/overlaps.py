@@ -37,9 +37,7 @@ _ERRING_TOGETHER = 3.0
 """A fused measurement's deviations in units of what its views say: rays of one picture, and views, err together."""
 
 
-def find_overlaps(
-    scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Tensor, search: LoopSearch, steps: int
-) -> Loops:
+def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Tensor, search: LoopSearch) -> Loops:
     """Loops between meta-poses whose frames share what they see; no gradient goes through it.
 
     For each meta-pose there are at most ``search.per_pose``, and ``search.overlaps`` of a trajectory: those that share
@@ -49,19 +47,18 @@ def find_overlaps(
         in_blocks: poses within blocks ``(batch, blocks, block, 3)`` by odometry.
         nodes: meta-poses as they are now, the origin in front ``(batch, blocks + 1, 3)``.
         embeddings: of the frames at the ends of the meta-poses ``(batch, blocks, embedding_size)``.
-        steps: steps of each registration.
     """
     batch, blocks, block = in_blocks.shape[:3]
     config = scans.registration
     with torch.no_grad():
-        nodes, ends = nodes[:, 1:].detach().float(), scans.ranges[:, block - 1 :: block]
+        nodes, ends = nodes[:, 1:].float(), scans.ranges[:, block - 1 :: block]
         shared = _shared(config, ends, nodes, search.min_separation)
         share, earlier = each_from_elsewhere(shared, min(search.per_pose, blocks), search.min_apart, -1.0)
         later = torch.arange(blocks, device=nodes.device).repeat_interleave(share.shape[-1]).expand(batch, -1)
         share, earlier = share.flatten(1), earlier.flatten(1)
         keep = share.topk(min(search.overlaps, share.shape[1]), dim=-1).indices
         share, earlier, later = (values.gather(1, keep) for values in (share, earlier, later))
-        odometry = frame_odometry(in_blocks.detach().float())
+        odometry = frame_odometry(in_blocks.float())
         frame, last = (at * block + block - 1 for at in (earlier, later))
         end = blocks * block - 1
         views = [((frame + a).clamp(0, end), (last + b).clamp(0, end)) for a, b in OVERLAP_VIEWS]
@@ -72,7 +69,7 @@ def find_overlaps(
             torch.stack([se2.between(pick(odometry, frame), pick(odometry, a)) for a, _ in views]),
             torch.stack([se2.between(pick(odometry, b), pick(odometry, last)) for _, b in views]),
             se2.between(pick(nodes, earlier), pick(nodes, later)),
-            steps,
+            search.registrations,
         )
         similarity = (pick(embeddings, earlier) * pick(embeddings, later)).sum(-1)
     valid = found & (share >= LEAST_SHARED)
