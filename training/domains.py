@@ -6,6 +6,12 @@ from ngo_estimator.images import ImageFormat
 from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.scan_registration import RegistrationConfig
 
+TRAIN_STORE = "train"
+"""The feature store that smoother and optimizer learn from."""
+
+OTHER_TRAIN_STORE = "train_policy"
+"""The one that the optimizer learns from as well, in worlds where another driver is known."""
+
 MIRRORED_ACTIONS = (0, 2, 1)
 """What the actions of ngo_msgs/DiscreteAction become in a mirror: forward stays, left and right change places."""
 
@@ -77,6 +83,11 @@ class Domain:
         return 0.2 * self.loss_scale
 
     @property
+    def optimizer_stores(self) -> tuple[str, ...]:
+        """Names of the feature stores that the optimizer learns from."""
+        return (TRAIN_STORE,)
+
+    @property
     def validation_stores(self) -> tuple[str, ...]:
-        """Names of the feature stores that the optimizer is measured on while it trains."""
+        """Names of the feature stores that smoother and optimizer are measured on while they train."""
         return ("validation",)

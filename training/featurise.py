@@ -31,7 +31,7 @@ from ngo_estimator.compass_closure import frames_to_read
 from ngo_estimator.local_pose_network import LocalPoseNetwork
 from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from training import runs
-from training.domains import Domain
+from training.domains import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
 from training.driven import Driven, driven_in_table
 from training.metrics import seen_from_first
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
@@ -50,6 +50,7 @@ STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
 """The arrays of a feature store, without those of a compass."""
 _MOST_STEPS = 1000  # of a stretch of a recording
 _CHUNK = 64  # steps at once: their activations stay in a CPU's cache (a fifth faster than 256)
+_FOR_ONE_OTHER = 5  # trajectories of the world's driver
 _BLOCK = PoseAggregationConfig(1).block
 
 
@@ -62,7 +63,8 @@ class Arguments:
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
     """Recordings to train on instead."""
     trajectories: int = 960
-    """Trajectories for training, each in a maze of its own that the local network has not seen."""
+    """Trajectories for training, each in a maze of its own that the local network has not seen; a fifth as many more of
+    a driver that the optimizer alone learns from, where the world has one."""
     validation_trajectories: int = 24
     """Trajectories of the validation split for each table of results."""
     test_trajectories: int = 0
@@ -152,7 +154,10 @@ def readings_of(world: World, compass: Compass, episode: Episode) -> dict[str, n
 def driven_in(arguments: Arguments, world: World) -> dict[str, Driven]:
     """The trajectories of each store that is to be made."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
-    found = {"train": Driven(seeds, seeds, DRAWN, world.driver)}
+    found = {TRAIN_STORE: Driven(seeds, seeds, DRAWN, world.driver)}
+    if world.optimizer_driver is not None:
+        others = list(OPTIMIZER_TRAIN_SEEDS[len(seeds) : len(seeds) + -(-len(seeds) // _FOR_ONE_OTHER)])
+        found[OTHER_TRAIN_STORE] = Driven(others, others, DRAWN, world.optimizer_driver)
     for split, count in (("validation", arguments.validation_trajectories), ("test", arguments.test_trajectories)):
         for table in world.tables:
             found[f"{split}_{table}"] = driven_in_table(world, table, split, count)
@@ -167,8 +172,9 @@ def _groups(count: int, part: int, parts: int) -> list[int]:
 def main(arguments: Arguments) -> None:
     """Make the arrays ``WORLD/features/STORE/NAME.npy`` of shape ``(trajectories, steps, ...)``.
 
-    The stores are ``train`` and, for each table of results, ``validation_TABLE`` and ``test_TABLE``; of recordings
-    ``train`` and ``validation``, stretches that overlap, and their mirror images.
+    The stores are ``train``, ``train_policy`` in worlds where the optimizer learns from another driver as well, and for
+    each table of results ``validation_TABLE`` and ``test_TABLE``; of recordings ``train`` and ``validation``, stretches
+    that overlap, and their mirror images.
     """
     if arguments.world is None:
         _main_recorded(arguments)
@@ -197,7 +203,7 @@ def _main_recorded(arguments: Arguments) -> None:
     local, local_description = load_local(folder, data.domain.name)
     place, place_description = load_place(folder, data.domain.name)
     stores: tuple[tuple[str, Part, int], ...] = (
-        ("train", "optimizer", 8 * _BLOCK),
+        (TRAIN_STORE, "optimizer", 8 * _BLOCK),
         ("validation", "validation", 2 * _BLOCK),
     )
     data.check_trained(local.config)
@@ -243,14 +249,14 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
         raise runs.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
-def training_stores(
-    folder: Path, domain: Domain, local_description: dict[str, Any], place_description: dict[str, Any]
-) -> tuple[list[Path], list[Path]]:
-    """The stores in ``folder`` to train on, and those to be measured on; raises ``RunError`` as ``check_networks``."""
-    train, validation = [folder / "train"], [folder / name for name in domain.validation_stores]
-    for store in (*train, *validation):
+def stores_named(
+    names: Sequence[str], folder: Path, local_description: dict[str, Any], place_description: dict[str, Any]
+) -> list[Path]:
+    """The stores of these names in ``folder``; raises ``RunError`` as ``check_networks``."""
+    stores = [folder / name for name in names]
+    for store in stores:
         check_networks(store, local_description, place_description)
-    return train, validation
+    return stores
 
 
 def open_store(store: Path, with_compass: bool = False, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:

@@ -29,6 +29,7 @@ from training import (
 )
 from training.curves import write_at_once
 from training.deepvo import DEEPVO
+from training.domains import TRAIN_STORE
 from training.featurise import open_store
 from training.own_odometry import make_odometry, open_odometry
 from training.rows import ROWS, Sources, rows_of
@@ -72,7 +73,7 @@ def prepare(sources: Sources, wanted: Wanted, scripts: Scripts) -> None:
     threads = torch.get_num_threads()
     for step in (
         *_networks(sources, scripts),
-        *_features(sources, wanted, scripts, (_TRAIN, _VALIDATION, wanted.split)),
+        *_features(sources, wanted, scripts, (TRAIN_STORE, _VALIDATION, wanted.split)),
         *_smoother(sources, scripts),
         *_settings(sources, scripts),
         *_optimizers(sources, wanted, scripts),
@@ -105,8 +106,8 @@ def _compass(arguments: train_compass.Arguments, folder: Path) -> None:
         shutil.copy(arguments.runs / arguments.world / COMPASS / f"{COMPASS}{suffix}", folder)
 
 
-_TRAIN, _VALIDATION = "train", "validation"
-_COUNTS = {_TRAIN: "trajectories", _VALIDATION: "validation_trajectories", "test": "test_trajectories"}
+_VALIDATION = "validation"
+_COUNTS = {TRAIN_STORE: "trajectories", _VALIDATION: "validation_trajectories", "test": "test_trajectories"}
 
 
 def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[str, ...]) -> Iterator[Step]:
@@ -118,7 +119,8 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
         changes["world"] = sources.world.name
         compass = sources.compass_weights if sources.has_compass else None
         arguments = replace(scripts.features, weights=sources.weights, out=sources.runs, compass=compass, **changes)
-        for store in [_TRAIN] if split == _TRAIN else [f"{split}_{table}" for table in sources.world.tables]:
+        tables = [f"{split}_{table}" for table in sources.world.tables]
+        for store in sources.world.optimizer_stores if split == TRAIN_STORE else tables:
             yield Step(f"the feature store {store}", _whole(sources, store), _call(featurise.main, arguments))
 
 

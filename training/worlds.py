@@ -15,7 +15,7 @@ import numpy as np
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.images import ImageFormat
 from ngo_estimator.scan_registration import RegistrationConfig
-from training.domains import Domain
+from training.domains import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
 from training.looks import TRAINING_LOOKS, Looks, LooksName, check_looks
 
 if TYPE_CHECKING:
@@ -73,18 +73,20 @@ class World(Domain):
     """A simulated world.
 
     ``driver`` drives wherever no other is named, ``training_drivers`` take turns in the streams of training data, from
-    which all but the optimizer learn (none: ``driver``). ``block_m`` is the corridor width, ``episode_frames`` the
-    length of the paper's trajectories, ``rows`` and ``extra_openings`` the ranges (both ends included) that training
-    mazes are drawn from. ``tables`` names the kinds of trajectories that results are given for, ``table_trajectories``
-    says how many a table has and ``prefixes`` after how many steps their errors are given. ``simulator`` holds its
-    settings that are not its own defaults. ``looks`` is what ``make_random`` draws beside a size, None: nothing, the
-    simulator's own looks. ``error_windows`` says over how many consecutive steps errors of odometry are added up in
-    training: beside those of single steps, these drift. No driver here drives backwards, whether the world ``reverses``
-    or not.
+    which all but smoother and optimizer learn (none: ``driver``). These two learn from trajectories of ``driver``, and
+    the optimizer from one more of ``optimizer_driver`` (None: nobody) for every five of them. ``block_m`` is the
+    corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and ``extra_openings`` the
+    ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of trajectories that
+    results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how many steps their
+    errors are given. ``simulator`` holds its settings that are not its own defaults. ``looks`` is what ``make_random``
+    draws beside a size, None: nothing, the simulator's own looks. ``error_windows`` says over how many consecutive
+    steps errors of odometry are added up in training: beside those of single steps, these drift. No driver here drives
+    backwards, whether the world ``reverses`` or not.
     """
 
     driver: str
     training_drivers: tuple[str, ...] = ()
+    optimizer_driver: str | None = None
     episode_frames: int
     rows: tuple[int, int]
     extra_openings: tuple[int, int]
@@ -112,6 +114,10 @@ class World(Domain):
     def unseen_tables(self) -> tuple[str, ...]:
         """The tables with the world's driver in mazes that nothing was trained in: designs are chosen on these."""
         return tuple(name for name, table in self.tables.items() if not table.seen and table.driver is None)
+
+    @property
+    def optimizer_stores(self) -> tuple[str, ...]:
+        return (TRAIN_STORE,) if self.optimizer_driver is None else (TRAIN_STORE, OTHER_TRAIN_STORE)
 
     @property
     def validation_stores(self) -> tuple[str, ...]:
@@ -231,6 +237,8 @@ WORLDS = {
         driver="random_goals",
         # The learned driver grazes walls, as others may: networks that never saw it are lost there.
         training_drivers=(*("random_goals",) * 5, "learned"),
+        # Trained on the planner's alone, the optimizer trusts odometry where that one's fails (docs/results.md).
+        optimizer_driver="learned",
         block_m=3.0,
         period_s=2 / 35,
         episode_frames=1000,

@@ -99,6 +99,21 @@ def test_networks_of_their_own_saw_the_same_trajectories(made: tuple[Path, dict[
     assert all(not np.allclose(a, b) for a, b in itertools.combinations(driven, 2))
 
 
+def test_the_optimizer_learns_from_the_other_driver_and_the_smoother_does_not(
+    made: tuple[Path, dict[str, Any]],
+) -> None:
+    folder, _ = made
+    runs = folder / "runs" / "maze3d"
+    assert len(open_store(runs / "features" / "train")["truth"]) > len(
+        open_store(runs / "features" / "train_policy")["truth"]
+    )
+    # Loops are kept beside the features of what an optimizer has learned from.
+    with_loops = sorted(path.parent.name for path in (runs / "features").glob("train*/loops"))
+    assert with_loops == ["train", "train_policy"]
+    begun = [json.loads(path.read_text())["settings"] for path in runs.glob("optimizer-*/run.json")]
+    assert begun and all(settings["stores"] == with_loops for settings in begun)
+
+
 def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
     page = (folder / "docs" / "results_maze3d.md").read_text()

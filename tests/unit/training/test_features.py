@@ -11,10 +11,11 @@ import torch
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_place, write_untrained
 from training import featurise
+from training.domains import OTHER_TRAIN_STORE, TRAIN_STORE
 from training.driven import driven_in_table
-from training.featurise import check_networks, features_of, open_store
+from training.featurise import check_networks, driven_in, features_of, open_store
 from training.streams import simulate
-from training.worlds import WORLDS
+from training.worlds import OPTIMIZER_TRAIN_SEEDS, WORLDS
 
 from .stores import SHAPES
 
@@ -63,6 +64,20 @@ def test_a_group_of_a_store_is_driven_as_its_seeds_say() -> None:
     expected = simulate(world, driven.seeds[8:], 21, world.tables["cycles"].size)
     for found, episode in zip(second, expected, strict=True):
         np.testing.assert_array_equal(found.poses_xyyaw, episode.poses_xyyaw)
+
+
+def test_another_driver_drives_a_fifth_as_many_more_mazes_for_the_optimizer_alone() -> None:
+    counts = {"validation_trajectories": 0, "test_trajectories": 0}
+    world = WORLDS["maze3d"]
+    driven = driven_in(featurise.Arguments("maze3d", trajectories=42, **counts), world)
+    ours, others = (driven[name] for name in world.optimizer_stores)
+    assert (ours.driver, others.driver) == ("random_goals", "learned")
+    assert (len(ours.seeds), len(others.seeds)) == (42, 9) and others.mazes == others.seeds
+    assert not {*ours.seeds} & {*others.seeds} and all(seed in OPTIMIZER_TRAIN_SEEDS for seed in others.seeds)
+    assert not driven_in(featurise.Arguments("maze3d", trajectories=0, **counts), world)[OTHER_TRAIN_STORE].seeds
+    world = WORLDS["maze2d"]
+    assert world.optimizer_stores == (TRAIN_STORE,)
+    assert OTHER_TRAIN_STORE not in driven_in(featurise.Arguments("maze2d", **counts), world)
 
 
 def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> None:
