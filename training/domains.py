@@ -29,12 +29,11 @@ class Domain:
     drive backwards. With ``twist`` the networks are told the velocity of each step, which they divide by
     ``twist_scale`` (m/s, m/s, rad/s). ``mirrors`` says that a frame seen in a mirror is a frame that could be.
 
-    What an optimizer here begins with: ``robust`` says whether the loops' gates start from a robust kernel or from
-    nothing, ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart`` meta-poses from each other and
-    ``max_loops`` of a trajectory, ``overlaps`` more are looked for under its poses, where ranges are registered, and
-    ``smoothing`` says whether its odometry is smoothed. It is trained for
-    ``optimizer_epochs``, the first ``single_share`` of them with one iteration where it closes loops, and errors count
-    by their square below ``loss_scale``: so many corridor widths, and as many fifths of a radian.
+    What an optimizer here begins with: ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart``
+    meta-poses from each other and ``max_loops`` of a trajectory, ``overlaps`` more are looked for under its poses,
+    where ranges are registered, and ``smoothing`` says whether its odometry is smoothed. It is trained for
+    ``optimizer_epochs``, and errors count by their square below ``loss_scale``: so many corridor widths, and as many
+    fifths of a radian.
     """
 
     name: str
@@ -52,14 +51,12 @@ class Domain:
     twist: bool = False
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     mirrors: bool = True
-    robust: bool = True
     loops_per_pose: int = LoopSearch.per_pose
     max_loops: int = LoopSearch.most
     loops_apart: int = LoopSearch.min_apart
     overlaps: int = 0
     smoothing: bool = False
     optimizer_epochs: int = 6
-    single_share: float = 0.0
     loss_scale: float = 0.1
 
     @property

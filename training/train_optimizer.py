@@ -59,8 +59,6 @@ class Arguments(runs.TrainerArguments):
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
     iterations: int = 5
     """Attend-optimise iterations."""
-    robust: bool | None = None
-    """Whether the loops' gates start from a robust kernel, or from nothing; by default as suits the world."""
     compass: bool = False
     """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
     smoothing: bool | None = None
@@ -149,7 +147,7 @@ class OptimizerTraining(lightning.LightningModule):
     def training_step(self, batch: Batch, _: int) -> Tensor:
         block = self.optimizer.block
         loss = trajectory_loss(
-            self.optimized(batch),
+            self(batch).meta_relative,
             batch["truth"][:, block - 1 :: block],
             self.optimizer.correction_std,
             self.domain.loss_scale_m,
@@ -157,18 +155,6 @@ class OptimizerTraining(lightning.LightningModule):
         )
         self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
         return loss
-
-    def optimized(self, batch: Batch) -> list[Tensor]:
-        """The relative meta-poses after each of the iterations that are trained in this epoch."""
-        optimizer = self.optimizer
-        single = optimizer.config.loops and self.current_epoch < self.domain.single_share * (self.arguments.epochs or 0)
-        steps = optimizer.aggregate(batch["relative"], batch["log_std"], batch["motion"])
-        fixes = fixes_of(batch, optimizer.block, self.domain.block_m)
-        results = optimizer.iterate(steps, loops_of(batch, self.registration), fixes)
-        if single:
-            return next(results).meta_relative
-        *_, last = results
-        return last.meta_relative
 
     def validation_step(self, batch: Batch, _: int) -> None:
         estimates = {"odometry": se2.r2g(batch["odometry"]), "corrected": self(batch).poses}
@@ -185,8 +171,8 @@ class OptimizerTraining(lightning.LightningModule):
         for name, parameter in self.optimizer.named_parameters():
             if not parameter.requires_grad:
                 continue
-            # Single numbers that start from zero, and hold the rest back until they move.
-            (fast if name in ("place_gain", "loop_gain") else slow).append(parameter)
+            # A single number that starts from zero.
+            (fast if name == "place_gain" else slow).append(parameter)
         rate = self.arguments.learning_rate
         groups: list[dict[str, Any]] = [{"params": slow}]
         if fast:
@@ -198,7 +184,6 @@ class OptimizerTraining(lightning.LightningModule):
 class Choices(NamedTuple):
     """The arguments that are the domain's unless they are given."""
 
-    robust: bool
     smoothing: bool
     loops_per_pose: int
     max_loops: int
@@ -209,7 +194,6 @@ def choices(arguments: Arguments, domain: Domain) -> Choices:
     """What is trained for how long: the domain's choices, but for those that are given."""
     given = arguments
     return Choices(
-        domain.robust if given.robust is None else given.robust,
         domain.smoothing and given.form != "paper" if given.smoothing is None else given.smoothing,
         domain.loops_per_pose if given.loops_per_pose is None else given.loops_per_pose,
         domain.max_loops if given.max_loops is None else given.max_loops,
@@ -246,7 +230,6 @@ def config_of(
         aggregation=aggregation,
         search=search,
         network=arguments.form == "loops",
-        robust=chosen.robust,
         compass=arguments.compass,
         **changes,
     )
@@ -299,7 +282,6 @@ def main(arguments: Arguments) -> dict[str, float]:
         best=None if recorded is None else "corrected_m",
         data=None if recorded is None else recorded.sha256,
         settings={
-            "single_share": domain.single_share,
             "loss_scale": domain.loss_scale,
             "search": dataclasses.asdict(search) if search is not None else None,
             "stores": list(domain.optimizer_stores),

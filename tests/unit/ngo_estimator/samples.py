@@ -33,15 +33,14 @@ def small_optimizer(
 ) -> NeuralGraphOptimizer:
     """An optimizer for 6 motion features, fresh or with random weights that close loops and move every pose.
 
-    ``form`` is ``loops``, ``learned`` (with gates from nothing), ``smoothed`` (with a smoother), ``gauss_newton`` or
-    ``paper``.
+    ``form`` is ``loops``, ``smoothed`` (with a smoother), ``gauss_newton`` or ``paper``.
     """
     torch.manual_seed(0)
     aggregation = PoseAggregationConfig(motion_feature_size=6, width=16, relative_std=(0.1, 0.02, 0.05))
     make = NeuralGraphOptimizerConfig.paper_form if form == "paper" else NeuralGraphOptimizerConfig
     settings = {"aggregation": aggregation, "iterations": 3, **changes}
     if form != "paper":
-        parts: dict[str, object] = {"network": form != "gauss_newton", "robust": form != "learned"}
+        parts: dict[str, object] = {"network": form != "gauss_newton"}
         if form == "smoothed":
             parts["smoother"] = SmootherConfig(6, aggregation.relative_std, width=8)
         settings = {**parts, "search": LoopSearch(2, 8, 2, 0, 3), **settings}
@@ -50,7 +49,7 @@ def small_optimizer(
         with torch.no_grad():
             for name, parameter in optimizer.named_parameters():
                 parameter.add_(0.1 * torch.randn_like(parameter))
-                if name in ("loop_gain", "place_gain"):
+                if name == "place_gain":
                     parameter.fill_(0.7)
     return optimizer.requires_grad_(False)
 

@@ -11,13 +11,13 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig, poses_in_block
 from tests.unit.ngo_estimator.samples import optimized, small_optimizer, small_pair_head, trajectory_inputs
 
 AGGREGATION = PoseAggregationConfig(motion_feature_size=6)
-FORMS = ["loops", "learned", "smoothed", "gauss_newton", "paper"]
+FORMS = ["loops", "smoothed", "gauss_newton", "paper"]
 NETWORKS = ["loops", "paper"]
 
 
 @pytest.mark.parametrize(
     ("form", "blocks"),
-    [("loops", 1), ("loops", 2), ("gauss_newton", 2), ("paper", 2), ("paper", 20), ("learned", 20), ("smoothed", 1)],
+    [("loops", 1), ("loops", 2), ("gauss_newton", 2), ("paper", 2), ("paper", 20), ("smoothed", 1)],
 )
 def test_a_fresh_optimizer_without_a_loop_returns_the_odometry_exactly(form: str, blocks: int) -> None:
     inputs = trajectory_inputs(2, 8 * blocks)

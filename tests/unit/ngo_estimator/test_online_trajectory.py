@@ -12,18 +12,21 @@ from hypothesis import strategies as st
 from ngo_estimator import se2
 from ngo_estimator.checkpoint import CheckpointError, write_untrained
 from ngo_estimator.local_odometry import RESTART_AFTER_NS
+from ngo_estimator.loop_closure import LoopSearch
 from ngo_estimator.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate, optimize_offline
 from ngo_estimator.relative_step import RejectedStep, RelativeStep
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 
 PERIOD_NS = 100_000_000
 FORMS = ["loops", "paper"]
+NO_LOOPS = LoopSearch(2, 8, 100_000, 0, 3)
 
 
 def make(form: str = "loops", trained: bool = True, window_frames: int = 2000) -> OnlineTrajectory:
+    # Fresh and with nothing to close, it passes the odometry on.
+    changes = {} if trained or form == "paper" else {"search": NO_LOOPS}
     return OnlineTrajectory(
-        # Fresh and with gates that are learned from nothing, it passes the odometry on.
-        small_optimizer("learned" if form == "loops" and not trained else form, trained),
+        small_optimizer(form, trained, **changes),
         None if form == "paper" else small_pair_head(),
         window_frames,
     )
@@ -379,7 +382,7 @@ def test_covariance_of_a_fresh_optimizer_is_that_of_sampled_odometry(form: str) 
     std = np.array([0.01, 0.01, 0.02])
     core = make(form, trained=False)
     if form == "loops":
-        core._optimizer.loop_gate.head.bias[0] = -100.0  # no loop is believed
+        core._optimizer.odometry_noise = torch.ones(3)  # it believes its odometry half as far as that says
     for step in steps:
         update = take(core, replace(step, covariance=np.diag(std**2)))
     relative = torch.from_numpy(np.stack([step.relative_xyyaw for step in steps]))

@@ -1,4 +1,4 @@
-"""How much each loop candidate is trusted under the current poses: the optimizer's learned robust kernels."""
+"""How much each loop candidate is trusted under the current poses: the optimizer's learned robust kernel."""
 
 import torch
 from torch import Tensor, nn
@@ -59,44 +59,3 @@ class RobustLoopGate(nn.Module):
         gate = torch.sigmoid((loops.logit + 2.0).unsqueeze(-1) + 4.0 * belief) * loops.valid.unsqueeze(-1) / kernel
         information = gate * torch.exp(4.0 * torch.tanh(scale / 2.0)) / variance
         return gate.squeeze(-1), information[..., [0, 0, 1]]
-
-
-class LearnedLoopGate(nn.Module):
-    """How much each loop candidate is trusted, learned from nothing: untrained it believes the pair head."""
-
-    def __init__(self, hidden: int = 32) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(9, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
-        self.head = nn.Linear(hidden, 3)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
-
-    def forward(
-        self, loops: Loops, residuals: Tensor, expected_variance: Tensor, iteration: int
-    ) -> tuple[Tensor, Tensor]:
-        """As of ``RobustLoopGate``; all iterations are alike."""
-        measured_variance = torch.exp(2.0 * loops.log_scale)
-        position_variance, heading_variance = measured_variance.unbind(-1)
-        position_error = residuals[..., :2].square().sum(-1)
-        heading_error = residuals[..., 2].square()
-        expected_position = expected_variance[..., :2].sum(-1)
-        inputs = torch.stack(
-            (
-                loops.similarity,
-                loops.logit / 5.0,
-                loops.log_scale[..., 0],
-                loops.log_scale[..., 1],
-                loops.log_length / 3.0,
-                torch.log1p(position_error / (2.0 * position_variance)) / 3.0,
-                torch.log1p(heading_error / heading_variance) / 3.0,
-                torch.log1p(position_error / (expected_position + 2.0 * position_variance)),
-                torch.log1p(heading_error / (expected_variance[..., 2] + heading_variance)),
-            ),
-            dim=-1,
-        )
-        out = self.head(self.layers(inputs))
-        gate = torch.sigmoid(loops.logit + 4.0 * out[..., 0]) * loops.valid
-        scale = torch.exp(4.0 * torch.tanh(out[..., 1:] / 2.0))
-        position = gate * scale[..., 0] / position_variance
-        heading = gate * scale[..., 1] / heading_variance
-        return gate, torch.stack((position, position, heading), dim=-1)

@@ -18,7 +18,7 @@ from ngo_estimator.loop_closure import (
     odometry_variances,
     spread_over_span,
 )
-from ngo_estimator.loop_gates import LearnedLoopGate, RobustLoopGate
+from ngo_estimator.loop_gates import RobustLoopGate
 from ngo_estimator.normal_equations import GraphStructure, NormalEquations
 from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.overlaps import find_overlaps
@@ -62,7 +62,6 @@ class NeuralGraphOptimizerConfig:
     residual: bool = True
     loops: bool = True
     network: bool = True
-    robust: bool = True
     compass: bool = False
     smoother: SmootherConfig | None = None
     search: LoopSearch = field(default_factory=LoopSearch)
@@ -192,13 +191,9 @@ class NeuralGraphOptimizer(nn.Module):
         if config.network:
             self._build_network(config)
         if config.loops:
-            noise = torch.tensor(_ODOMETRY_NOISE) if config.robust else torch.ones(3)
-            self.register_buffer("odometry_noise", noise, persistent=False)
+            self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
             self.odometry_noise: Tensor
-            self.loop_gate = RobustLoopGate() if config.robust else LearnedLoopGate()
-            if not config.robust:
-                # Gates that know nothing yet must not bend the trajectory.
-                self.loop_gain = nn.Parameter(torch.tensor(0.0))
+            self.loop_gate = RobustLoopGate()
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
             if config.compass:
@@ -396,7 +391,6 @@ class NeuralGraphOptimizer(nn.Module):
                     step = equations.step()
                 else:
                     step = gauss_newton_step(factors, nodes if lattice is None else nodes + 1)
-                step = step if self.config.robust else self.loop_gain * step
                 after, before_it = se2.g2r(torch.cat((poses + step[:, :nodes], poses))[:, 1:]).chunk(2)
                 change = after - before_it
                 change = se2.wrapped(change)
