@@ -10,7 +10,7 @@ TRAIN_STORE = "train"
 """The feature store that smoother and optimizer learn from."""
 
 OTHER_TRAIN_STORE = "train_policy"
-"""The one that the optimizer learns from as well, in worlds where another driver is known."""
+"""The one that the optimizer learns from as well, in worlds with an ``optimizer_driver``."""
 
 MIRRORED_ACTIONS = (0, 2, 1)
 """What the actions of ngo_msgs/DiscreteAction become in a mirror: forward stays, left and right change places."""

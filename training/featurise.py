@@ -183,10 +183,13 @@ def main(arguments: Arguments) -> None:
     folder = arguments.weights / world.name
     local, local_description = load_local(folder, world.name)
     place, place_description = load_place(folder, world.name)
-    for split, driven in driven_in(arguments, world).items():
+    features, chosen = arguments.out / world.name / "features", driven_in(arguments, world)
+    for split, driven in chosen.items():
+        _check_count(features / split, len(driven.seeds))
+    for split, driven in chosen.items():
         if not driven.seeds:
             continue
-        store = arguments.out / world.name / "features" / split
+        store = features / split
         store.mkdir(parents=True, exist_ok=True)
         check_networks(store, local_description, place_description)
         (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
@@ -195,6 +198,16 @@ def main(arguments: Arguments) -> None:
         if arguments.compass is not None:
             compass, _ = load_compass(arguments.compass / world.name, world.name)
             fill(store, "compass_done", world, driven, part, partial(readings_of, world, compass))
+
+
+def _check_count(store: Path, count: int) -> None:
+    """Refuse to make a store of other trajectories than those it was begun with, before others are made."""
+    path = store / "relative.npy"
+    if count and path.exists() and (begun := len(np.load(path, mmap_mode="r"))) != count:
+        raise runs.RunError(
+            f"{store} was begun with {begun} trajectories, {count} are asked for; expected as many, or {store.parent} "
+            "removed to make all stores anew"
+        )
 
 
 def _main_recorded(arguments: Arguments) -> None:
@@ -262,7 +275,7 @@ def stores_named(
 def open_store(store: Path, with_compass: bool = False, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:
     """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
     names = [*stored, *(_COMPASS if with_compass else ())]
-    hint = "run `python -m training.featurise` first"
+    hint = "run `python -m training.featurise` first, with as many trajectories as the other stores were made with"
     if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
         raise runs.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")
     arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in names}

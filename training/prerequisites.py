@@ -115,6 +115,9 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
         count = getattr(scripts.features, _COUNTS[split])
         if split == wanted.split:
             count = max(count, wanted.trajectories)
+        train = sources.runs / sources.world.name / "features" / TRAIN_STORE
+        if split == TRAIN_STORE and _whole(sources, TRAIN_STORE)():
+            count = len(open_store(train)["relative"])
         changes: dict[str, Any] = {name: count if name == _COUNTS[split] else 0 for name in _COUNTS.values()}
         changes["world"] = sources.world.name
         compass = sources.compass_weights if sources.has_compass else None

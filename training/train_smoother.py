@@ -33,6 +33,7 @@ from training.worlds import WorldName, world_named
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
 
+_STORES = (TRAIN_STORE,)  # another driver's ways cost more on the first one's than they are worth
 _BLOCK = PoseAggregationConfig(1).block
 
 
@@ -130,7 +131,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         StoredTrajectories(
             stores_named(names, features, local_description, place_description), None, place.pair_head, _BLOCK
         )
-        for names in ((TRAIN_STORE,), domain.validation_stores)
+        for names in (_STORES, domain.validation_stores)
     )
     made_with = {"local_pose_network_sha256": local_description["sha256"]}
     run = runs.Run(
@@ -141,7 +142,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "smoothed_m",
         data=None if recorded is None else recorded.sha256,
-        settings={"error_windows": ERROR_WINDOWS, **made_with},
+        settings={"error_windows": ERROR_WINDOWS, "stores": _STORES, **made_with},
     )
     scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
     smoother, begun = initial_smoother(arguments, local.config)

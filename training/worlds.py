@@ -237,7 +237,7 @@ WORLDS = {
         driver="random_goals",
         # The learned driver grazes walls, as others may: networks that never saw it are lost there.
         training_drivers=(*("random_goals",) * 5, "learned"),
-        # Trained on the planner's alone, the optimizer trusts odometry where that one's fails (docs/results.md).
+        # From the planner's trajectories alone it learns to trust odometry where the learned driver's fails.
         optimizer_driver="learned",
         block_m=3.0,
         period_s=2 / 35,

@@ -17,11 +17,12 @@ NETWORKS = ["loops", "paper"]
 
 @pytest.mark.parametrize(
     ("form", "blocks"),
-    [("loops", 1), ("loops", 2), ("gauss_newton", 2), ("paper", 2), ("paper", 20), ("smoothed", 1)],
+    [("loops", 1), ("loops", 2), ("gauss_newton", 2), ("paper", 2), ("paper", 20), ("loops", 20), ("smoothed", 1)],
 )
 def test_a_fresh_optimizer_without_a_loop_returns_the_odometry_exactly(form: str, blocks: int) -> None:
     inputs = trajectory_inputs(2, 8 * blocks)
-    result = optimized(small_optimizer(form), inputs)
+    changes = {} if form == "paper" else {"search": LoopSearch(2, 8, 100, 0, 3)}
+    result = optimized(small_optimizer(form, **changes), inputs)
     odometry = poses_in_blocks(inputs[0], 8)[:, :, -1]
     assert len(result.meta_relative) == 3
     assert all(torch.equal(relative, odometry) for relative in result.meta_relative)

@@ -382,7 +382,7 @@ def test_covariance_of_a_fresh_optimizer_is_that_of_sampled_odometry(form: str) 
     std = np.array([0.01, 0.01, 0.02])
     core = make(form, trained=False)
     if form == "loops":
-        core._optimizer.odometry_noise = torch.ones(3)  # it believes its odometry half as far as that says
+        core._optimizer.odometry_noise = torch.ones(3)  # fresh, it takes positions for twice as uncertain as they say
     for step in steps:
         update = take(core, replace(step, covariance=np.diag(std**2)))
     relative = torch.from_numpy(np.stack([step.relative_xyyaw for step in steps]))

@@ -49,6 +49,17 @@ def test_arrays_are_made_once_and_their_size_is_checked(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["relative.npy"]
 
 
+def test_a_store_begun_with_another_number_of_trajectories_is_refused_before_any_is_made(tmp_path: Path) -> None:
+    write_untrained(tmp_path / "weights" / "maze3d", "maze3d")
+    features = tmp_path / "maze3d" / "features"
+    (features / "train_policy").mkdir(parents=True)
+    np.save(features / "train_policy" / "relative.npy", np.zeros((3, 1000, 3)))
+    arguments = featurise.Arguments("maze3d", trajectories=8, weights=tmp_path / "weights", out=tmp_path)
+    with pytest.raises(ValueError, match=r"train_policy was begun with 3 trajectories, 2 are asked for; expected"):
+        featurise.main(arguments)
+    assert [entry.name for entry in features.iterdir()] == ["train_policy"]
+
+
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
 def test_parts_share_the_groups_without_overlap(parts: int) -> None:
     groups = [first for part in range(parts) for first in featurise._groups(45, part, parts)]

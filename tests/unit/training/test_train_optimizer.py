@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from ngo_estimator import se2
 from ngo_estimator.checkpoint import OPTIMIZER, load_optimizer, load_place, load_smoother, save_checkpoint
 from ngo_estimator.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
-from tests.unit.ngo_estimator.samples import small_optimizer
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.runs import WEIGHTS, RunError
 from training.train_optimizer import (
     Arguments,
@@ -19,6 +20,7 @@ from training.train_optimizer import (
     choices,
     config_of,
     main,
+    trajectory_loss,
 )
 from training.worlds import WORLDS, world_named
 
@@ -77,5 +79,23 @@ def test_what_is_trained_looks_for_overlaps() -> None:
     expected = optimizer(relative, log_std, motion, loops)
     assert expected.loops.start.shape[1] == loops.start.shape[1] + 20
     training = OptimizerTraining(Arguments(world="maze3d", epochs=4), optimizer, world_named("maze3d"), CAMERA)
-    torch.testing.assert_close(training(batch).meta_relative, expected.meta_relative)
-    torch.testing.assert_close(training(batch).poses, expected.poses)
+    found = training(batch)
+    torch.testing.assert_close(found.meta_relative, expected.meta_relative)
+    torch.testing.assert_close(found.poses, expected.poses)
+
+
+@pytest.mark.parametrize("form", ["loops", "paper"])
+def test_all_iterations_are_trained_from_the_first_epoch(form: str) -> None:
+    optimizer, world = small_optimizer(form, trained=True), world_named("maze3d")
+    relative, log_std, motion, codes = trajectory_inputs(2, 160)
+    loops = optimizer.find_loops(relative, codes, small_pair_head()) if form == "loops" else None
+    batch = {"relative": relative, "log_std": log_std, "motion": motion, "truth": se2.r2g(1.1 * relative)}
+    if loops is not None:
+        batch |= {f"loop_{k}": v for k, v in vars(loops).items() if isinstance(v, torch.Tensor)}
+    steps = optimizer(relative, log_std, motion, loops).meta_relative
+    assert len(steps) == 3
+    scales = optimizer.correction_std, world.loss_scale_m, world.loss_scale_rad
+    expected = trajectory_loss(steps, batch["truth"][:, 7::8], *scales)
+    training = OptimizerTraining(Arguments(world="maze3d", epochs=4), optimizer, world)
+    torch.testing.assert_close(training.training_step(batch, 0), expected)
+    assert not torch.allclose(expected, trajectory_loss(steps[:1], batch["truth"][:, 7::8], *scales))
