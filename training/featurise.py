@@ -262,14 +262,18 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
         raise runs.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
-def stores_named(
-    names: Sequence[str], folder: Path, local_description: dict[str, Any], place_description: dict[str, Any]
-) -> list[Path]:
-    """The stores of these names in ``folder``; raises ``RunError`` as ``check_networks``."""
-    stores = [folder / name for name in names]
-    for store in stores:
+def training_stores(
+    folder: Path,
+    names: Sequence[str],
+    domain: Domain,
+    local_description: dict[str, Any],
+    place_description: dict[str, Any],
+) -> tuple[list[Path], list[Path]]:
+    """The stores of these names in ``folder``, and those to be measured on; raises as ``check_networks``."""
+    train, validation = ([folder / name for name in some] for some in (names, domain.validation_stores))
+    for store in (*train, *validation):
         check_networks(store, local_description, place_description)
-    return stores
+    return train, validation
 
 
 def open_store(store: Path, with_compass: bool = False, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:

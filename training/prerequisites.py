@@ -115,9 +115,8 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
         count = getattr(scripts.features, _COUNTS[split])
         if split == wanted.split:
             count = max(count, wanted.trajectories)
-        train = sources.runs / sources.world.name / "features" / TRAIN_STORE
-        if split == TRAIN_STORE and _whole(sources, TRAIN_STORE)():
-            count = len(open_store(train)["relative"])
+        if split == TRAIN_STORE and _whole(sources, TRAIN_STORE)():  # what else is made goes with what is there
+            count = len(open_store(_store_folder(sources, TRAIN_STORE))["relative"])
         changes: dict[str, Any] = {name: count if name == _COUNTS[split] else 0 for name in _COUNTS.values()}
         changes["world"] = sources.world.name
         compass = sources.compass_weights if sources.has_compass else None
@@ -244,8 +243,11 @@ def _exists(sources: Sources, kind: str) -> Callable[[], bool]:
 
 
 def _whole(sources: Sources, store: str) -> Callable[[], bool]:
-    folder = sources.runs / sources.world.name / "features" / store
-    return _is_whole(partial(open_store, folder, sources.has_compass))
+    return _is_whole(partial(open_store, _store_folder(sources, store), sources.has_compass))
+
+
+def _store_folder(sources: Sources, store: str) -> Path:
+    return sources.runs / sources.world.name / "features" / store
 
 
 def _is_whole(opened: Callable[[], object]) -> Callable[[], bool]:

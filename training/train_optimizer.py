@@ -35,7 +35,7 @@ from ngo_estimator.pose_aggregation import PoseAggregationConfig
 from ngo_estimator.scan_registration import RegistrationConfig
 from training import runs
 from training.domains import Domain
-from training.featurise import stores_named
+from training.featurise import training_stores
 from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
 from training.streams import Batch
 from training.trajectories import StoredTrajectories, StretchData, correction_scale, fixes_of, loops_of, rmse_figures
@@ -256,10 +256,7 @@ def main(arguments: Arguments) -> dict[str, float]:
             "smooths odometry learned from steps that are not"
         )
     features = arguments.runs / domain.name / "features"
-    stores = [
-        stores_named(names, features, local_description, place_description)
-        for names in (domain.optimizer_stores, domain.validation_stores)
-    ]
+    stores = training_stores(features, domain.optimizer_stores, domain, local_description, place_description)
     smoother: OdometrySmoother | None = None
     if arguments.smoothing:
         smoother, described = load_smoother(folder, domain.name)

@@ -23,7 +23,7 @@ from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training import runs
 from training.domains import TRAIN_STORE
-from training.featurise import stores_named
+from training.featurise import training_stores
 from training.recorded import RecordedArguments, check_source, open_recorded, run_script
 from training.streams import Batch
 from training.train_local import LIKELIHOOD_WEIGHT, step_losses, windows_within
@@ -127,12 +127,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     local, local_description = load_local(folder, domain.name)
     place, place_description = load_place(folder, domain.name)
     features = arguments.runs / domain.name / "features"
-    train, validation = (
-        StoredTrajectories(
-            stores_named(names, features, local_description, place_description), None, place.pair_head, _BLOCK
-        )
-        for names in (_STORES, domain.validation_stores)
-    )
+    stores = training_stores(features, _STORES, domain, local_description, place_description)
+    train, validation = (StoredTrajectories(some, None, place.pair_head, _BLOCK) for some in stores)
     made_with = {"local_pose_network_sha256": local_description["sha256"]}
     run = runs.Run(
         arguments.runs / domain.name / f"smoother-seed{arguments.seed}",
