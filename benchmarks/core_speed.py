@@ -15,14 +15,14 @@ from benchmarks.drives import CACHE, Drive, drive_of, episodes, stamp_ns
 from benchmarks.peers import SETTINGS, Incremental, LevenbergMarquardt, Problem, xyyaw
 from benchmarks.roofline import counted, measured_peak
 from ngo_estimator.checkpoint import load_optimizer, load_place
-from ngo_estimator.local_odometry import LocalOdometry
-from ngo_estimator.loop_closure import Loops
-from ngo_estimator.neural_graph_optimizer import MetaSteps
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.online_trajectory import OnlineTrajectory
-from training.runs import WEIGHTS
-from training.streams import images_of
-from training.worlds import world_named
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.optimizer.loop_closure import Loops
+from ngo_estimator.optimizer.neural_graph_optimizer import MetaSteps
+from training.common.runs import WEIGHTS
+from training.data.streams import images_of
+from training.data.worlds import world_named
 
 Result = TypeVar("Result")
 

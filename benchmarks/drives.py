@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_place
-from ngo_estimator.relative_step import RelativeStep
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry import se2
 from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.episodes import Episode
+from training.common.runs import ROOT, WEIGHTS
+from training.data.worlds import MazeSize, world_named
 from training.featurise import features_of
-from training.metrics import seen_from_first
-from training.runs import ROOT, WEIGHTS
-from training.worlds import MazeSize, world_named
+from training.scoring.metrics import seen_from_first
 
 SIZES = {"maze2d": MazeSize(7, 8), "maze3d": MazeSize()}
 """The mazes that are driven through."""

@@ -26,10 +26,10 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.drives import CACHE, drive_of
 from benchmarks.pinned import in_process, two_cores
+from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.online_trajectory import OnlineTrajectory
-from ngo_estimator.rows import GrowingRows
-from training.runs import ROOT, WEIGHTS
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from training.common.runs import ROOT, WEIGHTS
 
 LONGEST_RATIO, MOST_GROWTH_MB = 1.2, 100.0
 

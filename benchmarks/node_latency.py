@@ -24,8 +24,8 @@ from std_msgs.msg import Header
 from benchmarks.drives import CACHE, drive_of, episodes, stamp_ns
 from benchmarks.pinned import running_on
 from demo.graph import Graph, GraphError, NodeSpec
-from ngo_estimator.local_odometry import LocalEstimate
 from ngo_estimator.nodes.messages import relative_pose_message, to_time
+from ngo_estimator.odometry.local_odometry import LocalEstimate
 from ngo_sim.flow_control import header_stamp_ns
 
 RATE_HZ = 35.0

@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 import torch
 
-from ngo_estimator import se2
-from ngo_estimator.loop_closure import Loops
-from ngo_estimator.neural_graph_optimizer import MetaSteps
-from training.pose_graph import PoseGraphSettings
+from ngo_estimator.geometry import se2
+from ngo_estimator.optimizer.loop_closure import Loops
+from ngo_estimator.optimizer.neural_graph_optimizer import MetaSteps
+from training.baselines.pose_graph import PoseGraphSettings
 
 SETTINGS = PoseGraphSettings()
 """How far odometry and loops are believed, and the robust kernel: those of the classical baseline."""

@@ -16,7 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from ngo_estimator import normal_equations
+from ngo_estimator.optimizer import normal_equations
 
 _SIDE = 1024
 _COPY_BYTES = 2**26

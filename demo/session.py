@@ -18,10 +18,10 @@ from demo.graph import Graph, GraphError, NodeSpec
 from demo.picture import save_picture
 from demo.recording import ALL_TOPICS, StampTimes
 from demo.trajectories import Poses, evaluate, match
-from ngo_estimator.trajectory_file import write_tum
+from ngo_estimator.trajectory.files import write_tum
 from ngo_sim.flow_control import header_stamp_ns
 from ngo_sim.mazes import Maze
-from training.recorder import Recorder
+from training.recordings.recorder import Recorder
 
 START_TIMEOUT_S = 90.0
 SILENCE_TIMEOUT_S = 60.0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from training.metrics import path_length_m, trajectory_error
+from training.scoring.metrics import path_length_m, trajectory_error
 
 Poses = npt.NDArray[np.float64]
 

@@ -25,20 +25,20 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
-from ngo_estimator.online_trajectory import OnlineTrajectory, optimize_offline
-from ngo_estimator.trajectory_errors import KITTI_LENGTHS_M, RelativeDelta
-from ngo_estimator.trajectory_report import ReportSettings
-from training import runs
-from training.evaluate_files import evaluate_files
-from training.evaluate_recorded import FEATURES, evaluate_recorded
+from ngo_estimator.geometry import se2
+from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_offline
+from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
+from ngo_estimator.trajectory.report import ReportSettings
+from training.common import runs
+from training.data.streams import simulate
+from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
 from training.featurise import features_of
-from training.metrics import TrajectoryError, trajectory_error
-from training.online_estimate import run_online, with_origin
-from training.recorded import RecordedArguments, open_recorded
-from training.streams import simulate
-from training.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
+from training.recordings.recording_source import RecordedArguments, open_recorded
+from training.scoring.file_errors import evaluate_files
+from training.scoring.metrics import TrajectoryError, trajectory_error
+from training.scoring.online_estimate import run_online, with_origin
+from training.scoring.recording_errors import FEATURES, evaluate_recorded
 
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 

@@ -17,11 +17,11 @@ from typing import Any, Literal
 import tyro
 
 from ngo_estimator.checkpoint import load_local
-from training import runs
-from training.results_page import interval, markdown
+from training.common import runs
+from training.data.worlds import world_named
+from training.report.results_page import interval, markdown
+from training.scoring.validation_steps import measured
 from training.train_local import RPE_STEPS
-from training.validation_steps import measured
-from training.worlds import world_named
 
 
 @dataclass(frozen=True)

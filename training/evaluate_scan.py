@@ -22,19 +22,19 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
-from ngo_estimator.images import ImageFormat, scan_image
-from ngo_estimator.online_trajectory import optimize_offline
+from ngo_estimator.data.images import ImageFormat, scan_image
+from ngo_estimator.geometry import se2
+from ngo_estimator.online.online_trajectory import optimize_offline
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2DConfig
-from training import runs
-from training.evaluate_recorded import FEATURES
+from training.common import runs
+from training.data.scans import ScannedMaze
+from training.data.streams import simulate
+from training.data.worlds import WORLDS
 from training.featurise import features_of
-from training.metrics import TrajectoryError, path_length_m, trajectory_error
-from training.scans import ScannedMaze
-from training.streams import simulate
-from training.worlds import WORLDS
+from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
+from training.scoring.recording_errors import FEATURES
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as drawn in training": {},

@@ -26,19 +26,19 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import PlaceNetworks, load_local, load_place
-from ngo_estimator.compass import Compass, load_compass, read_frames
-from ngo_estimator.compass_closure import frames_to_read
-from ngo_estimator.local_pose_network import LocalPoseNetwork
-from ngo_estimator.pose_aggregation import PoseAggregationConfig
-from training import runs
-from training.domains import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
-from training.driven import Driven, driven_in_table
-from training.metrics import seen_from_first
-from training.recorded import RecordedArguments, check_source, open_recorded, run_script
-from training.recorded_streams import known_to, told, windows
-from training.recorded_tracks import Part, Track
-from training.streams import Batch, action_histories, images_of, mirrored
-from training.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, WorldName, world_named
+from ngo_estimator.networks.compass import Compass, load_compass, read_frames
+from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.compass_closure import frames_to_read
+from training.common import runs
+from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
+from training.data.drive_plan import Driven, driven_in_table
+from training.data.streams import Batch, action_histories, images_of, mirrored
+from training.data.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, WorldName, world_named
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
+from training.recordings.recording_streams import known_to, told, windows
+from training.recordings.recording_tracks import Part, Track
+from training.scoring.metrics import seen_from_first
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode

@@ -21,8 +21,8 @@ import tyro
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import TopicArguments, choose_topics
-from training.recording_picture import save_picture
-from training.recording_report import REVISIT_AFTER_M, REVISIT_M, Report, inspect, topic_row
+from training.recordings.recording_picture import save_picture
+from training.recordings.recording_report import REVISIT_AFTER_M, REVISIT_M, Report, inspect, topic_row
 
 
 @dataclass(frozen=True)

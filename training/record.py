@@ -17,7 +17,7 @@ import tyro
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from ngo_recordings.errors import RecordingError
-from training.recorder import Recorder
+from training.recordings.recorder import Recorder
 
 _LOOK_S = 0.2
 

@@ -17,17 +17,18 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from training import attention, figures, results_page, runs, tables
-from training.curves import write_at_once
-from training.estimators import Arrays, Prepared, estimators
+from training.baselines.network_odometry import open_odometry
+from training.common import runs
+from training.common.curves import write_at_once
+from training.data.worlds import world_named
 from training.featurise import open_store
-from training.limits import LIMITED_WORLDS, LIMITS, limit_estimator
-from training.measured import Measured, measure
-from training.own_odometry import open_odometry
-from training.prerequisites import Scripts, Wanted, prepare
-from training.rows import COMPASS_WORLDS, ROWS, Sources, rows_of
-from training.trained import trainings_json
-from training.worlds import world_named
+from training.report import attention, figures, results_page, tables
+from training.report.prerequisites import Scripts, Wanted, prepare
+from training.report.training_records import trainings_json
+from training.scoring.error_cache import Measured, measure
+from training.scoring.oracle_rows import LIMITED_WORLDS, LIMITS, limit_estimator
+from training.scoring.row_estimators import Arrays, Prepared, estimators
+from training.scoring.table_rows import COMPASS_WORLDS, ROWS, Sources, rows_of
 
 
 @dataclass(frozen=True)

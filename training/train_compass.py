@@ -18,13 +18,14 @@ import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import save_checkpoint
-from ngo_estimator.compass import COMPASS, Compass, CompassConfig
-from ngo_estimator.lattice import snapped
+from ngo_estimator.geometry.lattice import snapped
+from ngo_estimator.networks.compass import COMPASS, Compass, CompassConfig
 from ngo_sim.episodes import Episode
-from training import runs, streams
-from training.data_module import StreamedData
-from training.streams import ALL, Batch, Share, images_of, mirrored, simulate
-from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.common import runs
+from training.common.data_module import StreamedData
+from training.data import streams
+from training.data.streams import ALL, Batch, Share, images_of, mirrored, simulate
+from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,17 @@ import torch
 import tyro
 from torch import Tensor
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import save_checkpoint
-from training import runs, streams
-from training.data_module import StreamedData
-from training.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
-from training.metrics import seen_from_first
-from training.streams import ALL, Batch, PairStream, Share, images_of, mirrored, relative_poses, simulate
+from ngo_estimator.geometry import se2
+from training.baselines.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
+from training.common import runs
+from training.common.data_module import StreamedData
+from training.data import streams
+from training.data.streams import ALL, Batch, PairStream, Share, images_of, mirrored, relative_poses, simulate
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.scoring.metrics import seen_from_first
 from training.train_local import episode_pairs, step_losses, step_metrics, windows_within
 from training.tune_pose_graph import fit_calibration
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode

@@ -27,12 +27,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from ngo_sim.policy_network import SHIPPED, PolicyConfig
-from training import runs
-from training.curves import write_at_once
-from training.driver_network import Features, MirroredPolicy, export
-from training.driving_task import REWARD_PER_M, DrivingTask
-from training.imitation import Lessons, imitate
-from training.worlds import World, world_named
+from training.common import runs
+from training.common.curves import write_at_once
+from training.data.worlds import World, world_named
+from training.driver.driver_network import Features, MirroredPolicy, export
+from training.driver.driving_task import REWARD_PER_M, DrivingTask
+from training.driver.imitation import Lessons, imitate
 
 CHECKPOINT = "last.pt"
 

@@ -18,7 +18,6 @@ import torch
 import tyro
 from torch import Tensor
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import (
     LOCAL,
     OPTIMIZER,
@@ -31,15 +30,16 @@ from ngo_estimator.checkpoint import (
     load_place,
     save_checkpoint,
 )
-from ngo_estimator.local_pose_network import LocalPoseNetwork
-from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
-from training import runs
-from training.data_module import StreamedData
-from training.streams import Batch, Share, TrajectoryStream
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
+from training.common import runs
+from training.common.data_module import StreamedData
+from training.data.streams import Batch, Share, TrajectoryStream
+from training.data.trajectories import rmse_figures
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
 from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.train_optimizer import trajectory_loss
-from training.trajectories import rmse_figures
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
 
 
 @dataclass(frozen=True)

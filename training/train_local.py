@@ -23,17 +23,15 @@ from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 from torch.utils.data import IterableDataset
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
-from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
-from training import runs
-from training.data_module import StreamedData
-from training.domains import Domain
-from training.looks import LooksName, check_looks
-from training.recorded import RecordedArguments, check_source, open_recorded, run_script
-from training.recorded_streams import RecordedSteps
-from training.streams import (
+from training.common import runs
+from training.common.data_module import StreamedData
+from training.data.data_source import Domain
+from training.data.looks import LooksName, check_looks
+from training.data.streams import (
     ACTION_HISTORY,
     Batch,
     PairStream,
@@ -43,7 +41,9 @@ from training.streams import (
     relative_poses,
     simulate,
 )
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
+from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
 HEADING_WEIGHT = 3.0

@@ -19,7 +19,6 @@ import tyro
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import (
     OPTIMIZER,
     load_local,
@@ -28,18 +27,30 @@ from ngo_estimator.checkpoint import (
     load_smoother,
     save_checkpoint,
 )
-from ngo_estimator.loop_closure import LoopSearch
-from ngo_estimator.neural_graph_optimizer import OVERLAPS_AFTER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig
-from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.scan_registration import RegistrationConfig
-from training import runs
-from training.domains import Domain
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.scan_registration import RegistrationConfig
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.optimizer.neural_graph_optimizer import (
+    OVERLAPS_AFTER,
+    NeuralGraphOptimizer,
+    NeuralGraphOptimizerConfig,
+)
+from training.common import runs
+from training.data.data_source import Domain
+from training.data.streams import Batch
+from training.data.trajectories import (
+    StoredTrajectories,
+    StretchData,
+    correction_scale,
+    fixes_of,
+    loops_of,
+    rmse_figures,
+)
+from training.data.worlds import WorldName, world_named
 from training.featurise import training_stores
-from training.recorded import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
-from training.streams import Batch
-from training.trajectories import StoredTrajectories, StretchData, correction_scale, fixes_of, loops_of, rmse_figures
-from training.worlds import WorldName, world_named
+from training.recordings.recording_source import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05

@@ -20,17 +20,24 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import IterableDataset
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
-from ngo_estimator.place_encoder import PlaceConfig
-from training import runs
-from training.data_module import StreamedData
-from training.domains import Domain
-from training.looks import LooksName, check_looks
-from training.recorded import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded, run_script
-from training.recorded_streams import RecordedPlaces
-from training.streams import Batch, PlaceStream, Share
-from training.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.place_encoder import PlaceConfig
+from training.common import runs
+from training.common.data_module import StreamedData
+from training.data.data_source import Domain
+from training.data.looks import LooksName, check_looks
+from training.data.streams import Batch, PlaceStream, Share
+from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
+from training.recordings.recording_source import (
+    NO_LOOPS,
+    RecordedArguments,
+    RecordedData,
+    check_source,
+    open_recorded,
+    run_script,
+)
+from training.recordings.recording_streams import RecordedPlaces
 
 
 @dataclass(frozen=True)

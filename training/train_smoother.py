@@ -16,19 +16,19 @@ import torch
 import tyro
 from torch import Tensor
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
-from ngo_estimator.local_pose_network import LocalPoseConfig
-from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
-from training import runs
-from training.domains import TRAIN_STORE
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
+from training.common import runs
+from training.data.data_source import TRAIN_STORE
+from training.data.streams import Batch
+from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
+from training.data.worlds import WorldName, world_named
 from training.featurise import training_stores
-from training.recorded import RecordedArguments, check_source, open_recorded, run_script
-from training.streams import Batch
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
 from training.train_local import LIKELIHOOD_WEIGHT, step_losses, windows_within
-from training.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
-from training.worlds import WorldName, world_named
 
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""

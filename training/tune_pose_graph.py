@@ -19,16 +19,14 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_place, load_smoother
-from ngo_estimator.compass_closure import CompassFixes
-from ngo_estimator.loop_closure import LoopSearch
-from ngo_estimator.odometry_smoothing import OdometrySmoother
-from ngo_estimator.place_encoder import PairHead
-from training import runs
-from training.compass_factors import found_fixes
-from training.featurise import open_store
-from training.loop_factors import (
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.optimizer.compass_closure import CompassFixes
+from ngo_estimator.optimizer.loop_closure import LoopSearch
+from training.baselines.compass_factors import found_fixes
+from training.baselines.loop_factors import (
     LoopFactors,
     MoreLoops,
     Seen,
@@ -37,9 +35,11 @@ from training.loop_factors import (
     registered_odometry,
     smoothed_odometry,
 )
-from training.metrics import trajectory_error
-from training.pose_graph import PoseGraphSettings, optimize
-from training.worlds import world_named
+from training.baselines.pose_graph import PoseGraphSettings, optimize
+from training.common import runs
+from training.data.worlds import world_named
+from training.featurise import open_store
+from training.scoring.metrics import trajectory_error
 
 GRID: tuple[tuple[dict[str, Any], ...], ...] = (
     tuple(

@@ -9,11 +9,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import OPTIMIZER, PLACE, PlaceNetworks, save_checkpoint
-from ngo_estimator.local_odometry import LocalEstimate
+from ngo_estimator.geometry import se2
 from ngo_estimator.nodes.messages import relative_pose_message, relative_step, to_ns
-from ngo_estimator.online_trajectory import OnlineTrajectory, TrajectoryUpdate
+from ngo_estimator.odometry.local_odometry import LocalEstimate
+from ngo_estimator.online.online_trajectory import OnlineTrajectory, TrajectoryUpdate
 from tests.unit.ngo_estimator.samples import place_config, small_optimizer
 
 from .estimator_graph import FIRST_RUN_NS, RUN_NS, STEP_NS

@@ -19,7 +19,7 @@ from demo.recording import ALL_TOPICS, StampTimes
 from ngo_recordings.definitions import message_definition
 from ngo_sim.episodes import record_episode
 from ngo_sim.maze2d import Maze2D
-from training.recorder import Recorder
+from training.recordings.recorder import Recorder
 
 from .processes import NodeProcess, wait_until
 

@@ -17,12 +17,12 @@ from rich.console import Console
 from sensor_msgs.msg import Image, LaserScan
 
 from ngo_estimator.checkpoint import write_untrained
-from ngo_estimator.local_odometry import RESTART_AFTER_NS
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS
 from ngo_estimator.nodes.messages import to_ns
 from ngo_estimator.nodes.run_recording import Arguments
 from ngo_estimator.nodes.run_recording import run as run_in_process
-from ngo_estimator.trajectory_file import read_tum
-from ngo_estimator.trajectory_report import trajectory_report
+from ngo_estimator.trajectory.files import read_tum
+from ngo_estimator.trajectory.report import trajectory_report
 from ngo_recordings.frames import UNUSABLE
 from ngo_recordings.recording import open_recording
 from ngo_recordings.topics import TopicArguments

@@ -13,12 +13,12 @@ from ngo_msgs.msg import RelativePose
 from PIL import Image as Picture
 from sensor_msgs.msg import CompressedImage, Image, LaserScan
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint, write_untrained
-from ngo_estimator.images import ImageFormat, scan_image
-from ngo_estimator.local_odometry import LocalOdometry
-from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_estimator.data.images import ImageFormat, scan_image
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.nodes.messages import to_ns, to_time
+from ngo_estimator.odometry.local_odometry import LocalOdometry
 
 from .processes import NodeProcess, Probe
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, write_untrained
-from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training import calibrate_covariance
 from training.calibrate_covariance import Arguments, normalized_errors
+from training.data.streams import simulate
+from training.data.worlds import VALIDATION_SEEDS, world_named
 from training.featurise import features_of
-from training.streams import simulate
-from training.worlds import VALIDATION_SEEDS, world_named
 
 FRAMES = 240
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ngo_estimator.compass import COMPASS, load_compass
-from training import streams, train_compass
+from ngo_estimator.networks.compass import COMPASS, load_compass
+from training import train_compass
+from training.data import streams
 
 
 class Killed(RuntimeError):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ngo_sim.episodes import Episode
-from training import evaluate_odometry, validation_steps
+from training import evaluate_odometry
 from training.evaluate_odometry import Arguments
-from training.validation_steps import true_steps
+from training.scoring import validation_steps
+from training.scoring.validation_steps import true_steps
 
 
 def test_a_heading_error_that_lasts_adds_up(

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from ngo_estimator.checkpoint import load_description, load_local
-from ngo_estimator.local_odometry import LocalOdometry
-from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.ros.processes import NodeProcess
-from training import runs
-from training.recorded import NO_LOOPS
+from training.common import runs
+from training.recordings.recording_source import NO_LOOPS
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(400)]
 

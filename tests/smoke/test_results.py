@@ -13,7 +13,6 @@ from tests.smoke import toy
 from training import (
     featurise,
     results,
-    streams,
     throughput,
     train_compass,
     train_end_to_end,
@@ -21,12 +20,12 @@ from training import (
     train_optimizer,
     train_place,
     tune_pose_graph,
-    worlds,
 )
+from training.data import streams, worlds
+from training.data.worlds import MazeSize, Table, world_named
 from training.featurise import open_store
-from training.metrics import trajectory_error
-from training.rows import ROWS, Sources, rows_of
-from training.worlds import MazeSize, Table, world_named
+from training.scoring.metrics import trajectory_error
+from training.scoring.table_rows import ROWS, Sources, rows_of
 
 STEPS = 160
 PREFIXES = (40, 77, STEPS)
@@ -114,7 +113,7 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
     networks = (train_compass, train_end_to_end, train_local, train_optimizer, train_place)
-    toy.refuse(monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.measured.scores")
+    toy.refuse(monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.scoring.error_cache.scores")
     assert results.main(arguments(folder), toy.scripts("maze2d", folder)) == result
 
 

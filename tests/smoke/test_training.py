@@ -28,13 +28,12 @@ from ngo_estimator.checkpoint import (
     load_place,
     load_smoother,
 )
-from ngo_estimator.local_odometry import LocalOdometry
-from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.smoke import toy
 from training import (
     evaluate,
     featurise,
-    runs,
     throughput,
     train_deepvo,
     train_end_to_end,
@@ -42,9 +41,10 @@ from training import (
     train_optimizer,
     train_place,
     train_smoother,
-    worlds,
 )
-from training.deepvo import DEEPVO
+from training.baselines.deepvo import DEEPVO
+from training.common import runs
+from training.data import worlds
 
 
 class Killed(RuntimeError):

@@ -11,9 +11,7 @@ import pytest
 from training import (
     evaluate,
     featurise,
-    prerequisites,
     results,
-    streams,
     throughput,
     train_compass,
     train_deepvo,
@@ -23,8 +21,9 @@ from training import (
     train_place,
     train_smoother,
     tune_pose_graph,
-    worlds,
 )
+from training.data import streams, worlds
+from training.report import prerequisites
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:

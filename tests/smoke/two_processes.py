@@ -15,7 +15,7 @@ from safetensors.torch import save
 
 from tests.smoke import toy
 from training import train_local
-from training.streams import Batch, PairStream
+from training.data.streams import Batch, PairStream
 
 
 def main(folder: Path) -> None:

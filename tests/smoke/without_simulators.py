@@ -29,12 +29,12 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
     """Run every script in turn at small size, and measure the estimator before and after."""
     import torch
 
-    from ngo_estimator import se2
+    from ngo_estimator.geometry import se2
     from training import evaluate, featurise, train_local, train_optimizer, train_place, train_smoother
-    from training.evaluate_recorded import with_origin
-    from training.metrics import trajectory_error
-    from training.recorded import RecordedArguments, open_recorded
-    from training.recorded_streams import RecordedSteps, track_pairs
+    from training.recordings.recording_source import RecordedArguments, open_recorded
+    from training.recordings.recording_streams import RecordedSteps, track_pairs
+    from training.scoring.metrics import trajectory_error
+    from training.scoring.recording_errors import with_origin
     from training.train_local import estimated, initial_network
 
     folder = Path(settings["folder"])

@@ -7,10 +7,10 @@ import pytest
 
 from benchmarks import drives
 from benchmarks.drives import Drive, drive_of, episodes, stamp_ns
-from ngo_estimator.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import record_episode
-from training.runs import WEIGHTS
-from training.worlds import world_named
+from training.common.runs import WEIGHTS
+from training.data.worlds import world_named
 
 
 def test_the_parts_of_a_drive_follow_each_other() -> None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks.peers import Incremental, LevenbergMarquardt, Problem, xyyaw
-from ngo_estimator import se2
+from ngo_estimator.geometry import se2
 
 SIDE, LAPS = 5, 3
 COUNT = 4 * SIDE * LAPS

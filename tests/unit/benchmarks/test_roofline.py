@@ -6,7 +6,7 @@ import torch
 from scipy.sparse import csc_matrix
 
 from benchmarks.roofline import Peak, Work, counted, measured_peak
-from ngo_estimator import normal_equations
+from ngo_estimator.optimizer import normal_equations
 
 
 def test_products_and_elementwise_operations_are_counted() -> None:

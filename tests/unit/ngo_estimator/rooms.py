@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ngo_estimator import se2
-from ngo_estimator.place_encoder import PairHead
-from ngo_estimator.scan_registration import RegistrationConfig
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.scan_registration import RegistrationConfig
+from ngo_estimator.networks.place_encoder import PairHead
 from tests.unit.ngo_estimator.samples import place_config
 
 RAYS = 241

@@ -4,12 +4,16 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
-from ngo_estimator.local_pose_network import LocalPoseConfig
-from ngo_estimator.loop_closure import Loops, LoopSearch
-from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig, OptimizedTrajectory
-from ngo_estimator.odometry_smoothing import SmootherConfig
-from ngo_estimator.place_encoder import PairHead, PlaceConfig
-from ngo_estimator.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig
+from ngo_estimator.networks.odometry_smoothing import SmootherConfig
+from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
+from ngo_estimator.optimizer.neural_graph_optimizer import (
+    NeuralGraphOptimizer,
+    NeuralGraphOptimizerConfig,
+    OptimizedTrajectory,
+)
 
 WORLDS = ["maze2d", "maze3d"]
 

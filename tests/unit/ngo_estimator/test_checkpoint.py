@@ -22,7 +22,7 @@ from ngo_estimator.checkpoint import (
     save_checkpoint,
     write_untrained,
 )
-from ngo_estimator.images import ImageFormat
+from ngo_estimator.data.images import ImageFormat
 
 LOADERS: dict[str, Callable[..., Any]] = {LOCAL: load_local, PLACE: load_place, OPTIMIZER: load_optimizer}
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ngo_estimator import se2
+from ngo_estimator.geometry import se2
 
 SHAPES = {"relative": 3, "log_std": 3, "motion": 6, "codes": 12, "origin_code": 12, "truth": 3}
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ngo_estimator.online_trajectory import OnlineTrajectory, optimize_offline
+from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_offline
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.online_estimate import online_poses
+from training.scoring.online_estimate import online_poses
 
 NAMES = ("relative", "log_std", "motion", "codes")
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import load_local, load_place, write_untrained
+from ngo_estimator.geometry import se2
 from training import featurise
-from training.domains import OTHER_TRAIN_STORE, TRAIN_STORE
-from training.driven import driven_in_table
+from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE
+from training.data.drive_plan import driven_in_table
+from training.data.streams import simulate
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, WORLDS
 from training.featurise import check_networks, driven_in, features_of, open_store
-from training.streams import simulate
-from training.worlds import OPTIMIZER_TRAIN_SEEDS, WORLDS
 
 from .stores import SHAPES
 

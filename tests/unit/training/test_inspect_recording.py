@@ -18,7 +18,7 @@ from ngo_recordings.recording import open_recording
 from ngo_recordings.topics import TopicArguments, choose_topics
 from tests.unit.ngo_recordings import messages as m
 from training.inspect_recording import Arguments, main
-from training.recording_report import Report, inspect, revisits
+from training.recordings.recording_report import Report, inspect, revisits
 
 S = 10**9
 ROOT = Path(__file__).parents[3]

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from training import results_page, tables
+from training.data.streams import simulate
+from training.data.worlds import world_named
 from training.featurise import _GROUP
-from training.maze_views import in_maze, maze_and_start
-from training.measured import Measured
-from training.metrics import seen_from_first
+from training.report import results_page, tables
+from training.report.maze_views import in_maze, maze_and_start
+from training.report.results_page import number, page
 from training.results import Arguments
-from training.results_page import number, page
-from training.scores import METRICS
-from training.streams import simulate
-from training.worlds import world_named
+from training.scoring.error_cache import Measured
+from training.scoring.metrics import seen_from_first
+from training.scoring.scores import METRICS
 
 WORLD = world_named("maze2d")
 KEYS = [metric.key for metric in METRICS["maze2d"]]

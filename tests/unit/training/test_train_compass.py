@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.compass import Compass, CompassConfig
-from ngo_estimator.lattice import reading_of
+from ngo_estimator.geometry.lattice import reading_of
+from ngo_estimator.networks.compass import Compass, CompassConfig
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.raycast import cast_rays
-from training import streams
-from training.streams import Batch, simulate
+from training.data import streams
+from training.data.streams import Batch, simulate
+from training.data.worlds import TRAIN_SEEDS, WORLDS
 from training.train_compass import Arguments, CompassStream, CompassTraining, lattice_errors, reading_metrics
-from training.worlds import TRAIN_SEEDS, WORLDS
 
 WORLD = WORLDS["maze2d"]
 

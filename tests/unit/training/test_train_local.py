@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint
-from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
-from training.recorded import RecordedArguments
-from training.streams import Batch
+from training.data.streams import Batch
+from training.data.worlds import WORLDS
+from training.recordings.recording_source import RecordedArguments
 from training.train_local import (
     HEADING_WEIGHT,
     Arguments,
@@ -26,7 +27,6 @@ from training.train_local import (
     stretch_losses,
     windows_within,
 )
-from training.worlds import WORLDS
 
 
 @pytest.fixture

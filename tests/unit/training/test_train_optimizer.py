@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import OPTIMIZER, load_optimizer, load_place, load_smoother, save_checkpoint
-from ngo_estimator.loop_closure import LoopSearch
+from ngo_estimator.geometry import se2
+from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.runs import WEIGHTS, RunError
+from training.common.runs import WEIGHTS, RunError
+from training.data.worlds import WORLDS, world_named
 from training.train_optimizer import (
     Arguments,
     Choices,
@@ -22,7 +23,6 @@ from training.train_optimizer import (
     main,
     trajectory_loss,
 )
-from training.worlds import WORLDS, world_named
 
 
 def test_a_world_says_what_suits_it() -> None:

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint, write_untrained
-from ngo_estimator.place_encoder import SeenRanges
-from ngo_estimator.scan_registration import RegistrationConfig
-from training.recorded import RecordedArguments
-from training.runs import RunError
+from ngo_estimator.geometry.scan_registration import RegistrationConfig
+from ngo_estimator.networks.place_encoder import SeenRanges
+from training.common.runs import RunError
+from training.data.worlds import world_named
+from training.recordings.recording_source import RecordedArguments
 from training.train_place import Arguments, PlaceTraining, initial_networks
-from training.worlds import world_named
 
 WORLD = world_named("maze3d")
 REGISTRATION = RegistrationConfig(9, 90.0, 0.01, odometry=False)

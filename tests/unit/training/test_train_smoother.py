@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import SMOOTHER, load_local, load_smoother, save_checkpoint, write_untrained
-from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from tests.unit.ngo_estimator.samples import small_optimizer, trajectory_inputs
-from training.recorded import RecordedArguments
-from training.runs import RunError
+from training.common.runs import RunError
+from training.data.worlds import world_named
+from training.recordings.recording_source import RecordedArguments
 from training.train_optimizer import Arguments, OptimizerTraining
 from training.train_smoother import Arguments as SmootherArguments
 from training.train_smoother import initial_smoother, smoothing_loss
-from training.worlds import world_named
 
 STEP_STD, META_STD = torch.tensor([0.01, 0.01, 0.004]), torch.tensor([0.05, 0.04, 0.02])
 

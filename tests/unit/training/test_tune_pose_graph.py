@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator import se2
 from ngo_estimator.checkpoint import SMOOTHER, load_local, save_checkpoint
-from ngo_estimator.compass_closure import frames_to_read
-from ngo_estimator.loop_closure import LoopSearch
-from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.optimizer.compass_closure import frames_to_read
+from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.samples import small_pair_head
-from training.compass_factors import found_fixes
-from training.pose_graph import PoseGraphSettings
-from training.prerequisites import is_tuned
-from training.rows import Sources
-from training.runs import WEIGHTS
+from training.baselines.compass_factors import found_fixes
+from training.baselines.pose_graph import PoseGraphSettings
+from training.common.runs import WEIGHTS
+from training.data.worlds import world_named
+from training.report.prerequisites import is_tuned
+from training.scoring.table_rows import Sources
 from training.tune_pose_graph import (
     COMPASS_GRID,
     GRID,
@@ -32,7 +33,6 @@ from training.tune_pose_graph import (
     main,
     tune,
 )
-from training.worlds import world_named
 
 START = PoseGraphSettings(odometry_position_scale=1.0, loop_position_scale=1.0, kernel="dcs")
 

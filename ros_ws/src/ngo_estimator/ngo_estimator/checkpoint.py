@@ -15,12 +15,12 @@ import safetensors
 from safetensors.torch import load, save
 from torch import nn
 
-from ngo_estimator.images import ImageFormat
-from ngo_estimator.local_pose_network import LocalPoseConfig, LocalPoseNetwork
-from ngo_estimator.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
-from ngo_estimator.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.place_encoder import PairHead, PlaceConfig, PlaceEncoder
-from ngo_estimator.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 
 FORMAT = 1
 LOCAL, PLACE, SMOOTHER, OPTIMIZER = (

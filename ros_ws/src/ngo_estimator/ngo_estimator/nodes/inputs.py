@@ -10,7 +10,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.status import NodeStatus
-from ngo_estimator.source_guard import SourceGuard
+from ngo_estimator.odometry.source_guard import SourceGuard
 
 # The graph learns of a publisher before it learns its node's name: nothing is said before that.
 _UNKNOWN = "a node of a name not known yet"

@@ -16,6 +16,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
+from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.parameters import LiveSettings
@@ -24,10 +25,9 @@ from ngo_estimator.nodes.qos import checked_overrides, overridable
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
-from ngo_estimator.planar_covariance import position_std, propagate
 
 if TYPE_CHECKING:
-    from ngo_estimator.local_odometry import LocalEstimate
+    from ngo_estimator.odometry.local_odometry import LocalEstimate
 
 NAME = "local_node"
 _ACTIONS = (DiscreteAction.FORWARD, DiscreteAction.TURN_LEFT, DiscreteAction.TURN_RIGHT)
@@ -46,9 +46,9 @@ class LocalNode(Node):
         self._live = LiveSettings(self, LocalNodeSettings)
         self._settings = settings = self._live.values
         # Imported here because torch takes seconds: a bad parameter is said at once.
-        from ngo_estimator.frame_pairing import FramePairing
-        from ngo_estimator.local_odometry import LocalOdometry
         from ngo_estimator.nodes.sensors import sensor_array, sensor_topic
+        from ngo_estimator.odometry.frame_pairing import FramePairing
+        from ngo_estimator.odometry.local_odometry import LocalOdometry
 
         self._core = load_core(LocalOdometry.load, settings)
         image_format = self._core.image_format

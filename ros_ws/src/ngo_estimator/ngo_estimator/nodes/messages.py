@@ -22,12 +22,12 @@ from std_msgs.msg import ColorRGBA, Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from ngo_estimator.planar_covariance import to_planar, to_spatial
+from ngo_estimator.geometry.planar_covariance import to_planar, to_spatial
 
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
-    from ngo_estimator.local_odometry import LocalEstimate
-    from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
-    from ngo_estimator.relative_step import RelativeStep
+    from ngo_estimator.data.relative_step import RelativeStep
+    from ngo_estimator.odometry.local_odometry import LocalEstimate
+    from ngo_estimator.online.online_trajectory import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
 _LOOP_WIDTH_M = 0.03
@@ -73,7 +73,7 @@ def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> Relativ
 
 def relative_step(message: RelativePose) -> "RelativeStep":
     """What ``OnlineTrajectory`` takes, from a message."""
-    from ngo_estimator.relative_step import RelativeStep
+    from ngo_estimator.data.relative_step import RelativeStep
 
     return RelativeStep(
         stamp_ns=to_ns(message.header.stamp),

@@ -20,6 +20,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
+from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.parameters import LiveSettings
@@ -29,11 +30,10 @@ from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.weights import load_core
-from ngo_estimator.planar_covariance import position_std
-from ngo_estimator.trajectory_file import edges_of, write_trajectory
+from ngo_estimator.trajectory.files import edges_of, write_trajectory
 
 if TYPE_CHECKING:
-    from ngo_estimator.online_trajectory import Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.online_trajectory import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
@@ -113,9 +113,9 @@ class NgoNode(LifecycleNode):
     def _configure(self) -> None:
         settings, built = self._settings, self._built
         # Imported here because torch takes seconds: a bad parameter is said at once.
-        from ngo_estimator.map_origin import MapOrigin
-        from ngo_estimator.online_trajectory import OnlineTrajectory
-        from ngo_estimator.tf_smoothing import SmoothedCorrection
+        from ngo_estimator.online.map_origin import MapOrigin
+        from ngo_estimator.online.online_trajectory import OnlineTrajectory
+        from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
         def load(folder: Path, world: str) -> OnlineTrajectory:
             return OnlineTrajectory.load(

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
+from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.planar_covariance import propagate
-from ngo_estimator.recording_run import RecordedRun, RecordedStep
-from ngo_estimator.trajectory_errors import aligned, associate
-from ngo_estimator.trajectory_file import SpatialPoses, write_trajectory
-from ngo_estimator.trajectory_plot import save_plot
-from ngo_estimator.trajectory_report import Report, ReportSettings, trajectory_report
+from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.trajectory.errors import aligned, associate
+from ngo_estimator.trajectory.files import SpatialPoses, write_trajectory
+from ngo_estimator.trajectory.plot import save_plot
+from ngo_estimator.trajectory.report import Report, ReportSettings, trajectory_report
 from ngo_recordings.writer import RecordingWriter
 
 ODOMETRY, POSE, TF = "/odom", "/ngo/pose", "/tf"

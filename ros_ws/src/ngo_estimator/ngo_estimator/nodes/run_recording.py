@@ -23,15 +23,15 @@ from ament_index_python.packages import get_package_share_directory
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ngo_estimator.trajectory_errors import KITTI_LENGTHS_M, RelativeDelta
-from ngo_estimator.trajectory_report import ReportSettings, remarks, report_table
+from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
+from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
 from ngo_recordings.images import SCAN_TYPE
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_topics
 
 if TYPE_CHECKING:
-    from ngo_estimator.local_odometry import LocalOdometry
-    from ngo_estimator.recording_run import RecordingRun
+    from ngo_estimator.odometry.local_odometry import LocalOdometry
+    from ngo_estimator.offline.recording_run import RecordingRun
 
 NAME = "run_recording"
 
@@ -111,9 +111,9 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         # Imported here because torch takes seconds: a file that is not there is said at once.
         import torch
 
-        from ngo_estimator.local_odometry import LocalOdometry
-        from ngo_estimator.online_trajectory import OnlineTrajectory
-        from ngo_estimator.recording_run import RecordingRun
+        from ngo_estimator.odometry.local_odometry import LocalOdometry
+        from ngo_estimator.offline.recording_run import RecordingRun
+        from ngo_estimator.online.online_trajectory import OnlineTrajectory
 
         torch.set_num_threads(1)
         folder = arguments.weights_folder
@@ -159,7 +159,7 @@ def _run(
 ) -> list[dict[str, Any]]:
     """Run over all frames; for each trajectory the folder of its results and how many poses it has."""
     from ngo_estimator.nodes.recorded_output import PART, RecordedOutput, remove_results
-    from ngo_estimator.recording_run import RecordedStep
+    from ngo_estimator.offline.recording_run import RecordedStep
     from ngo_recordings.frames import frames as frames_of
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

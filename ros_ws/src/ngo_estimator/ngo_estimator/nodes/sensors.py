@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image, LaserScan
 
-from ngo_estimator.images import ImageFormat
-from ngo_estimator.observations import observation
+from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.data.observations import observation
 from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, SCAN_TYPE, picture
 
 _TYPE_NAMES = {Image: IMAGE_TYPE, CompressedImage: COMPRESSED_TYPE, LaserScan: SCAN_TYPE}

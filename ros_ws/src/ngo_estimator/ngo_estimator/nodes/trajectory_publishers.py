@@ -17,10 +17,10 @@ from ngo_estimator.nodes.messages import loop_markers, trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.settings import NgoNodeSettings
-from ngo_estimator.publication_pace import PublicationPace
+from ngo_estimator.online.publication_pace import PublicationPace
 
 if TYPE_CHECKING:
-    from ngo_estimator.online_trajectory import Trajectory as WholeTrajectory
+    from ngo_estimator.online.online_trajectory import Trajectory as WholeTrajectory
 
 _DEPTH = 10
 

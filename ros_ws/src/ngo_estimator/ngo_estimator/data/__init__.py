@@ -1,0 +1,1 @@
+"""Records and buffers: images, observations, relative steps."""

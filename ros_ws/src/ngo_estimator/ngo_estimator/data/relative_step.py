@@ -1,0 +1,79 @@
+"""One step of the local odometry, as the online trajectory takes it, and what makes one unusable."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+RESTART_AFTER_NS = 1_000_000_000
+"""A stamp this far in the past means that the source restarted; anything less is a late frame."""
+
+LARGEST_VALUE = 1e4
+"""Largest size of a coordinate (m, rad), feature or code: beyond it the optimizer's float32 has no room to compute."""
+
+LARGEST_ODOMETRY = 1e9
+"""Largest size of a coordinate (m, rad) of the pose in ``odom``, which enters in float64 only."""
+
+
+class RejectedStep(ValueError):
+    """A relative pose that cannot be used; the trajectory is as it was before."""
+
+
+class DuplicateStep(RejectedStep):
+    """A step to the frame that is the newest already."""
+
+
+class LateStep(RejectedStep):
+    """A step to a frame that is a little older than the newest one."""
+
+
+@dataclass(frozen=True)
+class RelativeStep:
+    """Motion between two frames, as the local odometry has it.
+
+    ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
+    ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
+    ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
+    older one, which only the first step after a start has: of all others it came already.
+    """
+
+    stamp_ns: int
+    from_stamp_ns: int
+    relative_xyyaw: np.ndarray
+    covariance: np.ndarray
+    origin_stamp_ns: int
+    odom_xyyaw: np.ndarray
+    motion_feature: np.ndarray
+    place_code: np.ndarray
+    from_place_code: np.ndarray | None = field(default=None, kw_only=True)
+
+
+def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:
+    """Raise ``RejectedStep`` if a step cannot be used, whatever came before it.
+
+    Args:
+        motion_feature_size, code_length: lengths that are expected; None for place codes that are of no account.
+    """
+    vectors = {
+        "relative_xyyaw": (step.relative_xyyaw, (3,)),
+        "covariance": (step.covariance, (3, 3)),
+        "odom_xyyaw": (step.odom_xyyaw, (3,)),
+        "motion_feature": (step.motion_feature, (motion_feature_size,)),
+    }
+    if code_length is not None:
+        vectors["place_code"] = (step.place_code, (code_length,))
+        if step.from_place_code is not None:
+            vectors["from_place_code"] = (step.from_place_code, (code_length,))
+    for name, (value, shape) in vectors.items():
+        if value.shape != shape:
+            raise RejectedStep(f"{name} is of shape {value.shape}; expected {shape}")
+        if not np.isfinite(value).all():
+            raise RejectedStep(f"{name} has values that are not finite")
+        limit = LARGEST_ODOMETRY if name == "odom_xyyaw" else LARGEST_VALUE
+        if name != "covariance" and (largest := np.abs(value).max(initial=0.0)) > limit:
+            raise RejectedStep(f"{name} has values as large as {largest:g}; expected at most {limit:g}")
+    if not (np.diagonal(step.covariance) > 0.0).all():
+        raise RejectedStep(
+            f"covariance has the variances {np.diagonal(step.covariance).tolist()}; expected positive ones"
+        )
+    if step.from_stamp_ns >= step.stamp_ns:
+        raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")

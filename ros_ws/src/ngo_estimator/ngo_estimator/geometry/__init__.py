@@ -1,0 +1,1 @@
+"""Planar geometry: poses, covariances, registration of range scans."""

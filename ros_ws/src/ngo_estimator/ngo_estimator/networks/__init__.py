@@ -1,0 +1,1 @@
+"""The learned networks: local pose, place encoder, aggregation, smoothing."""

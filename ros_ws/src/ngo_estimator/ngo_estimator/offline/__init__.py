@@ -1,0 +1,1 @@
+"""Whole recordings through both estimators, without ROS."""

@@ -1,0 +1,169 @@
+"""Both estimators over the frames of a recording, as the live nodes compute without their middleware (no ROS here)."""
+
+from array import array
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.data.observations import observation
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS
+from ngo_estimator.odometry.frame_pairing import FramePairing
+from ngo_estimator.odometry.local_odometry import (
+    DuplicateFrame,
+    LateFrame,
+    LocalEstimate,
+    LocalOdometry,
+)
+from ngo_estimator.online.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
+from ngo_estimator.trajectory.files import SpatialPoses, seconds
+from ngo_recordings.frames import Frame
+
+_REASONS: dict[type[ValueError], str] = {
+    DuplicateFrame: "the stamp came twice",
+    LateFrame: "older than the frame before",
+}
+
+
+@dataclass(frozen=True)
+class RecordedStep:
+    """What came out of one frame: its motion since the frame before, and the trajectory after it."""
+
+    local: LocalEstimate
+    update: TrajectoryUpdate
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """A whole trajectory, and the truth about its frames, where there is any.
+
+    ``truth_residual`` ``(frames, 3)`` is what the projection to the plane leaves out of the truth (z m, roll rad, pitch
+    rad).
+    """
+
+    trajectory: Trajectory
+    truth: SpatialPoses | None
+    truth_residual: np.ndarray
+
+
+class RecordingRun:
+    """Feeds frames through both cores as the nodes do with messages.
+
+    Args:
+        local, online: the cores, which begin anew.
+        action_timeout_ns, action_capacity: as in ``FramePairing``.
+        scan_yaw_rad: where a scanner's angle 0 points, counter-clockwise from straight ahead.
+    """
+
+    def __init__(
+        self,
+        local: LocalOdometry,
+        online: OnlineTrajectory,
+        action_timeout_ns: int = 1_000_000_000,
+        action_capacity: int = 64,
+        scan_yaw_rad: float = 0.0,
+    ) -> None:
+        self._local, self._online, self._scan_yaw_rad = local, online, scan_yaw_rad
+        self._pairing = FramePairing(local.uses_action, action_timeout_ns, action_capacity, local.uses_twist)
+        self.frames = 0
+        """Frames that came."""
+        self.rejected: Counter[str] = Counter()
+        """Frames that were not used, by the reason."""
+        self.examples: dict[str, str] = {}
+        """For each reason the first such frame, in words."""
+        self.gaps = 0
+        """Steps that span more than the usual time between two frames."""
+
+    def run(self, frames: Iterable[Frame]) -> Iterator[RecordedStep | RecordedRun]:
+        """Every step, and after the last one of a trajectory the whole of it.
+
+        A recording whose stamps jump back by a second or more holds several trajectories.
+
+        Raises:
+            ValueError: frames that cannot be used lie between two whose odometry is too far apart to go on; live, the
+                trajectory would begin anew.
+        """
+        self._local.reset()
+        self._online.reset()
+        self._pairing.reset()
+        truth, before_ns = _Truth(), None
+        for frame in frames:
+            self.frames += 1
+            if before_ns is not None and frame.stamp_ns <= before_ns - RESTART_AFTER_NS:
+                yield from self._finished(truth)
+                truth, before_ns = _Truth(), None
+            # What led to a frame, stamped as in the messages: an action at the frame before, a velocity up to its own.
+            if frame.action is not None and before_ns is not None and before_ns < frame.stamp_ns:
+                self._pairing.add_action(before_ns, frame.action)
+            if frame.twist_xyyaw is not None:
+                self._pairing.add_twist(frame.stamp_ns, frame.twist_xyyaw)
+            before_ns = frame.stamp_ns if before_ns is None else max(before_ns, frame.stamp_ns)
+            if not self._taken(frame):
+                continue
+            truth.add(frame)
+            yield from self._steps()
+        yield from self._finished(truth)
+        if missing := self._pairing.dropped + self._pairing.waiting:
+            self.rejected["no action or velocity led to it"] = missing
+
+    def _taken(self, frame: Frame) -> bool:
+        """Whether the frame is of the right kind and size, and newer than those before."""
+        try:
+            image = observation(self._local.image_format, frame.image, frame.scan, self._scan_yaw_rad)
+            self._pairing.add_frame(frame.stamp_ns, image)
+        except ValueError as error:
+            self._reject(_REASONS.get(type(error), "not usable"), f"{seconds(frame.stamp_ns)} s: {error}")
+            return False
+        return True
+
+    def _steps(self) -> Iterator[RecordedStep]:
+        for pair in self._pairing.ready():
+            try:
+                local = self._local.update(pair.stamp_ns, pair.image, pair.action, pair.twist)
+                if local is None:
+                    continue
+                update = self._online.update(local)
+            except ValueError as error:
+                self._reject("not usable", f"{seconds(pair.stamp_ns)} s: {error}")
+                continue
+            if update.restarted:
+                raise ValueError(
+                    f"the odometry goes too far from one frame to the next at {seconds(local.stamp_ns)} s: split the "
+                    "recording there, or use weights that know this robot"
+                )
+            self.gaps += update.gap or local.missed_frames > 0
+            yield RecordedStep(local, update)
+
+    def _reject(self, reason: str, example: str) -> None:
+        self.rejected[reason] += 1
+        self.examples.setdefault(reason, example)
+
+    def _finished(self, truth: "_Truth") -> Iterator[RecordedRun]:
+        """The trajectory that ends here, if there is one."""
+        self._online.finish()
+        trajectory = self._online.trajectory()
+        self._local.reset()
+        self._online.reset()
+        if trajectory is not None:
+            yield RecordedRun(trajectory, *truth.poses())
+
+
+class _Truth:
+    """The true poses of the frames of one trajectory, a few bytes each."""
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._values = array("d")
+
+    def add(self, frame: Frame) -> None:
+        if frame.pose_xyyaw is not None:
+            residual = np.zeros(3) if frame.pose_residual is None else frame.pose_residual
+            self._stamps_ns.append(frame.stamp_ns)
+            self._values.extend((*frame.pose_xyyaw, *residual))
+
+    def poses(self) -> tuple[SpatialPoses | None, np.ndarray]:
+        values = np.array(self._values).reshape(-1, 6)
+        if len(values) == 0:
+            return None, values[:, 3:]
+        return SpatialPoses.from_planar(np.array(self._stamps_ns), values[:, :3]), values[:, 3:]

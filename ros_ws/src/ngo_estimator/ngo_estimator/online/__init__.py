@@ -1,0 +1,1 @@
+"""From relative poses to the corrected trajectory, while they arrive."""

@@ -1,0 +1,1 @@
+"""The Neural Graph Optimizer: loops, gates, Gauss-Newton."""

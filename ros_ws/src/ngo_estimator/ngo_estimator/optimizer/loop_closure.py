@@ -1,0 +1,316 @@
+"""Loop closures: candidates from place codes, their residuals, and the correction that they ask for.
+
+Not in the paper, whose attention has to learn all this. A loop says where a meta-pose lies relative to an earlier
+frame.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor, nn
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.scan_registration import Scans
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.optimizer.gauss_newton import pick
+
+VIEWS = ((0, 0), (-4, -4), (4, -4), (-2, -2), (2, -2), (-4, 0), (4, 0), (0, -3), (0, -6))
+"""Steps from the frames of a candidate to those of its views: at the earlier frame, and at the later one."""
+
+_REWEIGHTINGS = 3
+SMALLEST_SPREAD = 1e-4  # m or rad
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """Which pairs of frames become loop candidates.
+
+    ``per_pose`` candidates for each meta-pose, at least ``min_separation`` meta-poses older and more than
+    ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief. Each
+    is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
+    place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
+    With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
+    """
+
+    per_pose: int = 4
+    most: int = 512
+    min_separation: int = 6
+    min_apart: int = 1
+    views: int = 5
+    registrations: int = 0
+    overlaps: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
+            raise ValueError(
+                f"per_pose, most, min_separation, min_apart are {self.per_pose}, {self.most}, {self.min_separation}, "
+                f"{self.min_apart}; expected at least 1, 1, 1, 0"
+            )
+        if not 1 <= self.views <= len(VIEWS):
+            raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
+        if self.registrations < 0:
+            raise ValueError(f"registrations is {self.registrations}; expected 0 (none) or more")
+        if self.overlaps < 0 or (self.overlaps and not self.registrations):
+            raise ValueError(
+                f"overlaps, registrations are {self.overlaps}, {self.registrations}; expected 0 (none) or more, and "
+                "with overlaps steps in which they are registered"
+            )
+
+
+@dataclass(frozen=True)
+class Loops:
+    """Loop candidates of a batch, ``(batch, loops)`` each.
+
+    ``start`` indexes the global meta-poses with the origin in front: the measurement starts at the pose before
+    meta-step ``start`` and ends at the pose after meta-step ``end``, so the meta-steps ``start .. end`` lie on the
+    loop. ``measured`` ``(batch, loops, 3)`` is the end's pose in the frame of the start, ``log_scale`` ``(batch,
+    loops, 2)`` the logarithm of its scale (position in m, heading in rad), ``spread`` ``(batch, loops, 2)`` the
+    logarithm of how far its views disagree (m, rad), ``logit`` the belief that it is the same place, ``similarity`` the
+    inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false for fill. ``embeddings``
+    ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
+
+    ``length`` ``(batch, loops)`` counts the meta-poses on a loop, where those between its ends stand for several each;
+    ``most_drift`` ``(batch, loops, 3)`` is how far at most its residual varies by what is known without it. ``scans``
+    are the frames' ranges, where overlaps are still to be looked for.
+    """
+
+    start: Tensor
+    end: Tensor
+    frame: Tensor
+    measured: Tensor
+    log_scale: Tensor
+    spread: Tensor
+    logit: Tensor
+    similarity: Tensor
+    valid: Tensor
+    embeddings: Tensor
+    length: Tensor | None = None
+    most_drift: Tensor | None = None
+    scans: Scans | None = None
+
+    def and_also(self, others: "Loops") -> "Loops":
+        """These and, behind them, others of the same trajectories; both without ``length`` and ``most_drift``."""
+        names = ("start", "end", "frame", "measured", "log_scale", "spread", "logit", "similarity", "valid")
+        both = {name: torch.cat((getattr(self, name), getattr(others, name)), dim=1) for name in names}
+        return Loops(**both, embeddings=self.embeddings)  # type: ignore[arg-type]
+
+    @cached_property
+    def description(self) -> Tensor:
+        """What gates see of each loop beside its residual ``(batch, loops, 6)``: the same under all poses."""
+        beliefs = torch.stack((self.similarity, self.logit / 5.0), dim=-1)
+        return torch.cat((beliefs, self.log_scale, self.spread - self.log_scale), dim=-1)
+
+    @cached_property
+    def log_length(self) -> Tensor:
+        """Logarithm of how many meta-poses lie on each loop ``(batch, loops)``."""
+        length = self.end - self.start + 1 if self.length is None else self.length
+        return torch.log(length.to(self.measured.dtype))
+
+    @cached_property
+    def nodes(self) -> Tensor:
+        """The two poses of each loop ``(batch, loops, 2)``, as indices of the meta-poses with the origin in front."""
+        return torch.stack((self.start, self.end + 1), dim=-1)
+
+
+def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: LoopSearch) -> Loops:
+    """For each meta-pose the most similar earlier frames, measured by the pair head.
+
+    The choice has no gradient, what is measured has.
+
+    Args:
+        codes: place codes ``(batch, steps, code_length)`` of the frame after each step.
+        in_blocks: poses within blocks ``(batch, blocks, block, 3)``.
+    """
+    block = in_blocks.shape[2]
+    embeddings = pair_head.embed(codes)
+    at_ends = embeddings[:, block - 1 :: block]
+    with torch.no_grad():
+        similarity, frame, end = _most_similar(at_ends, embeddings, block, search)
+        # The pair head is the costly part: it sees only what is most similar, twice as many as can be kept.
+        keep = similarity.topk(min(2 * search.most, similarity.shape[1]), dim=-1).indices
+        similarity, frame, end = (value.gather(1, keep) for value in (similarity, frame, end))
+    measured, log_scale, logit = pair_head(pick(codes, frame), pick(codes[:, block - 1 :: block], end))
+    logit = logit.masked_fill(similarity < _NONE / 2.0, -1e4)
+    keep = logit.topk(min(search.most, logit.shape[1]), dim=-1).indices.sort(dim=-1).values
+    frame, end, logit, similarity = (value.gather(1, keep) for value in (frame, end, logit, similarity))
+    measured, log_scale = pick(measured, keep), pick(log_scale, keep)
+    last = end * block + block - 1
+    spread = torch.full_like(log_scale, math.log(SMALLEST_SPREAD))
+    if search.views > 1:
+        seen = (measured, log_scale)
+        measured, log_scale, spread = fused_measurements(pair_head, codes, in_blocks, frame, last, search.views, seen)
+    if search.registrations:
+        pair = pick(codes, frame), pick(codes, last)
+        measured, log_scale = pair_head.register(*pair, measured, log_scale, search.registrations)
+    return Loops(
+        # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
+        start=torch.minimum(frame // block, end),
+        end=end,
+        frame=frame,
+        measured=se2.compose(pick(in_blocks.flatten(1, 2), frame), measured),
+        log_scale=log_scale,
+        spread=spread,
+        logit=logit.clamp(min=-20.0),
+        similarity=similarity,
+        valid=logit > -1e3,
+        embeddings=at_ends,
+        scans=pair_head.scans(codes) if search.overlaps else None,
+    )
+
+
+def fused_measurements(
+    pair_head: PairHead,
+    codes: Tensor,
+    in_blocks: Tensor,
+    earlier: Tensor,
+    later: Tensor,
+    views: int,
+    first: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Measure each candidate from several pairs of frames near it, and fuse them robustly.
+
+    Errors of the pair head change from frame to frame, those of the odometry over so few steps are small.
+
+    Args:
+        earlier, later: the frames of each candidate ``(batch, loops)``.
+        first: pose and logarithm of scales of the frames themselves, where they were measured already.
+
+    Returns:
+        As ``fuse_views``.
+    """
+    steps = codes.shape[1]
+    poses = frame_odometry(in_blocks)
+    start = pick(poses, earlier)
+    results, log_scales = [], []
+    for number, (at_earlier, at_later) in enumerate(VIEWS[:views]):
+        a = (earlier + at_earlier).clamp(0, steps - 1)
+        b = (later + at_later).clamp(0, steps - 1)
+        if number == 0 and first is not None:
+            measured, log_scale = first
+        else:
+            measured, log_scale, _ = pair_head(pick(codes, a), pick(codes, b))
+        measured = se2.compose(se2.between(start, pick(poses, a)), measured)
+        results.append(se2.compose(measured, se2.between(pick(poses, b), pick(poses, later))))
+        log_scales.append(log_scale)
+    return fuse_views(torch.stack(results), torch.stack(log_scales))
+
+
+def fuse_views(measured: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Fuse measurements of the same pair of frames robustly.
+
+    Args:
+        measured: ``(views, ..., 3)``; log_scale: logarithm of their scales ``(views, ..., 2)``.
+
+    Returns:
+        Pose of the later frame in the earlier one ``(..., 3)``, logarithm of its scales ``(..., 2)`` as if the views
+        erred independently, and logarithm of their spread ``(..., 2)``.
+    """
+    precision = torch.exp(-2.0 * log_scale)
+    error = se2.wrapped(measured - measured[0])
+    weight, mean = precision, torch.zeros_like(measured[0])
+    for _ in range(_REWEIGHTINGS + 1):
+        by_component = weight[..., [0, 0, 1]]
+        mean = (by_component * error).sum(0) / by_component.sum(0)
+        left = (error - mean).square()
+        squares = torch.stack((left[..., 0] + left[..., 1], left[..., 2]), dim=-1)
+        weight = precision / (1.0 + 0.25 * precision * squares)
+    spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=SMALLEST_SPREAD).log()
+    return se2.wrapped(measured[0] + mean), -0.5 * weight.sum(0).log(), spread
+
+
+def frame_odometry(in_blocks: Tensor) -> Tensor:
+    """Global poses ``(batch, steps, 3)`` of all frames by odometry."""
+    ends = se2.r2g(in_blocks[..., -1, :])
+    starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
+    return se2.compose(starts.unsqueeze(2), in_blocks).flatten(1, 2)
+
+
+_NONE = -4.0  # the similarity of what is no candidate
+
+
+def _most_similar(at_ends: Tensor, embeddings: Tensor, block: int, search: LoopSearch) -> tuple[Tensor, Tensor, Tensor]:
+    """Similarity, earlier frame and later meta-pose ``(batch, blocks * per_pose)`` of the candidates."""
+    batch, blocks = at_ends.shape[:2]
+    similarity = (at_ends @ embeddings.mT).unflatten(-1, (blocks, block))
+    best, best_step = similarity.max(dim=-1)
+    index = torch.arange(blocks, device=at_ends.device)
+    best = best.masked_fill(index[:, None] - index < search.min_separation, _NONE)
+    values, chosen = each_from_elsewhere(best, min(search.per_pose, blocks), search.min_apart, _NONE)
+    frames = chosen * block + best_step.gather(-1, chosen)
+    return values.flatten(1), frames.flatten(1), index.repeat_interleave(chosen.shape[-1]).expand(batch, -1)
+
+
+def each_from_elsewhere(values: Tensor, count: int, apart: int, none: float) -> tuple[Tensor, Tensor]:
+    """The ``count`` best of each row ``(..., n)``, and their indices, both ``(..., count)``.
+
+    Neighbours of one would say the same again: the next one is more than ``apart`` away, or ``none``.
+    """
+    index = torch.arange(values.shape[-1], device=values.device)
+    chosen = []
+    for _ in range(count):
+        top = values.max(dim=-1, keepdim=True)
+        chosen.append((top.values, top.indices))
+        values = values.masked_fill((index - top.indices).abs() <= apart, none)
+    best, at = (torch.cat(parts, dim=-1) for parts in zip(*chosen, strict=True))
+    return best, at
+
+
+def loop_residuals(loops: Loops, poses: Tensor) -> Tensor:
+    """Measured minus current relative pose ``(batch, loops, 3)``, positions along the axes of the map.
+
+    Args:
+        poses: global meta-poses with the origin in front ``(batch, blocks + 1, 3)``.
+    """
+    start, end = pick(poses, loops.start), pick(poses, loops.end + 1)
+    xy = start[..., :2] + se2.rotate(start[..., 2], loops.measured[..., :2]) - end[..., :2]
+    yaw = se2.wrap(start[..., 2] + loops.measured[..., 2] - end[..., 2])
+    return torch.cat((xy, yaw.unsqueeze(-1)), dim=-1)
+
+
+def odometry_variances(start: Tensor, end: Tensor, poses: Tensor, step_variance: Tensor) -> Tensor:
+    """Variances ``(batch, n, 3)``, float64, of poses as seen from earlier ones by odometry alone.
+
+    A turn of a meta-step swings the end about the pose behind that step; cross-correlations are dropped.
+
+    Args:
+        start, end: nodes ``(batch, n)``, the earlier and the later pose.
+        poses: global meta-poses with the origin in front ``(batch, blocks + 1, 3)``.
+        step_variance: of the relative meta-poses ``(batch, blocks, 3)``, along the axes of the earlier pose.
+    """
+    # Sums over a loop are differences of prefix sums, of which float32 would leave too few digits.
+    poses, step_variance = poses.double(), step_variance.double()
+    along_x = torch.cos(poses[:, :-1, 2]).square()
+    position_x = along_x * step_variance[..., 0] + (1.0 - along_x) * step_variance[..., 1]
+    position_y = step_variance[..., :2].sum(-1) - position_x
+    position = torch.stack((position_x, position_y), dim=-1)
+    turn, at = step_variance[..., 2:], poses[:, 1:, :2]
+    lever = turn * at
+    terms = torch.cat((position, turn, lever, lever * at), dim=-1)
+    prefix = nn.functional.pad(terms.cumsum(1), (0, 0, 1, 0))
+    both = pick(prefix, torch.cat((end, start), dim=1))
+    position, turn, lever, squares = (both[:, : end.shape[1]] - both[:, end.shape[1] :]).split((2, 1, 2, 2), dim=-1)
+    at_end = pick(poses, end)[..., :2]
+    across = at_end * (at_end * turn - 2.0 * lever) + squares
+    return torch.cat((position + across.flip(-1), turn), dim=-1).clamp(min=0.0)
+
+
+def spread_over_span(loops: Loops, values: Tensor, weights: Tensor, blocks: int) -> tuple[Tensor, Tensor]:
+    """Spread a value of each loop evenly over its meta-steps, and average over the loops.
+
+    Args:
+        values: ``(batch, loops, channels)``; weights: ``(batch, loops)``.
+
+    Returns:
+        Weighted mean of value / length ``(batch, blocks, channels)`` and sum of weights ``(batch, blocks, 1)``.
+    """
+    length = (loops.end - loops.start + 1).unsqueeze(-1)
+    weights = weights.unsqueeze(-1)
+    payload = torch.cat((values / length * weights, weights), dim=-1)
+    edges = payload.new_zeros(payload.shape[0], blocks + 1, payload.shape[2])
+    index = torch.cat((loops.start, loops.end + 1), dim=1).unsqueeze(-1).expand(-1, -1, payload.shape[2])
+    edges = edges.scatter_add(1, index, torch.cat((payload, -payload), dim=1))
+    spread = edges.cumsum(dim=1)[:, :-1]
+    total = spread[..., -1:].clamp(min=0.0)
+    return spread[..., :-1] / (total + 1e-3), total

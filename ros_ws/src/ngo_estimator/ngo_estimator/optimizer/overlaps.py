@@ -1,0 +1,168 @@
+"""Loops between frames that see the same walls, where the poses say so: looked for once poses have been corrected.
+
+Not in the paper. A place is told by how it looks, from much the same pose. Two frames that face each other along a
+corridor look nothing alike, and yet share its walls; with poses good enough to know that, their ranges are registered,
+as scan matching back ends do (Hess et al. 2016).
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans, register
+from ngo_estimator.optimizer.gauss_newton import pick
+from ngo_estimator.optimizer.loop_closure import (
+    VIEWS,
+    Loops,
+    LoopSearch,
+    each_from_elsewhere,
+    frame_odometry,
+    fuse_views,
+)
+
+OVERLAP_LOGIT = 4.0
+"""Belief in a loop that was found by poses: what registers is taken for right, and kernels judge it by its residual."""
+
+OVERLAP_VIEWS = VIEWS[:5]
+"""Pairs of frames, near the two of an overlap, between which it is measured."""
+
+LEAST_SHARED = 0.25
+"""Share of the rays that must agree before two frames are registered."""
+
+_DRIFT_M, _DRIFT_RAD = 0.5, math.radians(5.0)
+"""Deviations of a relative pose that a registration starts from."""
+
+_AGREEING = 5.0
+"""Ranges agree that differ by so many of their deviations, and half of the drift."""
+
+_EVERY = 3
+"""One of so many rays tells whether frames share what they see."""
+
+_ERRING_TOGETHER = 3.0
+"""A fused measurement's deviations in units of what its views say: rays of one picture, and views, err together."""
+
+
+def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Tensor, search: LoopSearch) -> Loops:
+    """Loops between meta-poses whose frames share what they see; no gradient goes through it.
+
+    For each meta-pose there are at most ``search.per_pose``, and ``search.overlaps`` of a trajectory: those that share
+    most, as far apart from each other and in time as ``search`` has all loops.
+
+    Args:
+        in_blocks: poses within blocks ``(batch, blocks, block, 3)`` by odometry.
+        nodes: meta-poses as they are now, the origin in front ``(batch, blocks + 1, 3)``.
+        embeddings: of the frames at the ends of the meta-poses ``(batch, blocks, embedding_size)``.
+    """
+    batch, blocks, block = in_blocks.shape[:3]
+    config = scans.registration
+    with torch.no_grad():
+        nodes, ends = nodes[:, 1:].float(), scans.ranges[:, block - 1 :: block]
+        shared = _shared(config, ends, nodes, search.min_separation)
+        share, earlier = each_from_elsewhere(shared, min(search.per_pose, blocks), search.min_apart, -1.0)
+        later = torch.arange(blocks, device=nodes.device).repeat_interleave(share.shape[-1]).expand(batch, -1)
+        share, earlier = share.flatten(1), earlier.flatten(1)
+        keep = share.topk(min(search.overlaps, share.shape[1]), dim=-1).indices
+        share, earlier, later = (values.gather(1, keep) for values in (share, earlier, later))
+        odometry = frame_odometry(in_blocks.float())
+        frame, last = (at * block + block - 1 for at in (earlier, later))
+        end = blocks * block - 1
+        views = [((frame + a).clamp(0, end), (last + b).clamp(0, end)) for a, b in OVERLAP_VIEWS]
+        measured, log_scale, spread, found = measure_overlaps(
+            config,
+            torch.stack([pick(scans.ranges, a) for a, _ in views]),
+            torch.stack([pick(scans.ranges, b) for _, b in views]),
+            torch.stack([se2.between(pick(odometry, frame), pick(odometry, a)) for a, _ in views]),
+            torch.stack([se2.between(pick(odometry, b), pick(odometry, last)) for _, b in views]),
+            se2.between(pick(nodes, earlier), pick(nodes, later)),
+            search.registrations,
+        )
+        similarity = (pick(embeddings, earlier) * pick(embeddings, later)).sum(-1)
+    valid = found & (share >= LEAST_SHARED)
+    loops = Loops(
+        start=torch.where(valid, earlier + 1, later),
+        end=later,
+        frame=frame,
+        measured=measured,
+        log_scale=log_scale,
+        spread=spread,
+        logit=torch.full_like(share, OVERLAP_LOGIT),
+        similarity=similarity,
+        valid=valid,
+        embeddings=embeddings,
+    )
+    return loops if scans.known is None else scans.known(loops)
+
+
+def _shared(config: RegistrationConfig, ranges: Tensor, poses: Tensor, min_separation: int) -> Tensor:
+    """What each frame shares with each earlier one ``(batch, frames, frames)``, negative where that is not asked for.
+
+    Args:
+        ranges: ``(batch, frames, rays)``; poses: ``(batch, frames, 3)``.
+    """
+    batch, frames = poses.shape[:2]
+    index = torch.arange(frames, device=poses.device)
+    far = torch.cdist(poses[..., :2], poses[..., :2])
+    seen_m = ranges.amax(dim=-1)
+    near = (far < torch.minimum(seen_m.unsqueeze(-1), seen_m.unsqueeze(-2))) & (
+        index[:, None] - index >= min_separation
+    )
+    which, later, earlier = near.nonzero(as_tuple=True)
+    relative = se2.between(poses[which, earlier], poses[which, later])
+    shared = poses.new_full((batch, frames, frames), -1.0)
+    shared[which, later, earlier] = shared_views(config, ranges[which, earlier], ranges[which, later], relative)
+    return shared
+
+
+def shared_views(config: RegistrationConfig, a: Tensor, b: Tensor, relative: Tensor) -> Tensor:
+    """Share of the rays ``(n,)`` that end where the other frame sees a wall as well: the smaller one of both.
+
+    Args:
+        a, b: ranges ``(n, rays)`` in m, 0 where nothing is known; relative: pose of ``b`` in the frame of ``a``
+            ``(n, 3)``.
+    """
+    return torch.minimum(_seen_again(config, a, b, relative), _seen_again(config, b, a, se2.inverse(relative)))
+
+
+def _seen_again(config: RegistrationConfig, a: Tensor, b: Tensor, relative: Tensor) -> Tensor:
+    half = math.radians(config.field_of_view_deg) / 2.0
+    some = config.angles_rad.to(b)[::_EVERY]
+    ranges = b[:, ::_EVERY]
+    points = ranges.unsqueeze(-1) * torch.stack((some.cos(), some.sin()), dim=-1)
+    seen = se2.rotate(relative[:, 2:], points) + relative[:, None, :2]
+    at = ((half - torch.atan2(seen[..., 1], seen[..., 0])) * (config.rays - 1) / (2.0 * half)).round()
+    inside = (at >= 0.0) & (at <= config.rays - 1) & (ranges > 0.0)
+    there = a.gather(1, at.clamp(0, config.rays - 1).long())
+    tolerance = 0.5 * _DRIFT_M + _AGREEING * (config.noise_m + config.noise_share * there)
+    meets = inside & (there > 0.0) & ((seen.norm(dim=-1) - there).abs() < tolerance)
+    return meets.to(b.dtype).mean(-1)
+
+
+def measure_overlaps(
+    config: RegistrationConfig, a: Tensor, b: Tensor, from_a: Tensor, to_b: Tensor, start: Tensor, steps: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Register frames near the two of each overlap, and fuse what they say.
+
+    Args:
+        a, b: ranges ``(views, ..., rays)`` of frames near the earlier and near the later one.
+        from_a: poses ``(views, ..., 3)`` of the one as seen from the earlier frame; to_b: those of the later frame as
+            seen from the other.
+        start: pose of the later frame in the earlier one ``(..., 3)``, as far as it is known.
+        steps: steps of each registration.
+
+    Returns:
+        The pose ``(..., 3)``, logarithms of its deviations and of how far the views disagree ``(..., 2)``, and whether
+        most views were registered ``(...)``.
+    """
+    # In the digits of a registration: what it leaves alone has to be found the same.
+    from_a, to_b, start = from_a.float(), to_b.float(), start.float()
+    guess = se2.compose(se2.compose(se2.inverse(from_a), start), se2.inverse(to_b))
+    drift = guess.new_tensor([_DRIFT_M, _DRIFT_RAD]).log().expand(*guess.shape[:-1], 2)
+    measured, after = register(config, a, b, guess, drift, steps)
+    registered = (after != drift).any(-1)
+    # What was not registered says nothing.
+    after = torch.where(registered.unsqueeze(-1), after, drift + math.log(100.0))
+    measured, log_scale, spread = fuse_views(se2.compose(se2.compose(from_a, measured), to_b), after)
+    most = registered.to(start.dtype).mean(0) > 0.5
+    return measured, log_scale + math.log(_ERRING_TOGETHER), spread, most

@@ -1,0 +1,1 @@
+"""Files, errors, reports and plots of trajectories."""

@@ -1,0 +1,225 @@
+"""Trajectories as text files that evo, GTSAM and others read: TUM, KITTI and g2o.
+
+| Ending | What a file holds |
+|---|---|
+| ``.tum``, ``.txt`` | a pose a line, ``timestamp tx ty tz qx qy qz qw`` (s, m) |
+| ``.kitti`` | a pose a line, the upper 3 x 4 of its matrix, row by row |
+| ``.g2o`` | ``VERTEX_SE2`` for each pose, ``EDGE_SE2`` for each measurement between two of them |
+
+The KITTI format has no place for stamps: they lie beside it in ``NAME.times.txt``, a line each, in seconds. Its poses
+are those of the robot's base (x forward, y left), as in the other formats; KITTI's own are of a camera.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ENDINGS = (".tum", ".txt", ".kitti", ".g2o")
+TUM_ENDINGS = (".tum", ".txt")
+
+_NS = 1_000_000_000
+_KITTI, _TIMES = ".kitti", ".times.txt"
+
+
+@dataclass(frozen=True)
+class PoseEdges:
+    """Measurements between the poses of a trajectory.
+
+    ``frames`` ``(edges, 2)`` index its poses; ``relative_xyyaw`` ``(edges, 3)`` is the second one in the frame of the
+    first, ``std`` ``(edges, 3)`` its standard deviations (m, m, rad).
+    """
+
+    frames: np.ndarray
+    relative_xyyaw: np.ndarray
+    std: np.ndarray
+
+    def __post_init__(self) -> None:
+        edges = len(self.frames)
+        given = self.frames.shape, self.relative_xyyaw.shape, self.std.shape
+        if given != ((edges, 2), (edges, 3), (edges, 3)):
+            raise ValueError(f"frames, relative_xyyaw, std are of shapes {given}; expected (n, 2), (n, 3), (n, 3)")
+        if not ((self.std > 0.0) & np.isfinite(self.std)).all():
+            raise ValueError("std has values that are not positive; expected the standard deviation of each edge")
+
+
+@dataclass(frozen=True)
+class SpatialPoses:
+    """Poses in space: ``stamps_ns`` ``(n,)`` int64, ``positions_xyz`` ``(n, 3)`` m, ``quaternions_xyzw`` ``(n, 4)``."""
+
+    stamps_ns: np.ndarray
+    positions_xyz: np.ndarray
+    quaternions_xyzw: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def from_planar(cls, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> "SpatialPoses":
+        """Poses ``(n, 3)`` of the plane z = 0."""
+        half_yaw, zero = 0.5 * poses_xyyaw[:, 2], np.zeros(len(poses_xyyaw))
+        return cls(
+            np.asarray(stamps_ns),
+            np.column_stack((poses_xyyaw[:, :2], zero)),
+            np.column_stack((zero, zero, np.sin(half_yaw), np.cos(half_yaw))),
+        )
+
+    def planar(self) -> np.ndarray:
+        """Poses ``(n, 3)`` seen from above: x, y, and the heading of the forward axis."""
+        x, y, z, w = self.quaternions_xyzw.T
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return np.column_stack((self.positions_xyz[:, :2], yaw))
+
+
+def write_trajectory(
+    path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges] = ()
+) -> list[Path]:
+    """Write a trajectory in the format that the file's ending says, all at once or not at all.
+
+    Args:
+        path: a file that ends in one of ``ENDINGS``, in a folder that exists.
+        stamps_ns: ``(frames,)`` int64.
+        poses_xyyaw: ``(frames, 3)``.
+        edges: what g2o files hold beside the poses.
+
+    Returns:
+        The files written: ``path``, and for ``.kitti`` the one of the stamps.
+
+    Raises:
+        ValueError: another ending, or no pose to write.
+        OSError: a file cannot be written; those that were there before still are.
+    """
+    if path.suffix not in ENDINGS:
+        raise ValueError(f"file is '{path}'; allowed: a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if len(stamps_ns) == 0:
+        raise ValueError("the trajectory is empty; nothing was written")
+    if len(stamps_ns) != len(poses_xyyaw):
+        raise ValueError(f"stamps are {len(stamps_ns)} and poses {len(poses_xyyaw)}; expected as many")
+    if path.suffix == _KITTI:
+        times = (seconds(stamp) for stamp in stamps_ns.tolist())
+        return _write_together({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
+    if path.suffix in TUM_ENDINGS:
+        return _write_together({path: _tum_lines(stamps_ns, poses_xyyaw)})
+    return _write_together({path: _g2o_lines(poses_xyyaw, edges)})
+
+
+def seconds(stamp_ns: int) -> str:
+    """A stamp in seconds, to the nanosecond."""
+    # Stamps of today have 19 digits in ns, more than a float64 holds: seconds and nanoseconds are written as integers.
+    return f"{stamp_ns // _NS}.{stamp_ns % _NS:09d}"
+
+
+def write_tum(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> None:
+    """Write the TUM format, as ``write_trajectory`` does."""
+    if path.suffix not in TUM_ENDINGS:
+        raise ValueError(f"file is '{path}'; allowed: a name that ends in {' or '.join(TUM_ENDINGS)}")
+    write_trajectory(path, stamps_ns, poses_xyyaw)
+
+
+def edges_of(trajectory: Any) -> list[PoseEdges]:
+    """The measurements that a ``Trajectory`` of ``OnlineTrajectory`` was made of: steps of the odometry, and loops.
+
+    Steps are as the local network measured them; what an optimizer makes of them (smoothing, adjustments, how far each
+    may bend) is in the poses alone.
+    """
+    import torch  # takes seconds, and the nodes import this module before they check their parameters
+
+    from ngo_estimator.geometry import se2
+
+    odometry = torch.tensor(trajectory.odometry_xyyaw)
+    relative = se2.between(odometry[:-1], odometry[1:]).numpy()
+    frames = np.arange(len(relative))
+    steps = PoseEdges(np.column_stack((frames, frames + 1)), relative, trajectory.odometry_std)
+    return [steps, PoseEdges(trajectory.loops, trajectory.loop_relative_xyyaw, trajectory.loop_std)]
+
+
+def read_tum(path: Path) -> SpatialPoses:
+    """Read a file in the TUM format; lines that begin with ``#`` are comments.
+
+    Raises:
+        ValueError: a line that is not eight finite numbers, an orientation of no length, a stamp that is not later
+            than the one before it, or no pose at all; it names file and line.
+        OSError: the file cannot be read.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        try:
+            stamp, row = Decimal(words[0]), [float(word) for word in words[1:]]
+        except (InvalidOperation, ValueError):
+            raise ValueError(f"{where} is '{line[:80]}'; expected numbers: timestamp tx ty tz qx qy qz qw") from None
+        if len(row) != 7 or not stamp.is_finite() or not np.isfinite(row).all():
+            raise ValueError(f"{where} has {len(words)} numbers; expected 8 that are finite")
+        if not np.linalg.norm(row[3:]) > 0.0:
+            raise ValueError(f"{where} has the orientation 0 0 0 0; expected a quaternion qx qy qz qw")
+        stamps.append(int((stamp * _NS).to_integral_value()))
+        if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
+            raise ValueError(f"{where} has the stamp {words[0]}; expected one later than in the line before")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path} has no poses; expected lines of timestamp tx ty tz qx qy qz qw")
+    values = np.array(rows)
+    quaternions = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    return SpatialPoses(np.array(stamps, np.int64), values[:, :3], quaternions)
+
+
+def _tum_lines(stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Iterator[str]:
+    half_yaw = 0.5 * poses_xyyaw[:, 2]
+    values = np.column_stack((poses_xyyaw[:, :2], np.sin(half_yaw), np.cos(half_yaw)))
+    for stamp, (x, y, qz, qw) in zip(stamps_ns.tolist(), values.tolist(), strict=True):
+        yield f"{seconds(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
+
+
+def _kitti_lines(poses_xyyaw: np.ndarray) -> Iterator[str]:
+    values = np.column_stack((poses_xyyaw[:, :2], np.cos(poses_xyyaw[:, 2]), np.sin(poses_xyyaw[:, 2])))
+    for x, y, cos, sin in values.tolist():
+        yield f"{cos!r} {-sin!r} 0 {x!r} {sin!r} {cos!r} 0 {y!r} 0 0 1 0"
+
+
+def _g2o_lines(poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges]) -> Iterator[str]:
+    for index, (x, y, yaw) in enumerate(poses_xyyaw.tolist()):
+        yield f"VERTEX_SE2 {index} {x!r} {y!r} {yaw!r}"
+    for part in edges:
+        if part.frames.size and not 0 <= part.frames.min() <= part.frames.max() < len(poses_xyyaw):
+            raise ValueError(
+                f"edges join the frames {part.frames.min()} to {part.frames.max()}; "
+                f"expected 0 to {len(poses_xyyaw) - 1}"
+            )
+        information = part.std**-2.0
+        values = zip(part.frames.tolist(), part.relative_xyyaw.tolist(), information.tolist(), strict=True)
+        for (first, second), (x, y, yaw), (of_x, of_y, of_yaw) in values:
+            yield f"EDGE_SE2 {first} {second} {x!r} {y!r} {yaw!r} {of_x!r} 0 0 {of_y!r} 0 {of_yaw!r}"
+
+
+def _write_together(contents: Mapping[Path, Iterator[str]]) -> list[Path]:
+    """Write all files beside their places, and move them there only when each is on the disk."""
+    written: dict[Path, str] = {}
+    try:
+        for path, lines in contents.items():
+            handle, written[path] = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+            with os.fdopen(handle, "w") as file:
+                file.writelines(f"{line}\n" for line in lines)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(written[path], 0o644)  # mkstemp's own 0600 would hide the result from others
+        for path in contents:
+            os.replace(written[path], path)
+            del written[path]
+    except OSError as error:
+        if error.errno is None:
+            raise
+        # It names the file beside the one that was asked for.
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        for left in written.values():
+            os.unlink(left)
+    return list(contents)

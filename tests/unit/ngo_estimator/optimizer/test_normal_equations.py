@@ -1,0 +1,66 @@
+"""The sparse normal equations against the dense ones."""
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator.optimizer.gauss_newton import Factors, gauss_newton_step, node_covariance
+from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
+from tests.unit.ngo_estimator.samples import optimized, small_optimizer, trajectory_inputs
+from tests.unit.ngo_estimator.optimizer.test_gauss_newton import BLOCKS, random_graph
+
+
+def equations(factors: list[Factors]) -> NormalEquations:
+    nodes = torch.cat([f.nodes[0] for f in factors]).numpy()
+    return NormalEquations(factors, GraphStructure(nodes, BLOCKS + 1))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_steps_and_covariances_are_the_dense_ones(seed: int) -> None:
+    _, factors = random_graph(seed)
+    sparse = equations(factors)
+    assert torch.allclose(sparse.step(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
+    for node in (1, 5, BLOCKS):
+        expected = node_covariance(factors, BLOCKS + 1, node)[0].numpy()
+        np.testing.assert_allclose(sparse.covariance([node]), expected, rtol=1e-8, atol=1e-14)
+
+
+def test_the_joint_covariance_holds_those_of_single_poses_in_the_order_asked_for() -> None:
+    _, factors = random_graph()
+    sparse = equations(factors)
+    joint = sparse.covariance([7, 2])
+    np.testing.assert_allclose(joint[:3, :3], sparse.covariance([7]), rtol=1e-9)
+    np.testing.assert_allclose(joint[3:, 3:], sparse.covariance([2]), rtol=1e-9)
+    np.testing.assert_array_equal(joint, joint.T)
+    assert np.abs(joint[:3, 3:]).max() > 0.0
+    assert np.linalg.eigvalsh(joint)[0] > 0.0
+
+
+def test_one_structure_serves_all_steps_of_an_optimisation() -> None:
+    _, factors = random_graph()
+    structure = GraphStructure(torch.cat([f.nodes[0] for f in factors]).numpy(), BLOCKS + 1)
+    for gain in (1.0, 0.1, 1e-6):
+        weaker = [
+            factors[0],
+            Factors(factors[1].nodes, factors[1].jacobian, factors[1].residual, gain * factors[1].information),
+        ]
+        step = NormalEquations(weaker, structure).step()
+        assert torch.allclose(step, gauss_newton_step(weaker, BLOCKS + 1), rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("form", ["loops", "gauss_newton"])
+def test_with_and_without_gradients_the_optimizer_gives_the_same(form: str) -> None:
+    optimizer, inputs = small_optimizer(form, trained=True), trajectory_inputs(1, 160)
+    with torch.no_grad():
+        sparse = optimized(optimizer, inputs)
+    dense = optimized(optimizer, inputs)
+    assert sparse.equations is not None and dense.equations is None
+    assert torch.allclose(sparse.poses, dense.poses, atol=1e-5)
+    assert not torch.allclose(sparse.meta_relative[-1], sparse.meta_relative[0], atol=1e-4)
+    # The sparse one is linearised before the last step, which random weights leave large.
+    optimizer = small_optimizer(form, iterations=10)
+    with torch.no_grad():
+        sparse = optimized(optimizer, inputs)
+    dense = optimized(optimizer, inputs)
+    ends = [result.end_covariance()[0].diagonal() for result in (sparse, dense)]
+    assert torch.allclose(ends[0], ends[1], rtol=0.1)

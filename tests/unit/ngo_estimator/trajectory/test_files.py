@@ -1,0 +1,182 @@
+"""Trajectory files: what others read from them, and that they are written at once or not at all."""
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import gtsam
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry import se2
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.trajectory.files import ENDINGS, PoseEdges, SpatialPoses, edges_of, read_tum, write_trajectory
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
+
+STAMPS_NS = np.array([0, 1_700_000_000_057_142_857, 1_700_000_000_114_285_714], dtype=np.int64)
+POSES = np.array([[0.0, 0.0, 0.0], [1.25, -0.5, 0.5 * np.pi], [1.5, 2.0, -3.0]])
+ODOMETRY = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5 * np.pi], [1.0, 2.0, np.pi]])
+TRAJECTORY = SimpleNamespace(
+    odometry_xyyaw=ODOMETRY,
+    odometry_std=np.array([[0.1, 0.2, 0.5], [0.1, 0.2, 0.25]]),
+    loops=np.array([[0, 2]]),
+    loop_relative_xyyaw=np.array([[0.5, 1.5, -3.0]]),
+    loop_std=np.array([[0.5, 0.5, 0.1]]),
+)
+
+
+@pytest.mark.parametrize("name", ["path.tum", "path.txt"])
+def test_evo_reads_tum(tmp_path: Path, name: str) -> None:
+    assert write_trajectory(tmp_path / name, STAMPS_NS, POSES) == [tmp_path / name]
+    trajectory = file_interface.read_tum_trajectory_file(str(tmp_path / name))
+    np.testing.assert_allclose(trajectory.timestamps, STAMPS_NS / 1e9)
+    np.testing.assert_array_equal(trajectory.positions_xyz, np.column_stack((POSES[:, :2], np.zeros(3))))
+    yaw = 2.0 * np.arctan2(trajectory.orientations_quat_wxyz[:, 3], trajectory.orientations_quat_wxyz[:, 0])
+    np.testing.assert_allclose(np.cos(yaw - POSES[:, 2]), 1.0)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_tum_stamps_keep_every_nanosecond(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "path.tum", STAMPS_NS, POSES)
+    stamps = [line.split()[0] for line in (tmp_path / "path.tum").read_text().splitlines()]
+    assert stamps == ["0.000000000", "1700000000.057142857", "1700000000.114285714"]
+
+
+def test_evo_reads_kitti_and_the_times_lie_beside(tmp_path: Path) -> None:
+    files = write_trajectory(tmp_path / "path.kitti", STAMPS_NS, POSES)
+    assert files == [tmp_path / "path.times.txt", tmp_path / "path.kitti"] and set(tmp_path.iterdir()) == set(files)
+    poses = file_interface.read_kitti_poses_file(str(tmp_path / "path.kitti")).poses_se3
+    for matrix, (x, y, yaw) in zip(poses, POSES, strict=True):
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        expected = [[cos, -sin, 0.0, x], [sin, cos, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        np.testing.assert_allclose(matrix, expected, atol=1e-15)
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "path.times.txt"), STAMPS_NS / 1e9)
+
+
+def test_gtsam_reads_g2o(tmp_path: Path) -> None:
+    path = tmp_path / "path.g2o"
+    assert write_trajectory(path, STAMPS_NS, POSES, edges_of(TRAJECTORY)) == [path]
+    graph, values = gtsam.readG2o(str(path), False)
+    assert values.size() == len(POSES) and graph.size() == 3
+    for index, (x, y, yaw) in enumerate(POSES):
+        assert values.atPose2(index).equals(gtsam.Pose2(x, y, yaw), 1e-12)
+    keys, information = [], []
+    for k, relative in enumerate([(1.0, 0.0, 0.5 * np.pi), (2.0, 0.0, 0.5 * np.pi), (0.5, 1.5, -3.0)]):
+        factor = graph.at(k)
+        keys.append(tuple(factor.keys()))
+        assert factor.measured().equals(gtsam.Pose2(*relative), 1e-12)
+        information.append(factor.noiseModel().information())
+    assert keys == [(0, 1), (1, 2), (0, 2)]
+    np.testing.assert_allclose(information, [np.diag(d) for d in ((100, 25, 4), (100, 25, 16), (4, 4, 100))], rtol=1e-9)
+
+
+def test_the_edges_of_a_trajectory_are_its_odometry_and_loops(tmp_path: Path) -> None:
+    core = OnlineTrajectory(small_optimizer(trained=True), small_pair_head(), 64)
+    relative, log_std, motion, codes = (values[0].double() for values in trajectory_inputs(1, 80))
+    odometry = se2.r2g(relative).numpy()
+    for k in range(80):
+        place, feature = codes[k].float().numpy(), motion[k].float().numpy()
+        covariance = np.diag(np.exp(2.0 * log_std[k].numpy()))
+        core.update(RelativeStep(k + 1, k, relative[k].numpy(), covariance, 0, odometry[k], feature, place))
+    trajectory = core.trajectory()
+    assert trajectory is not None and len(trajectory.loops) > 0
+    steps, loops = edges_of(trajectory)
+    np.testing.assert_allclose(steps.relative_xyyaw, relative.numpy(), atol=1e-6)
+    np.testing.assert_allclose(steps.std, np.exp(log_std.numpy()), rtol=1e-5)
+    assert (loops.frames[:, 0] < loops.frames[:, 1]).all() and len(loops.frames) == len(trajectory.loop_weights)
+    write_trajectory(tmp_path / "path.g2o", trajectory.stamps_ns, trajectory.poses_xyyaw, [steps, loops])
+    graph, values = gtsam.readG2o(str(tmp_path / "path.g2o"), False)
+    assert (values.size(), graph.size()) == (81, 80 + len(loops.frames))
+
+
+def test_g2o_without_edges_has_the_poses_alone(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "path.g2o", STAMPS_NS, POSES)
+    graph, values = gtsam.readG2o(str(tmp_path / "path.g2o"), False)
+    assert (values.size(), graph.size()) == (3, 0)
+
+
+def test_edges_that_make_no_sense_are_errors(tmp_path: Path) -> None:
+    far = PoseEdges(np.array([[0, 3]]), np.zeros((1, 3)), np.ones((1, 3)))
+    with pytest.raises(ValueError, match="frames 0 to 3; expected 0 to 2"):
+        write_trajectory(tmp_path / "path.g2o", STAMPS_NS, POSES, [far])
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="not positive"):
+        PoseEdges(np.array([[0, 1]]), np.zeros((1, 3)), np.zeros((1, 3)))
+    with pytest.raises(ValueError, match=r"expected \(n, 2\)"):
+        PoseEdges(np.array([0, 1]), np.zeros((2, 3)), np.ones((2, 3)))
+
+
+def test_tum_is_read_back_exactly(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    poses = np.column_stack((rng.normal(0.0, 100.0, (50, 2)), rng.uniform(-np.pi, np.pi, 50)))
+    stamps_ns = 1_700_000_000_000_000_001 + np.arange(50) * 57_142_857
+    write_trajectory(tmp_path / "path.tum", stamps_ns, poses)
+    read = read_tum(tmp_path / "path.tum")
+    np.testing.assert_array_equal(read.stamps_ns, stamps_ns)
+    np.testing.assert_array_equal(read.planar()[:, :2], poses[:, :2])
+    np.testing.assert_allclose(read.planar()[:, 2], poses[:, 2], atol=1e-15)
+    np.testing.assert_allclose(read.quaternions_xyzw, SpatialPoses.from_planar(stamps_ns, poses).quaternions_xyzw)
+
+
+def test_tum_of_others_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "other.txt"
+    path.write_text("\ufeff# a comment\n\n1.5e0 1 2 3 0 0 0.5 0.5\n 2.000000001\t1 2 3 0.5 0.5 0.5 0.5\n")
+    read = read_tum(path)
+    assert read.stamps_ns.tolist() == [1_500_000_000, 2_000_000_001] and len(read) == 2
+    np.testing.assert_allclose(np.linalg.norm(read.quaternions_xyzw, axis=1), 1.0)
+    # Half a turn and a third about all axes: x forward becomes y.
+    np.testing.assert_allclose(read.planar(), [[1.0, 2.0, 0.5 * np.pi], [1.0, 2.0, 0.5 * np.pi]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 0 0 0 0 0 1\n", "line 1 has 7 numbers; expected 8"),
+        ("# c\n1 0 0 0 0 0 0 x\n", "line 2 is '1 0 0 0 0 0 0 x'; expected numbers"),
+        ("1 0 0 nan 0 0 0 1\n", "expected 8 that are finite"),
+        ("inf 0 0 0 0 0 0 1\n", "expected 8 that are finite"),
+        ("1 0 0 0 0 0 0 0\n", "orientation 0 0 0 0"),
+        ("1 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", "line 2 has the stamp 1.0; expected one later"),
+        ("# nothing\n", "has no poses"),
+    ],
+)
+def test_what_is_not_tum_is_an_error_that_names_the_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.tum").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_tum(tmp_path / "bad.tum")
+
+
+def test_other_endings_and_empty_trajectories_are_errors(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"path\.csv'; allowed: a name that ends in \.tum, \.txt, \.kitti or \.g2o"):
+        write_trajectory(tmp_path / "path.csv", STAMPS_NS, POSES)
+    with pytest.raises(ValueError, match="empty"):
+        write_trajectory(tmp_path / "path.tum", STAMPS_NS[:0], POSES[:0])
+    with pytest.raises(ValueError, match="expected as many"):
+        write_trajectory(tmp_path / "path.tum", STAMPS_NS[:2], POSES)
+    with pytest.raises(FileNotFoundError):
+        write_trajectory(tmp_path / "nowhere" / "path.tum", STAMPS_NS, POSES)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("failing", ["os.fsync", "os.replace"])
+def test_a_failed_write_leaves_the_old_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, failing: str
+) -> None:
+    write_trajectory(tmp_path / f"path{ending}", STAMPS_NS, POSES, edges_of(TRAJECTORY))
+    before = {path: path.read_text() for path in tmp_path.iterdir()}
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(failing, fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_trajectory(tmp_path / f"path{ending}", STAMPS_NS[:1], POSES[:1])
+    assert {path: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+def test_others_may_read_the_file(tmp_path: Path) -> None:
+    (path,) = write_trajectory(tmp_path / "path.tum", STAMPS_NS, POSES)
+    assert os.stat(path).st_mode & 0o777 == 0o644

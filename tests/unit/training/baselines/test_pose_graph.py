@@ -1,0 +1,241 @@
+"""The classical pose graph against graphs solved by hand, and on laps around a square whose truth is known."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.lattice import reading_of
+from ngo_estimator.optimizer.compass_closure import CompassFixes, frames_to_read
+from ngo_estimator.optimizer.loop_closure import LoopSearch
+from training.baselines.compass_factors import found_fixes
+from training.baselines.loop_factors import LoopFactors, exact_revisits
+from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
+
+PLAIN = PoseGraphSettings(
+    odometry_position_scale=1.0,
+    odometry_heading_scale=1.0,
+    loop_position_scale=1.0,
+    loop_heading_scale=1.0,
+    kernel="none",
+    drift_m=0.0,
+)
+SEARCH = LoopSearch(per_pose=1, most=200)
+NO_LOOPS = LoopFactors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
+
+
+def laps(count: int, side_steps: int = 32) -> np.ndarray:
+    """True steps ``(steps, 3)`` of laps around a square of 3.2 m; each of its corners is turned in one step."""
+    side = np.tile([0.1, 0.0, 0.0], (side_steps, 1))
+    side[-1, 2] = np.pi / 2.0
+    return np.tile(side, (4 * count, 1))
+
+
+def driven(steps: np.ndarray) -> np.ndarray:
+    return se2.r2g(torch.from_numpy(steps)).numpy()
+
+
+def noisy(steps: np.ndarray, std: float) -> np.ndarray:
+    """Odometry that is off by chance, and turns a little too far with every step."""
+    return steps + np.random.default_rng(0).normal(0.0, std, steps.shape) * [1.0, 0.3, 0.5] + [0.0, 0.0, 0.1 * std]
+
+
+def stds(steps: np.ndarray, std: float) -> np.ndarray:
+    return np.full(steps.shape, np.log(std))
+
+
+def rmse(poses: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.sqrt(np.square(poses - truth)[:, :2].sum(-1).mean()))
+
+
+def one_loop(start: int, end: int, measured: list[float], scale: float, logit: float = 5.0) -> LoopFactors:
+    log_scale = np.log([[scale, scale]])
+    return LoopFactors(np.array([start]), np.array([end]), np.array([measured]), log_scale, np.array([logit]))
+
+
+def together(a: LoopFactors, b: LoopFactors) -> LoopFactors:
+    return LoopFactors(*(np.concatenate((vars(a)[name], vars(b)[name])) for name in vars(a)))
+
+
+@pytest.mark.parametrize(
+    ("scales", "end_m"),
+    [
+        # Two steps and the loop share the 0.3 m that it is longer, by their variances.
+        ({}, 2.0 + 0.3 * 2.0 / 3.0),
+        ({"odometry_position_scale": 2.0}, 2.0 + 0.3 * 8.0 / 9.0),
+        ({"loop_position_scale": 2.0}, 2.0 + 0.3 * 2.0 / 6.0),
+    ],
+)
+def test_a_graph_solved_by_hand(scales: dict[str, float], end_m: float) -> None:
+    steps = np.tile([0.125, 0.0, 0.0], (16, 1))  # two meta-steps of 1 m
+    log_std = stds(steps, 0.05 / np.sqrt(8.0))  # of 0.05 m each
+    poses = optimize(steps, log_std, one_loop(0, 1, [2.3, 0.0, 0.0], 0.05), replace(PLAIN, **scales))
+    assert poses.dtype == np.float64
+    np.testing.assert_allclose(poses[:, 0], np.arange(1, 17) / 16 * end_m, atol=1e-6)
+    np.testing.assert_allclose(poses[:, 1:], 0.0, atol=1e-6)
+
+
+def test_a_turn_is_shared_like_a_length() -> None:
+    steps = np.zeros((16, 3))
+    log_std = stds(steps, 0.05 / np.sqrt(8.0))
+    poses = optimize(steps, log_std, one_loop(0, 1, [0.0, 0.0, 0.3], 0.05), PLAIN)
+    np.testing.assert_allclose(poses[:, 2], np.arange(1, 17) / 16 * 0.2, atol=1e-6)
+
+
+def test_without_loops_the_odometry_stays_as_calibrated() -> None:
+    steps = noisy(laps(1), 0.02)
+    settings = replace(PLAIN, odometry_gain=(2.0, 1.0, 1.0), odometry_bias=(0.0, 0.0, 0.01))
+    expected = driven(steps * [2.0, 1.0, 1.0] + [0.0, 0.0, 0.01])
+    np.testing.assert_allclose(optimize(steps, stds(steps, 0.02), NO_LOOPS, settings), expected, atol=1e-6)
+
+
+def test_a_loop_that_is_not_believed_does_nothing() -> None:
+    steps = laps(1)
+    loop = one_loop(0, 15, [1.0, 1.0, 0.0], 0.01, logit=-0.1)
+    odometry = driven(steps)
+    np.testing.assert_allclose(optimize(steps, stds(steps, 0.02), loop, PLAIN), odometry, atol=1e-6)
+    believed = optimize(steps, stds(steps, 0.02), loop, replace(PLAIN, min_logit=-0.2))
+    assert rmse(believed, odometry) > 0.1
+
+
+@pytest.mark.parametrize("kernel", ["none", "dcs", "cauchy"])
+def test_exact_loops_carry_an_exact_first_lap_over_to_the_others(kernel: Any) -> None:
+    steps = laps(3)
+    truth, first = driven(steps), len(steps) // 3
+    odometry, log_std = noisy(steps, 0.03), stds(steps, 0.03)
+    odometry[:first], log_std[:first] = steps[:first], np.log(1e-5)
+    loops = exact_revisits(truth, SEARCH)
+    poses = optimize(odometry, log_std, loops, replace(PLAIN, kernel=kernel))
+    ends = slice(7, None, 8)  # between meta-poses the odometry's own noise remains
+    assert rmse(driven(odometry)[ends], truth[ends]) > 0.5
+    assert rmse(poses[ends], truth[ends]) < 1e-3
+
+
+@pytest.mark.parametrize("kernel", ["cauchy", "geman_mcclure", "dcs"])
+def test_a_robust_kernel_rejects_a_false_loop(kernel: Any) -> None:
+    steps = laps(3)
+    truth = driven(steps)
+    odometry, log_std = noisy(steps, 0.01), stds(steps, 0.01)
+    loops = exact_revisits(truth, SEARCH)
+    loops = replace(loops, log_scale=np.full_like(loops.log_scale, np.log(0.02)))
+    # Opposite corners of the square as one place.
+    wrong = together(loops, one_loop(8, 31, [0.0, 0.0, 0.0], 0.02))
+    right = rmse(optimize(odometry, log_std, loops, PLAIN), truth)
+    assert rmse(optimize(odometry, log_std, wrong, PLAIN), truth) > 5.0 * right
+    robust = replace(PLAIN, kernel=kernel, kernel_width=3.0)
+    assert rmse(optimize(odometry, log_std, wrong, robust), truth) < 1.2 * right
+
+
+def test_perfect_loops_are_a_bound() -> None:
+    steps = laps(3)
+    truth = driven(steps)
+    odometry, log_std = noisy(steps, 0.02), stds(steps, 0.02)
+    settings = replace(PLAIN, search=SEARCH)
+    exact = optimize_exact(odometry, log_std, truth, settings)
+    np.testing.assert_array_equal(exact, optimize(odometry, log_std, exact_revisits(truth, SEARCH), settings))
+    loops = exact_revisits(truth, SEARCH)
+    errors = np.random.default_rng(1).normal(0.0, 0.2, loops.measured.shape)
+    measured = replace(loops, measured=loops.measured + errors, log_scale=np.full_like(loops.log_scale, np.log(0.2)))
+    found = optimize(odometry, log_std, measured, settings)
+    assert rmse(exact, truth) < rmse(found, truth) < rmse(driven(odometry), truth)
+
+
+def test_the_same_input_gives_the_same_output() -> None:
+    steps = laps(2)
+    odometry, loops = noisy(steps, 0.02), exact_revisits(driven(steps), SEARCH)
+    results = [optimize(odometry, stds(steps, 0.02), loops, PoseGraphSettings()) for _ in range(2)]
+    np.testing.assert_array_equal(*results)
+
+
+def fixes_of(truth: np.ndarray, odometry: np.ndarray, lattice: list[float], block_m: float) -> CompassFixes:
+    """What a compass reads in a lattice of this pose: good to 1 cm and 0.6 degrees, or (a tenth) anything at all."""
+    rng = np.random.default_rng(3)
+    poses = torch.from_numpy(np.concatenate((np.zeros((1, 3)), truth)))[frames_to_read(len(truth), 8)]
+    exact = reading_of(se2.between(torch.tensor(lattice, dtype=torch.float64), poses), block_m).numpy()
+    wrong = rng.random(len(exact)) < 0.1
+    error = rng.laplace(0.0, 0.01, exact.shape)
+    error[wrong] = rng.uniform(-0.5, 0.5, (wrong.sum(), 3)) * [block_m, block_m, np.pi / 2.0]
+    log_scale = np.full((1, len(exact), 2), np.log(0.01))
+    return found_fixes((exact + error)[None], log_scale, odometry[None], stds(odometry, 0.01)[None], 8, block_m)[0]
+
+
+@pytest.mark.parametrize("lattice", [[0.0, 0.0, 0.0], [0.3, -0.2, 0.6], [0.1, 0.4, 2.2]])
+@pytest.mark.parametrize("block_m", [1.0, 1.5])
+def test_a_compass_takes_the_drift_away(lattice: list[float], block_m: float) -> None:
+    steps = laps(4)
+    truth = driven(steps)
+    odometry, log_std = noisy(steps, 0.01), stds(steps, 0.01)
+    compass = fixes_of(truth, odometry, lattice, block_m)
+    assert rmse(driven(odometry), truth) > 0.5
+    assert rmse(optimize(odometry, log_std, NO_LOOPS, replace(PLAIN, kernel="dcs"), compass), truth) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"odometry_position_scale": 0.0}, r"odometry_position_scale is 0\.0; expected a positive number"),
+        ({"loop_heading_scale": -1.0}, "loop_heading_scale is -1"),
+        ({"kernel_width": float("inf")}, "kernel_width is inf"),
+        ({"compass_kernel_width": float("nan")}, "compass_kernel_width is nan"),
+        ({"kernel": "l2"}, "kernel is 'l2'; expected none or one of huber, cauchy, geman_mcclure, dcs"),
+        ({"min_logit": float("nan")}, "min_logit is nan"),
+        ({"odometry_gain": (1.0, 1.0)}, "odometry_gain is .* expected three finite numbers"),
+        ({"odometry_bias": (0.0, 0.0, float("nan"))}, "odometry_bias is .* expected three finite numbers"),
+        ({"compass_rounds": 0}, "compass_rounds is 0; expected at least 1"),
+        ({"block": 0}, "block is 0; expected at least 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PoseGraphSettings(**change)
+
+
+def test_what_does_not_fit_together_is_refused() -> None:
+    steps = laps(1)
+    with pytest.raises(ValueError, match="do not divide into blocks"):
+        optimize(steps[:-1], stds(steps[:-1], 0.02), NO_LOOPS, PLAIN)
+
+
+def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measurements_allow() -> None:
+    """Exact loops of a millimetre, an odometry that is decimetres off, and a third of the loops wrong."""
+    rng = np.random.default_rng(0)
+    steps, turn = 320, 2.0 * np.pi / 80.0
+    true_steps = np.tile([0.1, 0.0, turn], (steps, 1))
+    truth = se2.r2g(torch.from_numpy(true_steps)).numpy()
+    odometry = true_steps + np.array([0.0, 0.0, 0.004])
+    loops = exact_revisits(truth, LoopSearch(per_pose=2, most=500), 8)
+    measured = loops.measured.copy()
+    wrong = rng.random(len(measured)) < 0.33
+    measured[wrong] += rng.uniform(-2.0, 2.0, (int(wrong.sum()), 3))
+    loops = replace(loops, measured=measured)
+    errors = {}
+    for drift_m in (0.0, 1.0):
+        settings = PoseGraphSettings(drift_m=drift_m, kernel="geman_mcclure", min_logit=0.0)
+        poses = optimize(odometry, np.full((steps, 3), np.log(0.004)), loops, settings)
+        errors[drift_m] = float(np.linalg.norm((poses - truth)[:, :2], axis=1).max())
+    drifted = np.linalg.norm((se2.r2g(torch.from_numpy(odometry)).numpy() - truth)[:, :2], axis=1).max()
+    assert errors[1.0] < 0.1 * drifted and errors[1.0] < 0.2 * errors[0.0], (errors, drifted)
+
+
+def test_a_drift_below_zero_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"drift_m is -1\.0; expected 0 or more"):
+        PoseGraphSettings(drift_m=-1.0)
+
+
+def test_further_loops_are_asked_for_under_the_poses_without_them() -> None:
+    true_steps = laps(3)
+    truth, steps = driven(true_steps), noisy(true_steps, 0.02)
+    exact = exact_revisits(truth, SEARCH, 8)
+    asked: list[np.ndarray] = []
+
+    def more(nodes: np.ndarray) -> LoopFactors:
+        asked.append(nodes)
+        return exact
+
+    poses = optimize(steps, stds(steps, 0.02), NO_LOOPS, PLAIN, more=more)
+    (nodes,) = asked
+    np.testing.assert_allclose(nodes[1:, :2], driven(steps)[7::8, :2], atol=1e-6)
+    np.testing.assert_allclose(poses, optimize(steps, stds(steps, 0.02), exact, PLAIN), atol=1e-6)

@@ -1,0 +1,149 @@
+"""The worlds as data: seed ranges that never meet, and environments that look like what the networks take."""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from training.data.drive_plan import driven_in_table
+from training.data.streams import PairStream, PlaceStream, simulate
+from training.data.worlds import (
+    DEMO_SEEDS,
+    OPTIMIZER_TRAIN_SEEDS,
+    TEST_SEEDS,
+    TRAIN_SEEDS,
+    VALIDATION_SEEDS,
+    WORLDS,
+    MazeSize,
+    Table,
+    World,
+    world_named,
+)
+from training.featurise import _GROUP
+from training.train_local import Arguments
+
+
+def test_seed_ranges_do_not_overlap() -> None:
+    ranges = [TEST_SEEDS, VALIDATION_SEEDS, DEMO_SEEDS, TRAIN_SEEDS, OPTIMIZER_TRAIN_SEEDS]
+    assert all(len(seeds) > 0 and seeds.step == 1 and seeds[0] >= 0 for seeds in ranges)
+    for a, b in itertools.combinations(ranges, 2):
+        assert a[-1] < b[0] or b[-1] < a[0]
+    assert range(1000) == TEST_SEEDS and range(1000, 2000) == VALIDATION_SEEDS and range(2000, 3000) == DEMO_SEEDS
+    assert TRAIN_SEEDS[0] >= 10_000
+
+
+def test_the_two_trainings_on_pairs_share_no_maze() -> None:
+    world = WORLDS["maze2d"]
+    local = PairStream(world, TRAIN_SEEDS, 99, 200_000, 256)
+    place = PlaceStream(world, TRAIN_SEEDS[len(TRAIN_SEEDS) // 2 :], 0, 256, 24)
+    assert max(map(max, local.groups)) < min(map(min, place.groups))
+
+
+def test_world_named_knows_both_and_names_them() -> None:
+    assert world_named("maze2d").name == "maze2d" and world_named("maze3d").name == "maze3d"
+    with pytest.raises(ValueError, match=r"maze4d.*maze2d, maze3d"):
+        world_named("maze4d")
+
+
+def test_2d_environments_are_those_that_the_networks_take() -> None:
+    world = WORLDS["maze2d"]
+    (episode,) = simulate(world, [5], 3)
+    assert episode.observations.reshape(3, *world.image.shape).dtype == np.dtype(world.image.dtype)
+    assert episode.period_s == world.period_s
+    assert episode.maze.block_m == world.block_m
+    world.image.check(episode.observations[0].reshape(world.image.shape))
+
+
+def test_training_mazes_vary_within_their_ranges() -> None:
+    world = WORLDS["maze2d"]
+    sizes = set()
+    for seed in range(30):
+        env = world.make_random(np.random.default_rng(seed))
+        config = env.unwrapped.config  # type: ignore[attr-defined]
+        assert world.rows[0] <= config.rows == config.cols <= world.rows[1]
+        assert world.extra_openings[0] <= config.extra_openings <= world.extra_openings[1]
+        sizes.add((config.rows, config.extra_openings))
+        env.close()
+    assert {rows for rows, _ in sizes} == set(range(world.rows[0], world.rows[1] + 1))
+
+
+def test_make_without_a_size_is_the_simulators_own() -> None:
+    from ngo_sim.maze2d import Maze2DConfig
+
+    assert WORLDS["maze2d"].make().unwrapped.config == Maze2DConfig()  # type: ignore[attr-defined]
+    assert WORLDS["maze2d"].make(4, 1).unwrapped.config == Maze2DConfig(rows=4, cols=4, extra_openings=1)  # type: ignore[attr-defined]
+
+
+SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
+def test_each_table_has_episodes_and_mazes_of_its_own_in_its_split(world: World) -> None:
+    own = [table for table in world.tables if world.tables[table].driver is None]
+    for of in (world.table_seeds, world.table_mazes):
+        stretches = [of(table, split) for split in SPLITS for table in own]
+        assert all(len(seeds) >= 100 for seeds in stretches)
+        for a, b in itertools.combinations(stretches, 2):
+            assert not set(a) & set(b)
+    for (split, seeds), table in itertools.product(SPLITS.items(), world.tables):
+        assert set(world.table_seeds(table, split)) <= set(seeds)
+        # The first mazes of a split are those that the networks are measured on while they train.
+        assert min(world.table_seeds(table, split)) >= seeds[0] + 100
+    with pytest.raises(ValueError, match=r"'nowhere'.*expected one of"):
+        world.table_seeds("nowhere", "test")
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_seen_mazes_are_those_of_the_local_network_and_unseen_ones_of_no_training(split: str) -> None:
+    world, local = WORLDS["maze3d"], Arguments(world="maze3d")
+    trained = PairStream(world, TRAIN_SEEDS, 0, local.datapoints, local.batch_size)
+    in_training = {seed for group in trained.groups for seed in group}
+    seen, unseen = world.table_mazes("seen", split), world.table_mazes("unseen", split)
+    assert set(seen) <= in_training
+    # Groups of mazes are of one size, which the first of them decides: here as there.
+    assert list(seen[:_GROUP]) in trained.groups
+    assert not set(unseen) & {*TRAIN_SEEDS[:100_000]} and max(unseen) < TRAIN_SEEDS[0]
+    assert not set(world.table_seeds("seen", split)) & set(world.table_seeds("unseen", split))
+
+
+def test_an_episode_in_a_seen_maze_has_the_walls_of_training_and_another_start_and_drive() -> None:
+    world = WORLDS["maze3d"]
+    driven = driven_in_table(world, "seen", "validation", 2)
+    seen = list(driven.episodes(dataclasses.replace(world, episode_frames=30), slice(0, 2)))
+    trained = list(simulate(world, driven.mazes, 31))
+    for now, then in zip(seen, trained, strict=True):
+        np.testing.assert_array_equal(now.maze.walls, then.maze.walls)
+        assert not np.array_equal(now.poses_xyyaw[0], then.poses_xyyaw[0])
+        assert not np.array_equal(now.actions, then.actions)
+
+
+def test_a_table_of_another_driver_has_the_same_mazes_and_starts() -> None:
+    tables = {"unseen": Table(), "unseen_by_chance": Table(driver="random")}
+    world = dataclasses.replace(WORLDS["maze2d"], tables=tables, episode_frames=30)
+    assert world.unseen_tables == ("unseen",) and world.validation_stores == ("validation_unseen",)
+    ours, by_chance = (
+        next(driven_in_table(world, table, "validation", 1).episodes(world, slice(0, 1))) for table in tables
+    )
+    np.testing.assert_array_equal(ours.maze.walls, by_chance.maze.walls)
+    np.testing.assert_array_equal(ours.poses_xyyaw[0], by_chance.poses_xyyaw[0])
+    assert not np.array_equal(ours.actions, by_chance.actions)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"stretch": 2}, "stretch is 2; expected 0 to 1"), ({"size": MazeSize(4), "seen": True}, "as they were drawn")],
+)
+def test_a_table_that_cannot_be_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Table(**change)
+
+
+def test_tables_say_what_their_mazes_are() -> None:
+    world = WORLDS["maze2d"]
+    for table, openings in (("perfect", 0), ("cycles", 8)):
+        env = world.make_random(np.random.default_rng(0), world.tables[table].size)
+        config = env.unwrapped.config  # type: ignore[attr-defined]
+        assert (config.rows, config.cols, config.extra_openings) == (7, 7, openings)
+        env.close()

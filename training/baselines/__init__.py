@@ -1,0 +1,1 @@
+"""Other methods in the tables: DeepVO, pose graphs."""

@@ -1,0 +1,253 @@
+"""The classical baseline: a pose graph of the same odometry and loops as ours, optimised with GTSAM.
+
+Nodes are the ends of the meta-steps. Odometry factors are composed meta-steps with the network's own deviations, loop
+factors are what ``find_loops`` gives. A few numbers say how far either is to be believed: ``training.tune_pose_graph``
+chooses them on validation mazes.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import gtsam
+import numpy as np
+import torch
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.lattice import snapped
+from ngo_estimator.networks.pose_aggregation import block_variances, frame_poses, poses_in_blocks
+from ngo_estimator.optimizer.compass_closure import CompassFixes
+from ngo_estimator.optimizer.loop_closure import LoopSearch
+from training.baselines.loop_factors import LoopFactors, MoreLoops, exact_revisits
+
+Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
+_KERNELS: dict[str, Callable[[float], Any]] = {
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
+    "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
+    "dcs": gtsam.noiseModel.mEstimator.DCS.Create,
+}
+_HUBER_WIDTH = 1.0
+_DRIFT_LEFT = (*(0.25**stage for stage in range(6)), 0.0)
+_DRIFT_RAD_A_M = 0.2
+_UNKNOWN = 1e4  # scale of a deviation that is not to matter
+
+
+@dataclass(frozen=True)
+class PoseGraphSettings:
+    """What can be tuned in the pose graph. A scale multiplies the deviation that a network states."""
+
+    block: int = 8
+    """Steps in a meta-pose."""
+    odometry_position_scale: float = 4.0
+    """Scale of the odometry's deviations in position."""
+    odometry_heading_scale: float = 2.0
+    """Scale of the odometry's deviations in heading."""
+    odometry_gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors of a step's x, y and turn: a constant calibration of the odometry."""
+    odometry_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What is then added to each step (m, m, rad)."""
+    search: LoopSearch = field(default_factory=lambda: LoopSearch(per_pose=4, most=500, views=1))
+    """Which pairs of frames become loop candidates."""
+    min_logit: float = 2.0
+    """Belief from which on a loop enters the graph."""
+    loop_position_scale: float = 1.0
+    """Scale of the loops' deviations in position."""
+    loop_heading_scale: float = 0.5
+    """Scale of the loops' deviations in heading."""
+    kernel: Kernel = "geman_mcclure"
+    """Robust kernel over loops and compass readings."""
+    kernel_width: float = 2.0
+    """Parameter of the kernel over loops, in deviations."""
+    drift_m: float = 1.0
+    """What the graph allows the odometry to have drifted at first: so much, and a fifth of it in rad, is added (in
+    squares) to each loop's deviation, then a quarter of that, and so on, in the end nothing (as in graduated
+    non-convexity). With 0 it begins with a convex kernel instead."""
+    compass_position_scale: float = 2.0
+    """Scale of the compass readings' deviations in position."""
+    compass_heading_scale: float = 2.0
+    """Scale of the compass readings' deviations in heading."""
+    compass_kernel_width: float = 10.0
+    """Parameter of the kernel over compass readings, in deviations."""
+    compass_rounds: int = 4
+    """How often compass readings are snapped to the lattice at most."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name.endswith(("_scale", "_width")) and not 0.0 < value < math.inf:
+                raise ValueError(f"{name} is {value}; expected a positive number")
+            if name in ("odometry_gain", "odometry_bias") and (len(value) != 3 or not np.isfinite(value).all()):
+                raise ValueError(f"{name} is {value}; expected three finite numbers (x, y, turn)")
+        if self.kernel not in ("none", *_KERNELS):
+            raise ValueError(f"kernel is {self.kernel!r}; expected none or one of {', '.join(_KERNELS)}")
+        if not 0.0 <= self.drift_m < math.inf:
+            raise ValueError(f"drift_m is {self.drift_m}; expected 0 or more")
+        if math.isnan(self.min_logit):
+            raise ValueError("min_logit is nan; expected a number")
+        for name in ("block", "compass_rounds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
+
+    def calibrated(self, relative: np.ndarray) -> np.ndarray:
+        """Steps ``(..., 3)`` of the odometry after the constant calibration, float64."""
+        return np.asarray(relative, dtype=np.float64) * self.odometry_gain + self.odometry_bias
+
+
+def optimize(
+    relative: np.ndarray,
+    log_std: np.ndarray,
+    loops: LoopFactors,
+    settings: PoseGraphSettings,
+    compass: CompassFixes | None = None,
+    more: MoreLoops | None = None,
+) -> np.ndarray:
+    """Poses ``(steps, 3)`` after each step, seen from the first frame, float64.
+
+    Args:
+        relative: steps ``(steps, 3)`` of the odometry (m, m, rad), a whole number of blocks.
+        log_std: logarithm of their standard deviations ``(steps, 3)``.
+        loops: loop candidates, from ``found_loops`` of the calibrated odometry.
+        compass: readings of this trajectory alone, a batch of one.
+        more: gives further loops, of the meta-poses ``(blocks + 1, 3)`` that the graph comes to without them.
+    """
+    steps = torch.from_numpy(settings.calibrated(relative)).unsqueeze(0)
+    in_blocks = poses_in_blocks(steps, settings.block)
+    variances = block_variances(in_blocks, torch.from_numpy(np.asarray(log_std, dtype=np.float64)).unsqueeze(0))
+    odometry = in_blocks[0, :, -1], variances[0].sqrt().numpy()
+    graph = _Graph(*odometry, loops, settings)
+    if more is not None:
+        graph = _Graph(*odometry, loops.and_also(more(graph.solve())), settings)
+    poses = torch.from_numpy(graph.solve() if compass is None else graph.solve_with(compass))
+    meta_relative = se2.between(poses[:-1], poses[1:])
+    return frame_poses(in_blocks, meta_relative.unsqueeze(0))[0].numpy()
+
+
+def optimize_exact(
+    relative: np.ndarray, log_std: np.ndarray, truth: np.ndarray, settings: PoseGraphSettings
+) -> np.ndarray:
+    """What perfect loops would give: as ``optimize``, with true revisits and their true relative poses."""
+    exact = replace(settings, kernel="none", drift_m=0.0, loop_position_scale=1.0, loop_heading_scale=1.0)
+    return optimize(relative, log_std, exact_revisits(truth, settings.search, settings.block), exact)
+
+
+class _Graph:
+    """A trajectory's factors. Node ``k`` is the pose before meta-step ``k``; the one after the last is the lattice."""
+
+    def __init__(
+        self, meta_relative: torch.Tensor, meta_std: np.ndarray, loops: LoopFactors, settings: PoseGraphSettings
+    ) -> None:
+        self._settings = settings
+        self._odometry = np.concatenate((np.zeros((1, 3)), se2.r2g(meta_relative).numpy()))
+        self._base = gtsam.NonlinearFactorGraph()
+        anchor = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
+        self._base.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), anchor))
+        deviations = _noises(meta_std, settings.odometry_position_scale, settings.odometry_heading_scale)
+        for node, (step, noise) in enumerate(zip(meta_relative.numpy(), deviations, strict=True)):
+            self._base.add(gtsam.BetweenFactorPose2(node, node + 1, gtsam.Pose2(*step), noise))
+        believed = loops.logit >= settings.min_logit
+        scale = np.exp(loops.log_scale[believed].astype(np.float64))[:, [0, 0, 1]]
+        by = np.array([settings.loop_position_scale, settings.loop_position_scale, settings.loop_heading_scale])
+        self._loop_deviations = scale * by
+        self._loops = [
+            (start, end + 1, gtsam.Pose2(*measured))
+            for start, end, measured in zip(
+                loops.start[believed].tolist(),
+                loops.end[believed].tolist(),
+                loops.measured[believed].astype(np.float64),
+                strict=True,
+            )
+        ]
+
+    def solve(self) -> np.ndarray:
+        """Poses ``(blocks + 1, 3)`` from odometry and loops."""
+        return _xyyaw(self._loop_closed())
+
+    def solve_with(self, compass: CompassFixes) -> np.ndarray:
+        """Poses ``(blocks + 1, 3)`` from odometry, loops and compass.
+
+        Headings first: they are ambiguous only by quarter turns, and with them the positions hardly drift.
+        """
+        values, node = self._loop_closed(), len(self._odometry)
+        values.insert(node, gtsam.Pose2(*compass.lattice[0].double().numpy()))
+        measured = _snapped(compass, _xyyaw(values))
+        values = _minimum(self._with_compass(compass, measured, convex=True, headings_only=True), values)
+        before: np.ndarray | None = None
+        for _ in range(self._settings.compass_rounds):
+            measured = _snapped(compass, _xyyaw(values))
+            if before is not None and np.array_equal(measured, before):
+                break
+            values, before = _minimum(self._with_compass(compass, measured, convex=True), values), measured
+        return _xyyaw(_minimum(self._with_compass(compass, measured), values))[:-1]
+
+    def _loop_closed(self) -> gtsam.Values:
+        values = gtsam.Values()
+        for node, pose in enumerate(self._odometry):
+            values.insert(node, gtsam.Pose2(*pose))
+        settings = self._settings
+        last = settings.kernel, settings.kernel_width
+        if settings.drift_m == 0.0 or settings.kernel == "none":
+            stages = [(*kernel, 0.0) for kernel in dict.fromkeys((self._convex, last))]
+        else:
+            stages = [(*self._convex, settings.drift_m), *((*last, settings.drift_m * share) for share in _DRIFT_LEFT)]
+        for stage in stages:
+            values = _minimum(self._with_loops(*stage), values)
+        return values
+
+    def _with_loops(self, kernel: Kernel, width: float, drift_m: float = 0.0) -> gtsam.NonlinearFactorGraph:
+        graph = self._base.clone()
+        drift = drift_m * np.array([1.0, 1.0, _DRIFT_RAD_A_M])
+        noises = _noises(np.hypot(self._loop_deviations, drift), 1.0, 1.0)
+        for (start, end, measured), noise in zip(self._loops, noises, strict=True):
+            graph.add(gtsam.BetweenFactorPose2(start, end, measured, _robust(noise, kernel, width)))
+        return graph
+
+    def _with_compass(
+        self, compass: CompassFixes, measured: np.ndarray, convex: bool = False, headings_only: bool = False
+    ) -> gtsam.NonlinearFactorGraph:
+        settings, lattice = self._settings, len(self._odometry)
+        kernel, width = self._convex if convex else (settings.kernel, settings.compass_kernel_width)
+        graph = self._with_loops(settings.kernel, settings.kernel_width)
+        scale = compass.log_scale[0].double().exp().numpy()[:, [0, 0, 1]]
+        position_scale = _UNKNOWN if headings_only else settings.compass_position_scale
+        noises = _noises(scale, position_scale, settings.compass_heading_scale)
+        for node, pose, noise in zip(compass.node[0].tolist(), measured, noises, strict=True):
+            robust = _robust(noise, kernel, width)
+            graph.add(gtsam.BetweenFactorPose2(lattice, node, gtsam.Pose2(*pose), robust))
+        return graph
+
+    @property
+    def _convex(self) -> tuple[Kernel, float]:
+        """The kernel far from the minimum, where most others pull at nothing."""
+        return ("none", self._settings.kernel_width) if self._settings.kernel == "none" else ("huber", _HUBER_WIDTH)
+
+
+def _snapped(compass: CompassFixes, poses: np.ndarray) -> np.ndarray:
+    """What the readings say ``(fixes, 3)``, in the frame of the lattice, which is the last of the ``poses``."""
+    nodes = torch.from_numpy(poses)
+    in_lattice = se2.between(nodes[-1], nodes[compass.node[0]])
+    return snapped(compass.readings[0].double(), in_lattice, compass.block_m).numpy()
+
+
+def _noises(deviation: np.ndarray, position_scale: float, heading_scale: float) -> list[Any]:
+    """Noise models of deviations ``(n, 3)``."""
+    scaled = deviation * np.array([position_scale, position_scale, heading_scale])
+    return [gtsam.noiseModel.Diagonal.Sigmas(row) for row in scaled]
+
+
+def _robust(noise: Any, kernel: Kernel, width: float) -> Any:
+    if kernel == "none":
+        return noise
+    return gtsam.noiseModel.Robust.Create(_KERNELS[kernel](width), noise)
+
+
+def _minimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-4)
+    parameters.setAbsoluteErrorTol(1e-4)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+
+
+def _xyyaw(values: gtsam.Values) -> np.ndarray:
+    """Poses ``(nodes, 3)`` in the order of the nodes."""
+    return np.asarray(gtsam.utilities.extractPose2(values))

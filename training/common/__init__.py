@@ -1,0 +1,1 @@
+"""What every training shares: runs, learning curves, data modules."""

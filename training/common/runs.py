@@ -1,0 +1,261 @@
+"""What all training scripts share: the folder of a run with its record, and the trainer."""
+
+import dataclasses
+import json
+import shlex
+import subprocess
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
+
+from training.common.curves import Batch, Curves, rows, write_at_once
+
+ROOT = Path(__file__).resolve().parents[2]
+WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
+
+
+class RunError(ValueError):
+    """What lies in the folder of a run, or was asked of it, does not fit: one line that says what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerArguments:
+    """Where and how a training computes: what the arguments of every training script begin with."""
+
+    accelerator: str = "auto"
+    """Kind of device by Lightning's name, as cpu or gpu; auto: a GPU where there is one."""
+    devices: str = "auto"
+    """Processes that train together, each on batches of its own; auto: one, or one a GPU."""
+    strategy: str = "auto"
+    """How they do so by Lightning's name, as ddp or ddp_find_unused_parameters_true; auto: ddp if several."""
+    precision: Literal["bf16-mixed", "32-true"] = "bf16-mixed"
+    """Arithmetic of the networks; 32-true where a device has no fast bfloat16."""
+
+
+def revision() -> str:
+    """The commit that is checked out, with ``+changes`` where files differ from it."""
+    try:
+        commit = subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True
+        ).stdout.strip()
+        changes = subprocess.run(
+            ["git", "status", "--porcelain", "--untracked-files=no"],
+            cwd=ROOT,
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return commit + ("+changes" if changes.strip() else "")
+
+
+def record(script: str, arguments: Any) -> dict[str, Any]:
+    """How this run was made: command, arguments and revision, for the JSON beside its weights.
+
+    Folders are left out: they say where a network was made, not how; of recordings, the names are kept.
+    """
+    values, changed = {}, []
+    for field, value in _flat(arguments):
+        if isinstance(value, Path):
+            continue
+        if isinstance(value, tuple) and value and isinstance(value[0], Path):
+            values[field.name] = tuple(path.name for path in value)
+        else:
+            values[field.name] = value
+        if value != field.default:
+            flag = field.name.replace("_", "-")
+            if isinstance(value, bool) and field.default is not None:
+                changed.append(f"--{flag}" if value else f"--no-{flag}")
+            else:
+                kept = values[field.name]
+                changed += [f"--{flag}", *map(str, kept if isinstance(kept, tuple) else (kept,))]
+    command = shlex.join(["python", "-m", f"training.{script}", *changed])
+    return {"command": command, "arguments": values, "revision": revision()}
+
+
+def _flat(arguments: Any) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
+    """Fields and their values, those of nested arguments among them where any of these was given."""
+    for field in dataclasses.fields(arguments):
+        value = getattr(arguments, field.name)
+        if not dataclasses.is_dataclass(value):
+            yield field, value
+        elif field.default_factory is dataclasses.MISSING or value != field.default_factory():
+            yield from _flat(value)
+
+
+class BestWeights(Callback):
+    """Keeps the weights of the epoch with the lowest value of what is logged as ``name``.
+
+    For small data, which networks begin to learn by heart. Its state travels in the checkpoint.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name, self.value, self.epoch = name, float("inf"), -1
+        self.weights: dict[str, torch.Tensor] = {}
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        value = float(trainer.callback_metrics.get(self.name, torch.tensor(float("inf"))))
+        if value < self.value:
+            self.value, self.epoch = value, trainer.current_epoch
+            self.weights = {name: tensor.detach().cpu().clone() for name, tensor in pl_module.state_dict().items()}
+
+    def restore(self, training: lightning.LightningModule) -> None:
+        """Give the training the best weights, if there were any."""
+        if self.weights:
+            training.load_state_dict(self.weights)
+            print(f"kept epoch {self.epoch + 1}, of the lowest {self.name} ({self.value:.4g})")
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"value": self.value, "epoch": self.epoch, "weights": self.weights}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.value, self.epoch, self.weights = state_dict["value"], state_dict["epoch"], state_dict["weights"]
+
+
+class Run:
+    """A training in a folder of its own: ``run.json``, ``metrics.csv`` and ``last.ckpt``, and its trainer.
+
+    Begun again with the same arguments, it goes on after its last whole epoch and ends as if it had not been stopped.
+    Several processes hold the same run; only the one that ``is_first`` writes. With ``best``, the name of something
+    that is logged, the weights of the epoch in which that was lowest are kept, not the last ones. ``data`` identifies
+    recordings, which count as arguments, and ``settings`` are those of the world that the training depends on.
+
+    Raises:
+        ValueError: the folder holds a run that was begun with other arguments or settings.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        script: str,
+        arguments: TrainerArguments,
+        epochs: int,
+        seed: int,
+        datapoints: Callable[[Batch], int] = rows,
+        best: str | None = None,
+        data: str | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.folder = folder
+        self.record = record(script, arguments)
+        if data is not None:
+            self.record["arguments"]["data_sha256"] = data
+        if settings is not None:
+            self.record["settings"] = dict(settings)
+        self._description = {**self.record, "started": _now(), "resumed": [], "state": "running"}
+        self._check_arguments()
+        self.curves = Curves(folder / "metrics.csv", datapoints)
+        self.best = None if best is None else BestWeights(best)
+        self.trainer = make_trainer(
+            folder,
+            epochs,
+            seed,
+            arguments.precision,
+            [self.curves, *([] if self.best is None else [self.best])],
+            accelerator=arguments.accelerator,
+            devices=arguments.devices,
+            strategy=arguments.strategy,
+        )
+        self.is_first = bool(self.trainer.is_global_zero)
+
+    def _check_arguments(self) -> None:
+        path = self.folder / "run.json"
+        if not path.exists() or resume_from(self.folder) is None:
+            return
+        begun = json.loads(path.read_text())
+        now, then = (
+            {**of["arguments"], **of.get("settings", {})} for of in (json.loads(json.dumps(self.record)), begun)
+        )
+        differing = sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name))
+        if differing:
+            given = ", ".join(f"{name} {now.get(name)}" for name in differing)
+            expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
+            raise RunError(
+                f"{self.folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, "
+                "or the folder removed to begin anew"
+            )
+        self._description = {**begun, "state": "running"}
+        self._description["resumed"] = [*begun["resumed"], {"time": _now(), "revision": self.record["revision"]}]
+
+    def fit(self, training: lightning.LightningModule, data: lightning.LightningDataModule) -> None:
+        """Train to the last epoch, from the last one that was completed."""
+        if self.is_first:
+            self._write()
+        self.trainer.fit(training, datamodule=data, ckpt_path=resume_from(self.folder))
+        if self.best is not None:
+            self.best.restore(training)
+
+    def validate(self, training: lightning.LightningModule, data: lightning.LightningDataModule) -> dict[str, float]:
+        """What the training logs of the validation data, as it is now."""
+        (logged,) = self.trainer.validate(training, datamodule=data, verbose=False)
+        return {name: float(value) for name, value in logged.items()}
+
+    def finish(self, metrics: dict[str, Any]) -> dict[str, Any]:
+        """Complete ``run.json``; returns the ``training`` entry of the JSON beside the weights."""
+        training = {**self.record, "processes": self.trainer.world_size, **self.curves.figures()}
+        self._description = {**self._description, **training, "metrics": metrics, "ended": _now(), "state": "complete"}
+        self._write()
+        return training
+
+    def _write(self) -> None:
+        write_at_once(self.folder / "run.json", json.dumps(self._description, indent=2) + "\n")
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def make_trainer(
+    folder: Path, epochs: int, seed: int, precision: str, callbacks: Sequence[Callback] = (), **options: Any
+) -> lightning.Trainer:
+    """A trainer that keeps ``metrics.csv`` and ``last.ckpt`` in ``folder`` after each epoch, and shows its progress."""
+    lightning.seed_everything(seed, workers=True)
+    torch.set_float32_matmul_precision("high")
+    checkpoint = ModelCheckpoint(dirpath=folder, filename="last", save_top_k=1, enable_version_counter=False)
+    return lightning.Trainer(
+        max_epochs=epochs,
+        precision=precision,  # type: ignore[arg-type]
+        gradient_clip_val=1.0,
+        callbacks=[
+            checkpoint,
+            *(callbacks or [Curves(folder / "metrics.csv")]),
+            TQDMProgressBar(refresh_rate=20, leave=True),
+        ],
+        logger=False,
+        reload_dataloaders_every_n_epochs=1,
+        # The streams deal the training data out themselves; every process measures all of the validation data, so that
+        # medians and other figures that cannot be averaged come out as with one.
+        use_distributed_sampler=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        **options,
+    )
+
+
+def one_cycle(optimizer: torch.optim.Optimizer, trainer: lightning.Trainer) -> dict[str, Any]:
+    """Warm-up over a tenth of the training, then a cosine to zero, in the form that Lightning takes."""
+    steps = int(trainer.estimated_stepping_batches)
+    if steps < 3:
+        raise RunError(f"the training has {steps} step(s) of the optimiser; expected at least 3, to warm up and cool")
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer,
+        [group["lr"] for group in optimizer.param_groups],
+        total_steps=steps,
+        pct_start=max(0.1, 2.0 / steps),
+        div_factor=10.0,
+        final_div_factor=100.0,
+    )
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def resume_from(run: Path) -> str | None:
+    """The run's last checkpoint, if it has one."""
+    last = run / "last.ckpt"
+    return str(last) if last.exists() else None

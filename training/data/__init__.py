@@ -1,0 +1,1 @@
+"""Training data from the simulators: worlds, streams, feature stores."""

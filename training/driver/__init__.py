@@ -1,0 +1,1 @@
+"""The learned driver of the 3D world."""

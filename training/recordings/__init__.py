@@ -1,0 +1,1 @@
+"""A robot's recordings: stores, streams, reports and pictures."""

@@ -1,0 +1,256 @@
+"""A robot's recordings as training data: `--data FILES` in place of a simulated world."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from ngo_estimator.checkpoint import CheckpointError, load_local
+from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.topics import TopicArguments
+from training.common.runs import RunError
+from training.data.data_source import MIRRORED_ACTIONS, Domain
+from training.data.streams import ACTION_HISTORY, relative_poses
+from training.recordings.recording_store import StoredRecording, make_store
+from training.recordings.recording_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
+
+NO_LOOPS = "no_loops"
+"""Key in the JSON beside a place encoder or an optimizer with which no loops are closed; its value says why."""
+FEWEST_STEPS = 200
+"""Of the networks' part; fewer teach nothing."""
+_PANORAMA = math.pi
+_NARROW = math.radians(35.0)
+
+
+@dataclass(frozen=True)
+class RecordedArguments:
+    """Recordings instead of a simulated world, and what is made of them."""
+
+    data: tuple[Path, ...] = ()
+    """Recordings with ground truth to learn from: .mcap files or rosbag2 folders, each one a recording."""
+    name: str = "my_robot"
+    """Name of what is trained on recordings: of the folders of its weights and of its run."""
+    holdout: tuple[Path, ...] = ()
+    """Those of the recordings that nothing is learned from; not given: the last of several, the end of a single one."""
+    reduction: int | None = None
+    """How many times smaller pictures are made; not given: the least that leaves at most 96 columns."""
+    place_radius_m: float | None = None
+    """How far two frames of one place may be apart; not given: four fast steps, 0.3 to 1 m."""
+    heading_limit_deg: float | None = None
+    """How far they may be turned against each other; not given: 35, or 180 for scanners that look around."""
+    scan_yaw_deg: float = 0.0
+    """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead; to be given live, too."""
+    mirror: bool = True
+    """Whether to learn from the frames' mirror images, too; not for sensors that sit far to one side."""
+    from_weights: Path | None = None
+    """Folder of weights to begin with, of the same sensor; their sizes and search for loops stay."""
+    topics: Annotated[TopicArguments, tyro.conf.arg(name="")] = field(default_factory=TopicArguments)
+
+    def __post_init__(self) -> None:
+        if self.holdout and not set(self.holdout) < set(self.data):
+            raise ValueError(
+                f"holdout is {_names(self.holdout)}, data is {_names(self.data)}; expected some of the data, not all"
+            )
+        if len(set(self.data)) < len(self.data):
+            raise ValueError(f"data is {_names(self.data)}; expected each recording once")
+        if self.reduction is not None and self.reduction < 1:
+            raise ValueError(f"reduction is {self.reduction}; expected a whole number from 1 on")
+        if not math.isfinite(self.scan_yaw_deg):
+            raise ValueError(f"scan_yaw_deg is {self.scan_yaw_deg:g}; expected a finite number")
+        if "/" in self.name or not self.name:
+            raise ValueError(f"name is {self.name!r}; expected one that a folder can have")
+
+
+def run_script(main: Callable[[Any], object], arguments: type[Any], description: str | None) -> None:
+    """Run a script with the command line's arguments; what recordings, weights or runs lack ends it with one line."""
+    try:
+        main(tyro.cli(arguments, description=description))
+    except (RecordingError, CheckpointError, RunError) as error:
+        sys.exit(f"unusable: {error}")
+
+
+def check_source(world: str | None, recordings: RecordedArguments) -> None:
+    """Raise ``ValueError`` unless the data come from one place, a simulated world or recordings."""
+    if (world is None) == (not recordings.data):
+        raise ValueError("expected either --world, or --data FILES")
+
+
+@dataclass(frozen=True)
+class RecordedData:
+    """What there is to learn from: the domain, and tracks by what they are for; ``sha256`` tells it from other data."""
+
+    domain: Domain
+    recordings: list[StoredRecording]
+    parts: Split
+    sha256: str
+    scan_yaw_deg: float = 0.0
+
+    def tracks(self, *parts: Part) -> list[Track]:
+        """The tracks of some parts."""
+        return [track for part in parts for track in self.parts.tracks[part]]
+
+    def check_trained(self, config: LocalPoseConfig) -> None:
+        """Raise ``RecordingError`` unless a network was trained on what the recordings give with these settings."""
+        domain = self.domain
+        if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
+            raise RecordingError(
+                f"the weights of {domain.name} were trained on these recordings with other settings: give the same "
+                "--data, topics, --reduction and --from-weights as to train_local, or train anew"
+            )
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """For the JSON beside the weights: which recordings, how they were split, and what the plane leaves out."""
+        return {
+            "recordings": [recording.name for recording in self.recordings],
+            "split": list(self.parts.words),
+            "period_s": self.domain.period_s,
+            "place_radius_m": self.domain.place_radius_m,
+            "scan_yaw_deg": self.scan_yaw_deg,
+            "projection_residual": self.residual,
+        }
+
+    @property
+    def residual(self) -> dict[str, float]:
+        """What the projection of the true poses to the plane leaves out: range of heights, and the largest tilt."""
+        residuals = np.concatenate([recording.residuals for recording in self.recordings])
+        known = np.isfinite(residuals).all(axis=1)
+        heights = [r.residuals[np.isfinite(r.residuals[:, 0]), 0] for r in self.recordings]
+        return {
+            "height_range_m": float(max(np.ptp(height) for height in heights if len(height))),
+            "largest_tilt_deg": float(np.degrees(np.abs(residuals[known, 1:]).max())),
+        }
+
+
+def open_recorded(arguments: RecordedArguments, runs: Path) -> RecordedData:
+    """Read the recordings into ``runs/NAME/data`` (once), split them, and print how.
+
+    Raises:
+        RecordingError: of one line, about what is missing in them.
+    """
+    return _opened(arguments, runs)
+
+
+@lru_cache(maxsize=2)  # one script after another in one process asks for the same
+def _opened(arguments: RecordedArguments, runs: Path) -> RecordedData:
+    image = None
+    if arguments.from_weights is not None:
+        image = load_local(arguments.from_weights)[0].config.image
+    folder = runs / arguments.name / "data"
+    yaw_rad = math.radians(arguments.scan_yaw_deg)
+    image, recordings, sha256 = make_store(
+        folder, arguments.data, arguments.topics, image, arguments.reduction, yaw_rad
+    )
+    period = period_s(recordings)
+    tracks = [tracks_of(n, recording, period) if period else [] for n, recording in enumerate(recordings)]
+    for recording, found in zip(recordings, tracks, strict=True):
+        if not found:
+            raise RecordingError(
+                f"{recording.name} has no {SHORTEST} frames in a row, one each {period:.3f} s as most of the "
+                "recordings, with a true pose, action and velocity as chosen: see `python -m "
+                "training.inspect_recording`, or leave it out"
+            )
+    parts = split(recordings, tracks, [arguments.data.index(path) for path in arguments.holdout], period)
+    for part in PARTS:
+        if not parts.tracks[part]:
+            raise RecordingError(
+                f"the recordings are too short: no {SHORTEST} frames in a row are left for {part}; expected a few "
+                f"thousand frames in all: record longer, or more drives ({'; '.join(parts.words)})"
+            )
+    steps = sum(len(track) - 1 for track in parts.tracks["train"])
+    if steps < FEWEST_STEPS:
+        raise RecordingError(
+            f"the recordings are too short: {steps} steps to learn from; expected {FEWEST_STEPS} or more: "
+            "record longer, or more drives"
+        )
+    domain = domain_of(arguments, image, recordings, parts.tracks["train"], period)
+    data = RecordedData(domain, recordings, parts, sha256, arguments.scan_yaw_deg)
+    _print(data)
+    return data
+
+
+def domain_of(
+    arguments: RecordedArguments,
+    image: ImageFormat,
+    recordings: Sequence[StoredRecording],
+    tracks: Sequence[Track],
+    period: float,
+) -> Domain:
+    """The scale of things, from the tracks that the networks learn from."""
+    steps = np.concatenate([relative_poses(track.poses_xyyaw).numpy() for track in tracks])
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    median, fast = np.percentile(lengths, (50, 95)).tolist()
+    if fast < 1e-4:
+        raise RecordingError("the robot stands still in what is to be learned from: drive around")
+    radius = arguments.place_radius_m or min(max(4.0 * fast, 0.3), 1.0)
+    around = image.height == 1 and (image.field_of_view_deg is None or image.field_of_view_deg >= 180.0)
+    limit = _PANORAMA if around else _NARROW
+    with_actions = all(recording.with_actions for recording in recordings)
+    with_twist = all(recording.with_twist for recording in recordings)
+    twist_scale = (1.0, 1.0, 1.0)
+    if with_twist:
+        values = np.abs(np.concatenate([track.twists for track in tracks if track.twists is not None]))
+        x, y, yaw = np.maximum(np.percentile(values, 95, axis=0), 1e-3).tolist()
+        twist_scale = (x, max(y, 0.1 * x), yaw)
+    if image.has_depth and arguments.from_weights is None:
+        image = with_depth_scale(image, tracks)
+    return Domain(
+        name=arguments.name,
+        image=image,
+        period_s=period,
+        block_m=2.0 * radius,
+        place_radius_m=radius,
+        heading_limit_rad=limit if arguments.heading_limit_deg is None else math.radians(arguments.heading_limit_deg),
+        # Views are four frames away from the frames of a loop: further than a place reaches, they tell nothing.
+        loop_views=5 if 4.0 * median <= 0.6 * radius else 1,
+        reverses=not with_actions and float((steps[:, 0] < -0.1 * fast).mean()) > 0.01,
+        actions=3 if with_actions else 0,
+        mirrored_actions=MIRRORED_ACTIONS if with_actions else (),
+        # Where a robot has no momentum, the earlier ones are soon found to say nothing.
+        action_history=ACTION_HISTORY if with_actions else 1,
+        twist=with_twist,
+        twist_scale=twist_scale,
+        mirrors=arguments.mirror,
+    )
+
+
+def with_depth_scale(image: ImageFormat, tracks: Sequence[Track]) -> ImageFormat:
+    """The format with the scale of the depths that are seen: a third of their median is where resolution halves."""
+    some = np.concatenate([np.asarray(track.images[:: max(1, len(track) // 50), ..., -1]).ravel() for track in tracks])
+    returned = some[np.isfinite(some)]
+    if not len(returned):
+        raise RecordingError("no depth in the recordings has a return; expected distances in m")
+    softening = round(float(np.median(returned)) / 3.0, 3)
+    return dataclasses.replace(image, depth_gain_m=2.0 * softening, depth_softening_m=softening)
+
+
+def _print(data: RecordedData) -> None:
+    image, domain, residual = data.domain.image, data.domain, data.residual
+    size = f"{image.width} x {image.height} of {image.channels} x {image.dtype}"
+    made = f", made {image.reduction} times smaller" if image.reduction > 1 else ""
+    made += f", {image.field_of_view_deg:g} deg" if image.field_of_view_deg is not None else ""
+    print(f"frames: {size}{made}, one each {domain.period_s:.4f} s")
+    told = "actions" if domain.actions else "velocities" if domain.twist else "images alone"
+    print(f"each step is estimated from the two frames and: {told}" if told != "images alone" else f"steps from {told}")
+    print(f"places: within {domain.place_radius_m:.2f} m and {math.degrees(domain.heading_limit_rad):.0f} deg")
+    print(
+        f"left out by the projection to the plane: {residual['height_range_m']:.3f} m of height, tilt up to "
+        f"{residual['largest_tilt_deg']:.2f} deg"
+    )
+    for line in data.parts.words:
+        print(line)
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ", ".join(path.name for path in paths) or "none"

@@ -1,0 +1,184 @@
+"""The page of a world's results in Markdown, made whole from the JSON."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from training.data.worlds import World
+from training.scoring.oracle_rows import LIMITS
+from training.scoring.scores import METRICS, Metric
+from training.scoring.table_rows import ROWS
+
+
+def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
+    """The page's text; ``images`` are the names of files in ``images/`` with their captions."""
+    metrics = METRICS[world.name]
+    several = len(result["seeds"]) > 1
+    parts = [
+        f"<!-- Made by `{result['command']}`; changes belong into training/results_page.py. -->",
+        f"# Results in {world.name}",
+        f"`{result['command']}` at revision `{result['revision']}`: {result['trajectories']} trajectories of "
+        f"{result['steps']} steps a table, {result['split']} split. In brackets are 95 % bootstrap intervals over "
+        "trajectories. No trajectory is aligned with the truth but for its first pose. "
+        + (
+            f"Optimizers were trained with the seeds {_joined(result['seeds'])}: their numbers are means over these, "
+            "and the smallest and largest mean of a single seed stand beside them. "
+            if several
+            else ""
+        )
+        + "Numbers in full are in "
+        f"[`training/results/{world.name}.json`](../training/results/{world.name}.json); what they mean is in "
+        "[results.md](results.md).",
+    ]
+    for name, table in result["tables"].items():
+        length = f"{result['path_m'][name][str(result['steps'])]:.0f} m driven on average"
+        parts += [f"## Table `{name}`", f"{length}.", _table(table, metrics), _bias(result, name)]
+        parts += ["### Differences on the same trajectories", _pairs(result["paired"][name], metrics[0])]
+        parts += [
+            f"### {metrics[0].title} ({metrics[0].unit}) after fewer steps",
+            "The estimator has seen these steps alone, as in use.",
+            _prefixes(table, metrics[0]),
+        ]
+        if "limits" in result:
+            parts += [
+                "### What limits it",
+                "One part after the other replaced by the truth; of optimizers the first training seed.",
+                _table(result["limits"][name], metrics),
+            ]
+        if result["attention"].get(name):
+            parts += ["### Attention", _attention(result["attention"][name])]
+    parts += ["## Figures", *(f"![{caption}](images/{name})\n\n{caption}" for name, caption in images.items())]
+    parts += [
+        "## Trainings",
+        "Time is what went into the weights; throughput and memory are of all processes together. Data are "
+        "simulated while the networks train, so that throughput is of both.",
+        _trainings(result["trainings"]),
+        _generation(result["data_generation"]),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def number(value: float) -> str:
+    """Three significant digits, without an exponent."""
+    magnitude = abs(value)
+    digits = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2 if magnitude >= 1 else 3
+    if 0 < magnitude < 0.1:
+        digits = 4 if magnitude >= 0.01 else 5
+    return f"{value:.{digits}f}"
+
+
+def interval(entry: dict[str, Any]) -> str:
+    """A mean with its interval in brackets, of ``{mean, ci95}``."""
+    low, high = entry["ci95"]
+    return f"{number(entry['mean'])} [{number(low)}, {number(high)}]"
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
+    def cells(row: str, entry: dict[str, Any]) -> list[str]:
+        texts = []
+        for metric in metrics:
+            value = entry[metric.key]
+            seeds = value.get("seeds")
+            spread = f" ({number(min(seeds))} to {number(max(seeds))})" if seeds else ""
+            texts.append(interval(value) + spread)
+        return [f"`{row}`", (ROWS[row] if row in ROWS else LIMITS[row]).title, *texts]
+
+    header = ["Row", "", *(f"{metric.title}, {metric.unit}" for metric in metrics)]
+    return markdown(header, (cells(row, entry) for row, entry in table.items()))
+
+
+def _bias(result: dict[str, Any], name: str) -> str:
+    bias = result["local_bias_deg"][name]
+    low, high = (f"{value:+.4f}" for value in bias["ci95"])
+    return f"Mean heading error of a step of the local network: {bias['mean']:+.4f} deg [{low}, {high}]."
+
+
+def _pairs(pairs: dict[str, Any], metric: Metric) -> str:
+    def cells(name: str, entry: dict[str, Any]) -> list[str]:
+        row, other = name.split("_vs_")
+        difference, relative = entry[metric.key]["difference"], entry[metric.key]["relative_percent"]
+        low, high = (f"{value:+.1f}" for value in relative["ci95"])
+        apart = "yes" if difference["ci95"][0] > 0 or difference["ci95"][1] < 0 else "no"
+        return [f"`{row}`", f"`{other}`", f"{relative['mean']:+.1f} % [{low}, {high}]", interval(difference), apart]
+
+    header = ["Row", "Against", f"{metric.title}, relative", f"Difference, {metric.unit}", "Interval excludes zero"]
+    return markdown(header, (cells(name, entry) for name, entry in pairs.items()))
+
+
+def _prefixes(table: dict[str, Any], metric: Metric) -> str:
+    lengths = list(next(iter(table.values()))["prefixes"])
+    rows = (
+        [f"`{row}`", *(interval(entry["prefixes"][length][metric.key]) for length in lengths)]
+        for row, entry in table.items()
+    )
+    return markdown(["Row", *(f"{length} steps" for length in lengths)], rows)
+
+
+def _attention(found: dict[str, Any]) -> str:
+    def cells(row: str, entry: dict[str, Any]) -> list[str]:
+        first, last = entry["iterations"][0], entry["iterations"][-1]
+        shares = [
+            100.0 * value["mean"] for value in (first["revisit_mass"], last["revisit_mass"], entry["uniform_share"])
+        ]
+        return [
+            f"`{row}`",
+            number(first["relative_entropy"]["mean"]),
+            number(last["relative_entropy"]["mean"]),
+            *(f"{number(share)} %" for share in shares),
+        ]
+
+    header = [
+        "Row",
+        "Entropy, first iteration",
+        "Entropy, last iteration",
+        "On revisits, first iteration",
+        "On revisits, last iteration",
+        "On revisits, if uniform",
+    ]
+    counted = next(iter(found.values()))["trajectories"]
+    text = (
+        f"Of the first {counted} trajectories that come back to a place; entropy in units of that of uniform "
+        "attention; a revisit is another visit of the same place, in the past or the future."
+    )
+    return text + "\n\n" + markdown(header, (cells(row, entry) for row, entry in found.items()))
+
+
+def _trainings(trainings: dict[str, Any]) -> str:
+    def cells(name: str, entry: dict[str, Any]) -> list[str]:
+        return [
+            f"`{name}`",
+            _unit(entry, "seconds", 1.0 / 60.0, "min"),
+            _unit(entry, "datapoints_per_s", 1.0, "/s"),
+            _unit(entry, "peak_memory_mb", 1.0 / 1024.0, "GiB"),
+            f"`{entry['command']}`" if "command" in entry else "",
+        ]
+
+    header = ["Network", "Time", "Datapoints", "Peak memory", "Command"]
+    return markdown(header, (cells(name, entry) for name, entry in trainings.items()))
+
+
+def _generation(speed: dict[str, float]) -> str:
+    """How fast data is made without a training, if that was measured."""
+    suffix = "_datapoints_per_s"
+    made = [f"{name.removesuffix(suffix)} {value:,.0f}" for name, value in speed.items() if name.endswith(suffix)]
+    if not made:
+        return ""
+    memory = _unit(speed, "peak_memory_mb", 1.0 / 1024.0, "GiB")
+    return (
+        "Data alone (`python -m training.throughput`), datapoints/s with "
+        f"{speed['workers']:.0f} worker process(es): {_joined(made)}; peak memory {memory}."
+    )
+
+
+def _unit(entry: dict[str, Any], key: str, factor: float, unit: str) -> str:
+    return f"{number(factor * entry[key])} {unit}" if entry.get(key) else ""
+
+
+def _joined(values: Iterable[object]) -> str:
+    *most, last = map(str, values)
+    return f"{', '.join(most)} and {last}" if most else last

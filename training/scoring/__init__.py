@@ -1,0 +1,1 @@
+"""Errors of estimates, their statistics, and the estimators that the tables compare."""

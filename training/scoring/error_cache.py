@@ -1,0 +1,92 @@
+"""The errors of a row's trajectories on every prefix, kept on disk so that nothing is computed twice."""
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import ngo_estimator
+import training
+from training.data.worlds import World
+from training.scoring.row_estimators import Arrays, Estimator, prefix
+from training.scoring.scores import scores
+
+_MADE_BY = ("baselines", "data", "scoring")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one estimator makes of the trajectories of a table.
+
+    ``poses`` ``(trajectories, steps, 3)``, float32, of whole trajectories; ``scores``: for each number of steps the
+    metrics ``(trajectories,)`` by their key, the estimator having seen these steps alone, as in use.
+    """
+
+    poses: np.ndarray
+    scores: dict[int, dict[str, np.ndarray]]
+
+
+def measure(
+    estimator: Estimator, arrays: Arrays, data: str, prefixes: Sequence[int], world: World, cache: Path
+) -> Measured:
+    """Run an estimator over whole trajectories and over prefixes of them, or read what came out last time.
+
+    Args:
+        arrays: ``(trajectories, steps, ...)``; data: what identifies them.
+        prefixes: numbers of steps.
+        cache: a file ``.npz``, used if estimator, data and the code that computes are those of today.
+    """
+    trajectories, steps = arrays["relative"].shape[:2]
+    lengths = sorted({*prefixes, steps})
+    if lengths[0] < 1 or lengths[-1] > steps:
+        raise ValueError(f"prefixes are {list(prefixes)}; expected 1 to {steps}, the steps of a trajectory")
+    identity = json.dumps([estimator.identity, data, trajectories, lengths, _code()])
+    if (known := _read(cache, identity)) is not None:
+        return known
+    found: dict[int, dict[str, np.ndarray]] = {}
+    for length in lengths:
+        seen = prefix(arrays, length)
+        poses = estimator.poses(seen)
+        found[length] = scores(poses, np.asarray(seen["truth"], dtype=np.float64), world)
+    measured = Measured(poses.astype(np.float32), found)
+    _write(cache, identity, measured)
+    return measured
+
+
+def _code() -> str:
+    """A hash of the modules that the estimates come from."""
+    folders = [Path(folder) / name for folder in training.__path__ for name in _MADE_BY]
+    folders += map(Path, ngo_estimator.__path__)
+    files = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def _read(cache: Path, identity: str) -> Measured | None:
+    if not cache.exists():
+        return None
+    with np.load(cache) as stored:
+        if str(stored["identity"]) != identity:
+            return None
+        found: dict[int, dict[str, np.ndarray]] = {}
+        for name in stored.files:
+            length, _, metric = name.partition(":")
+            if metric:
+                found.setdefault(int(length), {})[metric] = stored[name]
+        return Measured(stored["poses"], found)
+
+
+def _write(cache: Path, identity: str, measured: Measured) -> None:
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
+    columns = {f"{length}:{name}": v for length, values in measured.scores.items() for name, v in values.items()}
+    try:
+        np.savez(partial, identity=np.array(identity), poses=measured.poses, **columns)  # type: ignore[arg-type]
+        os.replace(partial, cache)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            partial.unlink()

@@ -1,0 +1,273 @@
+"""What makes trajectories out of features, for every row of the tables of results."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ngo_estimator.checkpoint import load_optimizer, load_place, load_smoother
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.compass_closure import CompassFixes, compass_fixes, frames_to_read
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from training.baselines import loop_factors
+from training.baselines.compass_factors import found_fixes
+from training.baselines.loop_factors import LoopFactors, MoreLoops, Seen
+from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
+from training.featurise import open_store
+from training.scoring.table_rows import ROWS, Sources
+from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
+
+Arrays = dict[str, np.ndarray]
+"""Arrays of a feature store ``(trajectories, steps, ...)``; readings of a compass are of ``frames_to_read``."""
+
+Array = TypeVar("Array", np.ndarray, Tensor)
+
+COMPASS_ARRAYS = ("compass", "compass_log_scale")
+_BLOCK = PoseAggregationConfig(1).block
+_TOGETHER = 8  # trajectories that are optimised at once
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """One way to get trajectories: a function, and all that its result depends on beside code and data.
+
+    ``poses`` maps arrays ``(trajectories, steps, ...)`` to global poses ``(trajectories, steps, 3)`` after each step,
+    seen from the first frame, float64. ``identity`` names weights by their hash, and settings.
+    """
+
+    poses: Callable[[Arrays], np.ndarray]
+    identity: str
+
+
+Prepared = dict[tuple[int, int, LoopSearch], tuple[tuple[Tensor, Tensor], Loops]]
+"""Odometry and loops of some trajectories, by the number of the first, their length and the search: the costly part,
+and the same for all optimizers with one pair head and one search."""
+
+
+def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None = None) -> list[Estimator]:
+    """The estimators of a row: one, or one for each training seed.
+
+    ``prepared`` keeps what the rows of one table have in common; None where nothing is to be kept.
+    """
+    if row not in ROWS:
+        raise ValueError(f"row is {row!r}; expected one of {', '.join(ROWS)}")
+    kind = ROWS[row]
+    if row == "local" or kind.odometry is not None:
+        return [Estimator(local, row)]
+    if row == "local_calibrated":
+        calibration = calibration_of(sources)
+        return [Estimator(lambda arrays: local(calibrated(arrays, calibration)), f"{row} {json.dumps(calibration)}")]
+    if kind.own_networks:
+        own = sources.of_row(row, 0)
+        return [_trained(own, own.networks)]
+    if kind.form is not None:
+        return [_trained(sources, sources.row_folder(row, seed), prepared) for seed in range(seeds)]
+    place, description = load_place(sources.networks, sources.world.name)
+    if row == "registered":
+        return [Estimator(lambda arrays: registered(arrays, place.pair_head), f"{row} {description['sha256']}")]
+    identity, smoother = f"{row} {description['sha256']} {place.config.registration}", None
+    if kind.smoothed:
+        smoother, smooths = load_smoother(sources.networks, sources.world.name)
+        identity += f" {smooths['sha256']}"
+        if row == "smoothed":
+            return [Estimator(partial(smoothed, smoother), identity)]
+    form = "compass" if kind.compass else "registered" if kind.registered else "smoothed" if kind.smoothed else "loops"
+    settings = load_settings(sources.settings_file(form))
+    poses = pose_graph(row, settings, place.pair_head, sources.world.block_m, smoother=smoother)
+    return [Estimator(poses, f"{identity} {json.dumps(dataclasses.asdict(settings))}")]
+
+
+def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
+    """What there was after so many steps; the first frame's place code stays."""
+    read = len(frames_to_read(steps, _BLOCK))
+    return {name: array[:, : read if name in COMPASS_ARRAYS else steps] for name, array in arrays.items()}
+
+
+def local(arrays: Arrays) -> np.ndarray:
+    """The odometry alone."""
+    return se2.r2g(_float64(arrays["relative"])).numpy()
+
+
+def registered(arrays: Arrays, pair_head: PairHead) -> np.ndarray:
+    """The odometry as our optimizer takes it."""
+    seen = seen_in(prefix(arrays, _whole(arrays["relative"].shape[1], _BLOCK)))
+    steps, _ = loop_factors.registered_odometry(pair_head, seen, LoopSearch(registrations=REGISTRATIONS), _BLOCK)
+    return _with_tail(se2.r2g(_float64(steps)), _float64(arrays["relative"])).numpy()
+
+
+def smoothed(smoother: OdometrySmoother, arrays: Arrays) -> np.ndarray:
+    """The odometry as our optimizer smooths it, from what was seen of each trajectory and nothing that follows."""
+    whole = prefix(arrays, _whole(arrays["relative"].shape[1], _BLOCK))
+    steps, _ = loop_factors.smoothed_odometry(smoother, whole["relative"], whole["log_std"], whole["motion"])
+    return _with_tail(se2.r2g(_float64(steps)), _float64(arrays["relative"])).numpy()
+
+
+def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
+    """What loops are found in, with the odometry of the arrays, or another one."""
+    steps = arrays["relative"] if relative is None else relative
+    return Seen(steps, arrays["log_std"], arrays["codes"], arrays["origin_code"])
+
+
+def calibration_of(sources: Sources) -> dict[str, tuple[float, float, float]]:
+    """Constant gain and bias of each component of a step, least squares over the validation mazes of all tables."""
+    stores = [open_store(sources.store_folder("validation", table)) for table in sources.world.unseen_tables]
+    relative, truth = (np.concatenate([store[name] for store in stores]) for name in ("relative", "truth"))
+    return fit_calibration(relative, truth)
+
+
+def calibrated(arrays: Arrays, calibration: dict[str, tuple[float, float, float]]) -> Arrays:
+    """The arrays with a constant calibration applied to the odometry."""
+    relative = arrays["relative"] * np.array(calibration["odometry_gain"]) + np.array(calibration["odometry_bias"])
+    return {**arrays, "relative": relative}
+
+
+def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None = None) -> Estimator:
+    place, description = load_place(sources.networks, sources.world.name)
+    optimizer, trained = load_optimizer(optimizer_folder, sources.world.name)
+    if trained.get("place_encoder_sha256") != description["sha256"]:
+        raise ValueError(
+            f"{optimizer_folder} was trained on features of other networks than the present ones; remove it to make "
+            "it anew"
+        )
+    smooths = trained.get("odometry_smoother_sha256")  # where networks were tuned together, its copy has changed
+    if smooths is not None and load_smoother(sources.networks, sources.world.name)[1]["sha256"] != smooths:
+        raise ValueError(
+            f"{optimizer_folder} has another smoother than the one in {sources.networks}; remove it to make it anew"
+        )
+    identity = f"{trained['sha256']} {description['sha256']} {place.config.registration}"
+    return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m, prepared), identity)
+
+
+def optimized_by(
+    optimizer: NeuralGraphOptimizer,
+    pair_head: PairHead,
+    block_m: float,
+    prepared: Prepared | None = None,
+    known: Callable[[Loops, Tensor, int], Loops] | None = None,
+) -> Callable[[Arrays], np.ndarray]:
+    """What ``optimize_offline`` does, for many trajectories at once.
+
+    ``block_m`` is the side of a compass's lattice. ``prepared`` is of the same trajectories and the same pair head.
+    ``known`` makes other loops of those that are found, the true poses and the steps in a meta-pose.
+    """
+
+    def odometry_and_loops(first: int, whole: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], Loops | None]:
+        odometry = whole["relative"], whole["log_std"]
+        if not optimizer.config.loops:
+            return odometry, None
+        key = first, odometry[0].shape[1], optimizer.config.search
+        if prepared is not None and key in prepared:
+            return prepared[key]
+        odometry = optimizer.registered(*odometry, whole["codes"], pair_head, whole["origin_code"][:, 0])
+        loops = optimizer.find_loops(odometry[0], whole["codes"], pair_head)
+        if prepared is not None:
+            prepared[key] = odometry, loops
+        return odometry, loops
+
+    @torch.inference_mode()
+    def poses(arrays: Arrays) -> np.ndarray:
+        parts = []
+        for first in range(0, len(arrays["relative"]), _TOGETHER):
+            some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
+            whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
+            odometry, loops = odometry_and_loops(first, whole)
+            if loops is not None and known is not None:
+                loops = known(loops, whole["truth"], optimizer.block)
+            fixes = None
+            if optimizer.config.compass:
+                reading, scale = (whole[name] for name in COMPASS_ARRAYS)
+                fixes = compass_fixes(reading, scale, *odometry, optimizer.block, block_m)
+            result = optimizer(*odometry, whole["motion"], loops, fixes)
+            parts.append(_with_tail(result.poses.double(), some["relative"].double()))
+        return torch.cat(parts).numpy()
+
+    return poses
+
+
+def pose_graph(
+    row: str,
+    settings: PoseGraphSettings,
+    pair_head: PairHead,
+    block_m: float,
+    known: Callable[[LoopFactors, np.ndarray], LoopFactors] | None = None,
+    smoother: OdometrySmoother | None = None,
+) -> Callable[[Arrays], np.ndarray]:
+    """The classical rows: GTSAM with the loops that are found (and a compass), or with those that are known.
+
+    ``known`` makes other loops of those of a trajectory and its true poses, ``smoother`` the odometry of a row that
+    takes it smoothed.
+    """
+
+    def poses(arrays: Arrays) -> np.ndarray:
+        whole = prefix(arrays, _whole(arrays["relative"].shape[1], settings.block))
+        truth, seen = whole["truth"], seen_in(whole, settings.calibrated(whole["relative"]))
+        steps = whole["relative"], whole["log_std"]
+        if ROWS[row].registered:
+            steps = loop_factors.registered_odometry(pair_head, seen, settings.search, settings.block)
+        if smoother is not None:
+            steps = loop_factors.smoothed_odometry(smoother, *steps, whole["motion"])
+        odometry = list(zip(*steps, strict=True))
+        if row == "oracle":
+            solved = [optimize_exact(*one, true, settings) for one, true in zip(odometry, truth, strict=True)]
+        else:
+            if row == "true_pairs":
+                measured_revisits, of_search = loop_factors.measured_revisits, (settings.search, settings.block)
+                loops = [
+                    measured_revisits(pair_head, seen.part(slice(k, k + 1)), true, *of_search)
+                    for k, true in enumerate(truth)
+                ]
+            else:
+                loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
+            if known is not None:
+                loops = [known(found, true) for found, true in zip(loops, truth, strict=True)]
+            fixes: Sequence[CompassFixes | None] = [None] * len(truth)
+            if ROWS[row].compass:
+                reading, scale = (whole[name] for name in COMPASS_ARRAYS)
+                fixes = found_fixes(reading, scale, seen.relative, whole["log_std"], settings.block, block_m)
+            more: Sequence[MoreLoops | None] = [None] * len(truth)
+            if settings.search.overlaps and row != "true_pairs":
+                moved = settings.calibrated(steps[0])
+                more = loop_factors.overlaps_of(pair_head, whole["codes"], moved, settings.search, settings.block)
+            if known is not None:
+                more = [of and _known(of, known, true) for of, true in zip(more, truth, strict=True)]
+            added = zip(odometry, loops, fixes, more, strict=True)
+            solved = [optimize(*one, found, settings, fix, of) for one, found, fix, of in added]
+        left = torch.from_numpy(settings.calibrated(arrays["relative"]))
+        return _with_tail(torch.from_numpy(np.stack(solved)), left).numpy()
+
+    return poses
+
+
+def _known(more: MoreLoops, known: Callable[[LoopFactors, np.ndarray], LoopFactors], truth: np.ndarray) -> MoreLoops:
+    return lambda nodes: known(more(nodes), truth)
+
+
+def _whole(steps: int, block: int) -> int:
+    if steps < block:
+        raise ValueError(f"{steps} steps make no meta-pose; expected at least {block}")
+    return steps // block * block
+
+
+def _with_tail(poses: Tensor, relative: Tensor) -> Tensor:
+    """Poses of the first steps, followed by the odometry ``(trajectories, steps, 3)`` of the others."""
+    left = relative[:, poses.shape[1] :]
+    return poses if left.shape[1] == 0 else torch.cat((poses, se2.compose(poses[:, -1:], se2.r2g(left))), dim=1)
+
+
+def _float32(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32))
+
+
+def _float64(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float64))
