@@ -1,0 +1,1 @@
+"""Geometry of poses, of scans and of graphs: pure functions on arrays."""

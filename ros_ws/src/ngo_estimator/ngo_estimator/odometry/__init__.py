@@ -1,0 +1,1 @@
+"""Local estimators: from a sensor's stream to relative poses."""
