@@ -1,0 +1,1 @@
+"""The optimizer of the pose graph, and the loops that it takes."""
