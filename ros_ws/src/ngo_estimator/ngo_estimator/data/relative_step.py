@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ngo_estimator.geometry.key_scan import KeyScan
+
 RESTART_AFTER_NS = 1_000_000_000
 """A stamp this far in the past means that the source restarted; anything less is a late frame."""
 
@@ -26,6 +28,20 @@ class LateStep(RejectedStep):
     """A step to a frame that is a little older than the newest one."""
 
 
+@dataclass(frozen=True, eq=False)
+class KeyScanStep:
+    """The key scan that a step ends at, and where it was taken.
+
+    ``from_key_stamp_ns`` is the stamp of the key scan before it, from which the pose ``relative_xyyaw`` (3,) is seen, with
+    its ``covariance`` (3, 3).
+    """
+
+    scan: KeyScan
+    from_key_stamp_ns: int
+    relative_xyyaw: np.ndarray
+    covariance: np.ndarray
+
+
 @dataclass(frozen=True)
 class RelativeStep:
     """Motion between two frames, as the local odometry has it.
@@ -33,7 +49,8 @@ class RelativeStep:
     ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
     ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
     ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
-    older one, which only the first step after a start has: of all others it came already.
+    older one, which only the first step after a start has: of all others it came already. ``key`` is there where a lidar's
+    scan at the end of the step is a key scan, ``origin_scan``, the lidar's first scan, in the first step after a start.
     """
 
     stamp_ns: int
@@ -45,6 +62,8 @@ class RelativeStep:
     motion_feature: np.ndarray
     place_code: np.ndarray
     from_place_code: np.ndarray | None = field(default=None, kw_only=True)
+    key: KeyScanStep | None = field(default=None, kw_only=True)
+    origin_scan: KeyScan | None = field(default=None, kw_only=True)
 
 
 def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:
