@@ -51,6 +51,7 @@ class RelativeStep:
     ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
     older one, which only the first step after a start has: of all others it came already. ``key`` is there where a lidar's
     scan at the end of the step is a key scan, ``origin_scan``, the lidar's first scan, in the first step after a start.
+    ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one.
     """
 
     stamp_ns: int
@@ -64,6 +65,7 @@ class RelativeStep:
     from_place_code: np.ndarray | None = field(default=None, kw_only=True)
     key: KeyScanStep | None = field(default=None, kw_only=True)
     origin_scan: KeyScan | None = field(default=None, kw_only=True)
+    robot_odom_xyyaw: np.ndarray | None = field(default=None, kw_only=True)
 
 
 def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:

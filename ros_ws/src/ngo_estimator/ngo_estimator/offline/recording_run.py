@@ -10,12 +10,8 @@ import numpy as np
 from ngo_estimator.data.observations import observation
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
 from ngo_estimator.odometry.frame_pairing import FramePairing
-from ngo_estimator.odometry.local_odometry import (
-    DuplicateFrame,
-    LateFrame,
-    LocalEstimate,
-    LocalOdometry,
-)
+from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.online.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.files import SpatialPoses, seconds
 from ngo_recordings.frames import Frame
