@@ -47,3 +47,9 @@ class KeyScan:
             raise ValueError("angles or sensor_xyyaw are not finite; expected finite numbers")
         if not 0.0 < self.max_range < np.inf:
             raise ValueError(f"max_range is {self.max_range}; expected a positive, finite range")
+
+
+def no_scan(stamp_ns: int) -> KeyScan:
+    """A scan that saw nothing: it stands for one that is not known."""
+    nothing = np.zeros(0)
+    return KeyScan(stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(3), nothing, nothing, 1.0)

@@ -14,11 +14,15 @@ import torch
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
+
+
+_MOST_ITERATIONS = 30
+"""Until nothing moves any more, at the end of a recording."""
 
 
 @dataclass(frozen=True)
@@ -95,10 +99,8 @@ class ScanGraph:
         return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
 
     def begin_at(self, step: RelativeStep) -> None:
-        """Take the first frame, before the first step; raises ``ValueError`` where its scan is missing."""
-        if step.origin_scan is None:
-            raise ValueError("the first step has no scan of the first frame; expected it, as these weights take scans")
-        self._scans.append(step.origin_scan)
+        """Take the first frame, before the first step. No loop leads to it where its scan is missing."""
+        self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
         self._frames.append(0)
         self._nodes.append(np.zeros(3))
         self._key_stamp_ns = step.from_stamp_ns
@@ -192,6 +194,20 @@ class ScanGraph:
         """Leave undone what has begun."""
         if self._running is not None:
             self._running, self._waiting = None, self.config.keys_between
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is a loop that no optimisation has seen."""
+        return self._waiting > 0
+
+    def finish(self) -> bool:
+        """Optimise until nothing moves any more; returns whether there was anything to optimise."""
+        if self._running is None:
+            if not self._finder.loops.accepted.any():
+                return False
+            self.begin()
+        self._left = _MOST_ITERATIONS
+        return self.advance(self._left)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
