@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from ngo_estimator.geometry.branch_and_bound import PooledGrid, SearchConfig, pooled_grid, search
 
 CONFIG = SearchConfig(least_response=0.0, least_second=0.0)
@@ -19,7 +20,7 @@ def wall(start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
 def room() -> np.ndarray:
     """An L with a pillar: no symmetry."""
     corners = [(0.0, 0.0), (6.0, 0.0), (6.0, 2.5), (3.0, 2.5), (3.0, 4.0), (0.0, 4.0), (0.0, 0.0)]
-    walls = [wall(a, b) for a, b in zip(corners, corners[1:])]
+    walls = [wall(a, b) for a, b in zip(corners[:-1], corners[1:], strict=True)]
     return np.concatenate([*walls, wall((1.0, 2.8), (1.4, 3.1))])
 
 
