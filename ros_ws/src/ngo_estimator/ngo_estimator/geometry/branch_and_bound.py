@@ -21,8 +21,8 @@ class PooledGrid:
     """Likelihoods of a map, and their maxima over blocks.
 
     ``levels`` ``(depth + 1, rows, columns)``, uint8: cell ``(row, column)`` of level ``h`` holds the maximum over the
-    ``2 ** h`` cells from there on in x (columns) and y (rows), 255 for a likelihood of one. ``origin_m`` ``(2,)`` is the
-    corner of cell (0, 0), ``resolution_m`` the size of a cell.
+    ``2 ** h`` cells from there on in x (columns) and y (rows), 255 for a likelihood of one. ``origin_m`` ``(2,)`` is
+    the corner of cell (0, 0), ``resolution_m`` the size of a cell.
     """
 
     levels: np.ndarray
@@ -105,7 +105,7 @@ def pooled_grid(config: SearchConfig, points: np.ndarray) -> PooledGrid:
 def search(
     config: SearchConfig, grid: PooledGrid, points: np.ndarray, centre: np.ndarray, window: np.ndarray
 ) -> SearchMatch | None:
-    """Best pose of points ``(n, 2)`` (m) in a window of ``centre`` plus and minus ``window``, both ``(3,)`` (m, m, rad).
+    """Best pose of points ``(n, 2)`` (m) within ``window`` to each side of ``centre``, both ``(3,)`` (m, m, rad).
 
     Positions and headings are taken on a lattice around ``centre``. A window of pi and more in heading is a full turn.
     Returns ``None`` where no response reaches ``least_response``, or the search was cut short before it found the best.
@@ -119,7 +119,7 @@ def search(
     x = cosine * points[:, 0] - sine * points[:, 1] + (centre[0] - grid.origin_m[0])
     y = sine * points[:, 0] + cosine * points[:, 1] + (centre[1] - grid.origin_m[1])
     cells = np.floor(np.stack((x, y), axis=-1) / grid.resolution_m).astype(np.int32)
-    half_x, half_y = (int(math.floor(w / grid.resolution_m + 1e-9)) for w in window[:2])
+    half_x, half_y = (math.floor(w / grid.resolution_m + 1e-9) for w in window[:2])
     apart = config.separation_m / grid.resolution_m
     found = _best_first(
         grid.levels, cells, headings, half_x, half_y, apart, math.radians(config.separation_deg),
@@ -148,7 +148,7 @@ def _stamp(grid: np.ndarray, points: np.ndarray, resolution: float, deviation: f
     scale = -0.5 * (resolution / deviation) ** 2
     for k in range(len(points)):
         x, y = points[k, 0] / resolution, points[k, 1] / resolution
-        column, row = int(math.floor(x)), int(math.floor(y))
+        column, row = math.floor(x), math.floor(y)
         for i in range(row - reach, row + reach + 1):
             for j in range(column - reach, column + reach + 1):
                 value = np.uint8(round(255.0 * math.exp(scale * ((j + 0.5 - x) ** 2 + (i + 0.5 - y) ** 2))))

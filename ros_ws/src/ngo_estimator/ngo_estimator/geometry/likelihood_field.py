@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from ngo_estimator.geometry.planar_motion import Array, wrap
 
+_LONGEST_GAP_M = 1.5
+"""Neighbouring points farther apart are not joined."""
+
 _FINER = 5
 """How much finer the second pass steps."""
 
@@ -22,21 +25,27 @@ class SearchConfig:
     """How the search rates poses: cells of ``cell_m``; a point at the distance ``deviation_m`` from the closest one
     counts 0.61, at twice the distance 0.14. Cells up to ``reach_m`` from the middle are held. At most ``most_points``
     points of a scan are rated. A squared deviation from the prior costs ``prior_weight`` of the score, which is at
-    most 1. The coarse pass steps by ``step_m`` and ``step_deg``."""
+    most 1, and all of it at most ``most_prior``: wheels may slip. The coarse pass steps by ``step_m`` and ``step_deg``."""
 
     cell_m: float = 0.05
     deviation_m: float = 0.10
     reach_m: float = 25.0
     most_points: int = 120
     prior_weight: float = 0.01
+    most_prior: float = 0.2
     step_m: float = 0.10
     step_deg: float = 2.0
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.cell_m <= self.deviation_m < self.reach_m < math.inf and self.prior_weight >= 0.0):
+        if not (0.0 < self.cell_m <= self.deviation_m < self.reach_m < math.inf):
             raise ValueError(
-                f"cell_m, deviation_m, reach_m, prior_weight are {self.cell_m}, {self.deviation_m}, {self.reach_m}, "
-                f"{self.prior_weight}; expected 0 < cell_m <= deviation_m < reach_m, and a weight of at least 0"
+                f"cell_m, deviation_m, reach_m are {self.cell_m}, {self.deviation_m}, {self.reach_m}; expected "
+                "0 < cell_m <= deviation_m < reach_m"
+            )
+        if not (0.0 <= self.prior_weight < math.inf and 0.0 <= self.most_prior <= 1.0):
+            raise ValueError(
+                f"prior_weight, most_prior are {self.prior_weight}, {self.most_prior}; expected a weight of at least 0, "
+                "and 0 to 1"
             )
         if self.most_points < 1 or not (self.step_m > 0.0 and self.step_deg > 0.0):
             raise ValueError(
@@ -54,11 +63,16 @@ class LikelihoodField:
     config: SearchConfig
 
 
-def likelihood_field(points: Array, middle: Array, config: SearchConfig) -> LikelihoodField:
-    """The field of points ``(n, 2)`` round ``middle`` ``(2,)``."""
+def likelihood_field(points: Array, normals: Array, middle: Array, config: SearchConfig) -> LikelihoodField:
+    """The field of points ``(n, 2)`` with normals ``(n, 2)``, zero where there is none, round ``middle`` ``(2,)``.
+
+    Neighbours on one surface are joined by a line: points alone would draw a corridor's scan to the place where its
+    rays meet those of the last one, and motion along the corridor would vanish.
+    """
     side = 2 * math.ceil(config.reach_m / config.cell_m) + 1
     corner = middle - 0.5 * side * config.cell_m
-    return LikelihoodField(_field(points, corner, side, config.cell_m, config.deviation_m), corner, config)
+    drawn = _joined(points, normals, config.cell_m)
+    return LikelihoodField(_field(drawn, corner, side, config.cell_m, config.deviation_m), corner, config)
 
 
 def search(
@@ -67,7 +81,8 @@ def search(
     """The best pose ``(3,)`` within the window round a start, and its share of the field's largest score (0 to 1).
 
     Args:
-        points: of the scan, ``(n, 2)`` in the frame that is to be found.
+        points: of the scan, ``(n, 2)`` in the frame that is to be found. Points without a normal are best left out: they
+            lie far apart, and would fit where their rays met those of another scan.
         start: middle ``(3,)`` of the window.
         prior: mean ``(3,)`` and information ``(3, 3)`` of the pose.
         window: half sides, in m and in rad.
@@ -84,10 +99,33 @@ def search(
         pose, score = _best(
             field.scores, field.corner, config.cell_m, few, pose, mean, information,
             math.ceil(half_m / step_m), math.ceil(half_rad / step_rad), step_m, step_rad, config.prior_weight,
+            config.most_prior,
         )  # fmt: skip
         half_m, half_rad = step_m, step_rad
         step_m, step_rad = step_m / _FINER, step_rad / _FINER
     return pose, score
+
+
+@njit(cache=True)
+def _joined(points: Array, normals: Array, spacing: float) -> Array:
+    """The points, and more between neighbours whose surfaces face alike and whose gap runs along these."""
+    between = np.zeros(len(points), dtype=np.int64)
+    for i in range(len(points) - 1):
+        x, y = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        length = math.hypot(x, y)
+        alike = normals[i, 0] * normals[i + 1, 0] + normals[i, 1] * normals[i + 1, 1] > 0.95
+        if alike and length < _LONGEST_GAP_M and abs(x * normals[i, 0] + y * normals[i, 1]) < 0.2 * length:
+            between[i] = int(length / spacing)
+    result = np.empty((len(points) + between.sum(), 2))
+    place = 0
+    for i in range(len(points)):
+        for j in range(between[i] + 1):
+            share = j / (between[i] + 1)
+            for axis in range(2):
+                step = points[i + 1, axis] - points[i, axis] if between[i] else 0.0
+                result[place, axis] = points[i, axis] + share * step
+            place += 1
+    return result
 
 
 @njit(cache=True)
@@ -126,6 +164,7 @@ def _best(
     step_m: float,
     step_rad: float,
     prior_weight: float,
+    most_prior: float,
 ) -> tuple[Array, float]:
     rows, columns = scores.shape
     best_total, best_score = -math.inf, 0.0
@@ -149,7 +188,7 @@ def _best(
                 for a in range(3):
                     for b in range(3):
                         cost += away[a] * information[a, b] * away[b]
-                cost *= prior_weight
+                cost = min(cost * prior_weight, most_prior)
                 if -cost + 1.0 <= best_total:
                     continue
                 total = 0.0

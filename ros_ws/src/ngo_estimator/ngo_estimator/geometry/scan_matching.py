@@ -31,10 +31,10 @@ class IcpConfig:
     steps: int = 16
     annealing_steps: int = 6
     first_kernel_m: float = 0.10
-    last_kernel_m: float = 0.04
+    last_kernel_m: float = 0.03
     first_gate_m: float = 0.30
     last_gate_m: float = 0.12
-    facing_deg: float = 40.0
+    facing_deg: float = 30.0
     fit_m: float = 0.10
     noise_m: float = 0.015
     correlation: float = 8.0

@@ -39,5 +39,6 @@ class LocalSubmap:
     def field(self) -> LikelihoodField:
         """The likelihood field of all scans, round the last one."""
         if self._field is None:
-            self._field = likelihood_field(np.concatenate(self._points), self._middle, self._search)
+            points, normals = np.concatenate(self._points), np.concatenate(self._normals)
+            self._field = likelihood_field(points, normals, self._middle, self._search)
         return self._field

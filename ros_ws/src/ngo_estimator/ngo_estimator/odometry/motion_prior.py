@@ -73,13 +73,17 @@ class MotionPrior:
         self._stamp_ns, self._anchor = stamp_ns, pose
         self._last_wheels = self._anchor_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
 
-    def predict(self, stamp_ns: int, last: Array, wheels: WheelOdometry | None) -> Prediction:
-        """The prior of the scan at a stamp, after the last one had the pose ``last`` ``(3,)``."""
+    def predict(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry | None) -> Prediction:
+        """The prior of the scan at a stamp, after the last one had the pose ``last`` ``(3,)``.
+
+        ``covariance`` ``(3, 3)`` is that of ``last`` against the last key scans. It counts where wheels do not lead
+        back to a key scan.
+        """
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
         constant = self._velocity * elapsed if elapsed <= self.config.longest_s else np.zeros(3)
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
-            return self._without_wheels(last, constant, elapsed)
+            return self._without_wheels(last, covariance, constant, elapsed)
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
         starts = [compose(last, step)]
         off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
@@ -99,15 +103,16 @@ class MotionPrior:
             # The wheels' way since the key scan is wrong by what was doubted: go on from the last scan.
             mean = starts[0]
         doubted = self._doubt > 0.0
-        return _prediction(mean, deviations, tuple(starts), None if doubted else np.diag(step_deviations**2))
+        known = None if doubted else np.diag(step_deviations**2)
+        return _prediction(mean, np.diag(deviations**2), tuple(starts), known)
 
-    def _without_wheels(self, last: Array, constant: Array, elapsed: float) -> Prediction:
+    def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
         config = self.config
         position = min(config.still_m + 0.5 * config.acceleration_m_s2 * elapsed**2, config.largest_m)
         heading = math.radians(config.still_deg) + 0.5 * config.acceleration_rad_s2 * elapsed**2
         deviations = np.array((position, position, min(heading, math.radians(config.largest_deg))))
         mean = compose(last, constant)
-        return _prediction(mean, deviations, (mean,), None)
+        return _prediction(mean, np.diag(deviations**2) + covariance, (mean,), None)
 
     def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool) -> None:
         """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before."""
@@ -118,5 +123,5 @@ class MotionPrior:
             self._doubt = self._doubt_rad = 0.0
 
 
-def _prediction(mean: Array, deviations: Array, starts: tuple[Array, ...], step_covariance: Array | None) -> Prediction:
-    return Prediction(mean, np.diag(deviations**2), np.diag(deviations**-2), starts, step_covariance)
+def _prediction(mean: Array, covariance: Array, starts: tuple[Array, ...], step_covariance: Array | None) -> Prediction:
+    return Prediction(mean, covariance, np.linalg.inv(covariance), starts, step_covariance)

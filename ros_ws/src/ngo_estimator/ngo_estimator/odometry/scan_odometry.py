@@ -32,7 +32,7 @@ class ScanOdometryConfig:
 
     key_distance_m: float = 0.3
     key_turn_deg: float = 15.0
-    submap_scans: int = 15
+    submap_scans: int = 30
     poor_m: float = 0.1
     poor_deg: float = 5.0
     search_deviations: float = 2.0
@@ -120,7 +120,7 @@ class ScanOdometry:
             return self._begin(scan, wheels)
         if scan.stamp_ns <= self._stamp_ns:
             raise ValueError(f"the scan's stamp is {scan.stamp_ns}; expected one after {self._stamp_ns}")
-        prediction = self._prior.predict(scan.stamp_ns, self._pose, wheels)
+        prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, searched = self._register(scan, prediction)
         unsure = self._is_unsure(found, prediction)
         pose, covariance = (prediction.mean, prediction.covariance) if unsure else (found.pose, found.covariance)
@@ -139,18 +139,22 @@ class ScanOdometry:
         poor = max(deviation[0], deviation[1]) > config.poor_m or deviation[2] > math.radians(config.poor_deg)
         prior = (prediction.mean, prediction.information)
         starts = list(prediction.starts)
+        on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
         if poor:
             window = (
                 min(config.search_deviations * float(max(deviation[0], deviation[1])), config.wide_m),
                 min(config.search_deviations * float(deviation[2]), math.radians(config.wide_degs[0])),
             )
-            starts.append(search(self._submap.field, scan.points, starts[0], prior, window)[0])
+            starts.append(search(self._submap.field, on_lines, starts[0], prior, window)[0])
         best = self._best(scan, starts, prior)
         for wide_deg in config.wide_degs:
             if best.share >= config.good_share or len(scan.points) < config.least_points:
                 break
             poor, window = True, (config.wide_m, math.radians(wide_deg))
-            again = self._best(scan, [search(self._submap.field, scan.points, starts[0], prior, window)[0]], prior)
+            if prediction.step_covariance is None:
+                # Nothing measured this prediction, and it led to no fit: it only breaks ties.
+                prior = (prediction.mean, np.diag((2.0 / window[0], 2.0 / window[0], 2.0 / window[1])) ** 2)
+            again = self._best(scan, [search(self._submap.field, on_lines, starts[0], prior, window)[0]], prior)
             if again.share > best.share + 0.1:
                 best = again
         return best, poor

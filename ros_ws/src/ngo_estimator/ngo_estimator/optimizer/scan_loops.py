@@ -32,6 +32,8 @@ sightings through walls, the distance from the graph's pose in deviations (a thi
 neighbouring loops that agree.
 """
 
+_DISAGREEMENT, _AGREEING = EVIDENCE.index("disagreement"), EVIDENCE.index("agreeing")
+
 
 @dataclass(frozen=True)
 class ScanLoopConfig:
@@ -39,11 +41,14 @@ class ScanLoopConfig:
 
     Every ``every``-th key asks, at up to ``most_per_key`` places that are ``least_gap_m`` of path and more behind it.
     Places are every ``place_step``-th key, with ``submap_keys`` keys around each; ``source_keys`` keys are searched
-    together, by ``search_points`` of their points. A place may be ``reach_m`` outside of the window. ``most_submaps``
-    submaps are kept. A loop needs ``least_response``, at most ``most_second`` of it at another pose, ``least_on_lines``
-    of the points on lines, at most ``most_seen_through`` of the sightings through walls, at most ``most_disagreement``
-    deviations from the graph's pose, and ``least_agreeing`` loops of other keys, at most ``neighbour_keys`` away at
-    both ends, that agree to ``agreement_m`` and ``agreement_deg``.
+    together, by ``search_points`` of their points. A place may be ``reach_m`` outside of the window. A match of places
+    is searched ``match_m`` around the place. ``most_submaps`` submaps are kept.
+
+    A loop needs ``least_response``, at most ``most_second`` of it at another pose, ``least_on_lines`` of the points on
+    lines, at most ``most_seen_through`` of the sightings through walls, and at most ``most_disagreement`` deviations
+    from the graph's pose. It needs ``least_agreeing`` loops of other keys, at most ``neighbour_keys`` away at both
+    ends, that agree to ``agreement_m`` and ``agreement_deg``, and ``agreeing_per_deviation`` for each deviation from
+    the graph's pose: the more a loop would change, the more of them.
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)
@@ -56,33 +61,45 @@ class ScanLoopConfig:
     search_points: int = 300
     reach_m: float = 2.0
     most_submaps: int = 48
+    match_m: float = 4.0
     least_response: float = 0.55
     most_second: float = 0.9
     least_on_lines: float = 0.6
     most_seen_through: float = 0.15
-    most_disagreement: float = 4.5
+    most_disagreement: float = 3.0
     least_agreeing: int = 1
+    agreeing_per_deviation: float = 2.0
     neighbour_keys: int = 12
     agreement_m: float = 0.25
     agreement_deg: float = 4.0
 
     def __post_init__(self) -> None:
-        counts = (self.every, self.place_step, self.submap_keys, self.source_keys, self.search_points, self.most_submaps)
-        if not (all(n >= 1 for n in counts) and min(self.most_per_key, self.least_agreeing, self.neighbour_keys) >= 0):
-            raise ValueError(f"{self} has a count that is too small; expected at least one of each")
+        for name in ("every", "place_step", "submap_keys", "source_keys", "search_points", "most_submaps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
+        for name in ("most_per_key", "least_agreeing", "neighbour_keys"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least 0")
         shares = (self.least_response, self.most_second, self.least_on_lines, self.most_seen_through)
         if not all(0.0 <= x <= 1.0 for x in shares):
             raise ValueError(
                 "least_response, most_second, least_on_lines, most_seen_through are "
                 f"{shares}; expected shares from 0 to 1"
             )
-        lengths = (
-            self.least_gap_m, self.reach_m, self.most_disagreement, self.agreement_m, self.agreement_deg
-        )  # fmt: skip
+        lengths = (self.least_gap_m, self.reach_m, self.match_m, self.agreement_m, self.agreement_deg)
         if not all(0.0 <= x < math.inf for x in lengths):
             raise ValueError(
-                "least_gap_m, reach_m, most_disagreement, agreement_m, agreement_deg are "
-                f"{lengths}; expected finite numbers from 0 on"
+                f"least_gap_m, reach_m, match_m, agreement_m, agreement_deg are {lengths}; expected finite numbers "
+                "from 0 on"
+            )
+        if not (self.most_disagreement >= 0.0 and 0.0 <= self.agreeing_per_deviation < math.inf):
+            raise ValueError(
+                f"most_disagreement, agreeing_per_deviation are {self.most_disagreement}, "
+                f"{self.agreeing_per_deviation}; expected numbers from 0 on, the second finite"
+            )
+        if self.source_keys > self.submap_keys:
+            raise ValueError(
+                f"source_keys, submap_keys are {self.source_keys}, {self.submap_keys}; expected no more in the source"
             )
 
 
@@ -149,6 +166,17 @@ class _Submap:
     grid: PooledGrid
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """A place, and where in it the last key is searched: ``centre`` plus and minus ``window``, both ``(3,)``. The last
+    key is ``likely`` that near to its pose in the graph."""
+
+    place: int
+    centre: np.ndarray
+    window: np.ndarray
+    likely: np.ndarray
+
+
 class ScanLoopFinder:
     """Finds loops of each new key, and keeps all that were verified: a loop is accepted when a neighbour agrees."""
 
@@ -169,7 +197,7 @@ class ScanLoopFinder:
             poses: of all keys in the map ``(keys, 3)``.
             windows: half widths of the search around each key's pose, as seen from the last ``(keys, 3)`` (m, m, rad).
             matches: earlier keys that look like the last one, best first. They go before those near the pose, and are
-                searched over the widest window, in all directions.
+                searched in all directions.
 
         Returns:
             The loops that this call made acceptable, the last key's and earlier ones with which they agree.
@@ -187,15 +215,15 @@ class ScanLoopFinder:
         if key % config.every or len(scans[key].points) == 0:
             return ScanLoops.none()
         found = ScanLoops.none()
-        for place, window in self._candidates(poses, windows, matches):
-            loop = self._verified(scans, poses, place, window)
+        for candidate in self._candidates(poses, windows, matches):
+            loop = self._verified(scans, poses, candidate)
             if loop is not None:
                 found = found.extended(loop)
         return self._agreed(found, poses)
 
     def _candidates(
         self, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]
-    ) -> list[tuple[int, np.ndarray]]:
+    ) -> list["_Candidate"]:
         config, key = self.config, len(poses) - 1
         path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))))
         last = int(np.searchsorted(path, path[-1] - config.least_gap_m)) - config.submap_keys // 2
@@ -203,9 +231,9 @@ class ScanLoopFinder:
         places = range(0, max(0, last), config.place_step)
         if len(places) == 0:
             return []
-        anywhere = np.array((self.config.search.resolution_m * 100.0,) * 2 + (math.pi,))
         seen = dict.fromkeys(min(round(m / config.place_step), len(places) - 1) for m in matches if 0 <= m < last)
-        chosen = [(p * config.place_step, anywhere) for p in seen][: config.most_per_key]
+        around = np.array((config.match_m, config.match_m, math.pi))
+        chosen = [_Candidate(p * config.place_step, np.zeros(3), around, windows[p * config.place_step]) for p in seen]
         middles = np.stack(self._middles)
         cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         views = poses[:, :2] + np.stack(
@@ -214,8 +242,12 @@ class ScanLoopFinder:
         near = nearest_places(
             views, poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys, most=config.most_per_key
         )
-        taken = [place for place, _ in chosen]
-        chosen += [(place, windows[place]) for place in near if place not in taken]
+        taken = [candidate.place for candidate in chosen]
+        chosen += [
+            _Candidate(place, between(poses[place], poses[key]), windows[place], windows[place])
+            for place in near
+            if place not in taken
+        ]
         return chosen[: config.most_per_key]
 
     def _submap(self, scans: Sequence[KeyScan], poses: np.ndarray, place: int) -> _Submap:
@@ -226,24 +258,22 @@ class ScanLoopFinder:
         first, after = max(0, place - half), min(len(scans), place - half + self.config.submap_keys)
         local = _between(poses[place], poses[first:after])
         together = placed(scans[first:after], self._profiles[first:after], local)
-        submap = _Submap(first, local, together, line_map_of_points(together.points, together.normals), pooled_grid(self.config.search, together.points))
+        lines = line_map_of_points(together.points, together.normals)
+        submap = _Submap(first, local, together, lines, pooled_grid(self.config.search, together.points))
         self._submaps[place] = submap
         if len(self._submaps) > self.config.most_submaps:
             self._submaps.popitem(last=False)
         return submap
 
-    def _verified(
-        self, scans: Sequence[KeyScan], poses: np.ndarray, place: int, window: np.ndarray
-    ) -> ScanLoops | None:
+    def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: "_Candidate") -> ScanLoops | None:
         """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""
         config, key = self.config, len(scans) - 1
-        submap = self._submap(scans, poses, place)
+        submap = self._submap(scans, poses, candidate.place)
         first = max(0, key + 1 - config.source_keys)
         local = _between(poses[key], poses[first:])
         source = placed(scans[first:], self._profiles[first:], local)
-        expected = between(poses[place], poses[key])
         chosen = _spread(source.points, config.search.resolution_m, config.search_points)
-        match = search(config.search, submap.grid, chosen, expected, window)
+        match = search(config.search, submap.grid, chosen, candidate.centre, candidate.window)
         if match is None or match.response < config.least_response:
             return None
         second_peak = match.second / match.response
@@ -253,9 +283,9 @@ class ScanLoopFinder:
         if registered.share < config.least_on_lines:
             return None
         through = seen_through(submap.scans, source, registered.pose)
-        off = registered.pose - expected
+        off = registered.pose - between(poses[candidate.place], poses[key])
         off[2] = wrap(off[2])
-        disagreement = float(np.linalg.norm(3.0 * off / window))
+        disagreement = float(np.linalg.norm(3.0 * off / candidate.likely))
         if through > config.most_seen_through or disagreement > config.most_disagreement:
             return None
         # From the nearest of the submap's keys: its pose in the submap is the least uncertain.
@@ -291,9 +321,10 @@ class ScanLoopFinder:
                 (np.linalg.norm(off[:, :2], axis=1) <= config.agreement_m)
                 & (turn <= math.radians(config.agreement_deg))
             ]
-            evidence[agree, 5] += 1.0
-            evidence[k, 5] += len(agree)
-        accepted = evidence[:, 5] >= config.least_agreeing
+            evidence[agree, _AGREEING] += 1.0
+            evidence[k, _AGREEING] += len(agree)
+        needed = np.maximum(config.least_agreeing, config.agreeing_per_deviation * evidence[:, _DISAGREEMENT])
+        accepted = evidence[:, _AGREEING] >= needed
         fresh = np.flatnonzero(accepted & ~loops.accepted)
         self.loops = ScanLoops(pairs, loops.relative, loops.covariance, evidence, accepted)
         return self.loops[fresh]

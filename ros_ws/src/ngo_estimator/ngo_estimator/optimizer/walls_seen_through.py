@@ -54,17 +54,19 @@ def placed(scans: Sequence[KeyScan], profiles: Sequence[Array], poses: Array) ->
 
 
 def seen_through(target: PlacedScans, source: PlacedScans, pose: Array) -> float:
-    """Share of sightings that go through a wall: points of each side from all sensors of the other.
+    """Share of sightings that go through a wall: points of one side, from all sensors of the other.
 
     A sighting is a point that a sensor should have seen: a ray in its direction ends there or goes on behind it. Points
-    behind the end of a ray are hidden, and say nothing. ``pose`` ``(3,)`` is that of ``source`` in ``target``. Returns
-    one where there is no sighting at all.
+    behind the end of a ray are hidden, and say nothing. A wall that one side alone has is seen through by the other
+    alone, so that the larger of the two shares is returned; one where there is no sighting at all. ``pose`` ``(3,)`` is
+    that of ``source`` in ``target``.
     """
     sensors = np.stack([compose(pose, sensor) for sensor in source.sensors])
-    through, on = _sightings(target.sensors, target.profiles, transformed(pose, source.points))
-    more_through, more_on = _sightings(sensors, source.profiles, target.points)
-    through, on = through + more_through, on + more_on
-    return through / (through + on) if through + on > 0 else 1.0
+    both = (
+        _sightings(target.sensors, target.profiles, transformed(pose, source.points)),
+        _sightings(sensors, source.profiles, target.points),
+    )
+    return max((through / (through + on) for through, on in both if through + on > 0), default=1.0)
 
 
 @njit(cache=True)
@@ -75,7 +77,7 @@ def _sightings(sensors: Array, profiles: Array, points: Array) -> tuple[int, int
         for k in range(len(points)):
             x, y = points[k, 0] - sensors[s, 0], points[k, 1] - sensors[s, 1]
             away = math.sqrt(x * x + y * y)
-            direction = int(math.floor((math.atan2(y, x) - sensors[s, 2]) * bins / (2.0 * math.pi))) % bins
+            direction = math.floor((math.atan2(y, x) - sensors[s, 2]) * bins / (2.0 * math.pi)) % bins
             ray = profiles[s, direction]
             if ray > 0.0:
                 margin = _MARGIN_M + _MARGIN_SHARE * away
