@@ -30,7 +30,7 @@ class ScanGraphConfig:
     """How key scans are optimised.
 
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
-    at once where a new loop is ``surprise`` deviations off the graph. Loops are damped as by Cauchy, ``kernel``
+    at once where a new loop is ``surprise`` deviations off the graph. Steps and loops are damped as by Cauchy, ``kernel``
     deviations wide. To each step's covariance come ``step_m`` and ``step_deg`` (deviations), which registration in the
     same few key scans does not see.
     """
@@ -40,7 +40,7 @@ class ScanGraphConfig:
     iterations: int = 5
     keys_between: int = 8
     surprise: float = 3.0
-    kernel: float = 1.0
+    kernel: float = 3.0
     step_m: float = 0.005
     step_deg: float = 0.15
 

@@ -1,7 +1,8 @@
 """A pose graph over key scans: a chain of steps and robust loops, each with a whole information matrix.
 
-It is the loop closing of the Neural Graph Optimizer where no network takes part: every iteration gates each loop by its
-residual under the current poses, and takes a Gauss-Newton step. It begins at the last solution.
+It is the loop closing of the Neural Graph Optimizer where no network takes part: every iteration gates loops and steps by
+their residuals under the current poses, and takes a Gauss-Newton step. It begins at the last solution. A step is gated,
+as well, since registration can be wrong and sure of it: the graph may break there if loops say so.
 """
 
 from dataclasses import dataclass
@@ -69,9 +70,10 @@ class ScanPoseGraph:
 
     Args:
         steps: of node 0 to the last, in their order.
-        loops: between any two nodes; their residuals are damped as by Cauchy, ``kernel`` deviations wide.
+        loops: between any two nodes.
         gates: trust in each loop ``(n,)``, zero to one.
         poses: where to begin ``(nodes, 3)``, node 0 at the place where it stays.
+        kernel: width of the Cauchy kernel on all residuals, in deviations.
     """
 
     def __init__(
@@ -90,9 +92,11 @@ class ScanPoseGraph:
 
     def iterate(self) -> None:
         """Gate the loops by their residuals, and take a step that lowers the cost."""
-        squared = (self._loops.residuals(self.poses) ** 2).sum(1)
-        self.weights = self._gates / (1.0 + squared / self._kernel**2)
-        factors = [self._steps.factors(self.poses), self._loops.factors(self.poses, self.weights)]
+        self.weights = self._gates * self._kernel_weights(self._loops)
+        factors = [
+            self._steps.factors(self.poses, self._kernel_weights(self._steps)),
+            self._loops.factors(self.poses, self.weights),
+        ]
         self.equations = NormalEquations(factors, self._structure)
         step = self.equations.step()[0].numpy()
         for _ in range(_HALVINGS):
@@ -108,7 +112,11 @@ class ScanPoseGraph:
         self.converged = bool(np.abs(step).max() < _LEAST_STEP)
         self.poses, self._cost = poses, cost
 
+    def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
+        squared = (measured.residuals(self.poses) ** 2).sum(1)
+        weights: np.ndarray = 1.0 / (1.0 + squared / self._kernel**2)
+        return weights
+
     def _total(self, poses: np.ndarray) -> float:
-        chain = float((self._steps.residuals(poses) ** 2).sum())
-        squared = (self._loops.residuals(poses) ** 2).sum(1)
-        return chain + float(self._kernel**2 * (self._gates * np.log1p(squared / self._kernel**2)).sum())
+        costs = [np.log1p((x.residuals(poses) ** 2).sum(1) / self._kernel**2) for x in (self._steps, self._loops)]
+        return float(self._kernel**2 * (costs[0].sum() + (self._gates * costs[1]).sum()))
