@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 _KINDS = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
 # A relative, absolute or private name, whose parts may hold substitutions such as {node}.
 _PART = r"(?:[A-Za-z_]|\{[A-Za-z_]\w*\})(?:\w|\{[A-Za-z_]\w*\})*"
-_TOPIC_NAME = re.compile(rf"(?:~|(?:~?/)?{_PART}(?:/{_PART})*)", re.ASCII)
+_TOPIC_NAME = re.compile(rf"~|~?/?{_PART}(?:/{_PART})*", re.ASCII)
 
 
 class BadParameter(ValueError):
@@ -183,7 +183,7 @@ def described(entry: "Field[Any]") -> str:
 
 def is_topic_name(value: str) -> bool:
     """Whether ROS takes this as the name of a topic."""
-    return _TOPIC_NAME.fullmatch(value) is not None and "__" not in value
+    return _TOPIC_NAME.fullmatch(value) is not None
 
 
 def _choice(choices: tuple[str, ...]) -> str:
