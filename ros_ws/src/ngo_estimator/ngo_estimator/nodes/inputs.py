@@ -8,7 +8,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible, qos_policy_name_from_kind
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from ngo_estimator.nodes.qos import overridable
+from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.odometry.source_guard import SourceGuard
 

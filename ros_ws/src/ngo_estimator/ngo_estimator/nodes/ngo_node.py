@@ -20,12 +20,13 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.nodes.process import run_node
+from ngo_common.nodes.qos import checked_overrides, overridable
+from ngo_common.settings import usage
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
-from ngo_estimator.nodes.parameters import LiveSettings
-from ngo_estimator.nodes.process import run_node
-from ngo_estimator.nodes.qos import checked_overrides, overridable
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 NAME = "ngo_node"
 _DEPTH = 100
 _PENDING_S = 0.3
+_SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -48,7 +50,7 @@ class NgoNode(LifecycleNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        super().__init__(NAME)
         self._live = LiveSettings(self, NgoNodeSettings)
         self._live.on_change(self._on_settings)
         self._built, self._listening = ExitStack(), ExitStack()  # what cleanup and deactivate undo
@@ -57,7 +59,8 @@ class NgoNode(LifecycleNode):
         self._inputs: list[Input] = []
         self._configured = False
         if not self._settings.autostart:
-            self.get_logger().info("unconfigured: waits to be told, as with ros2 lifecycle set")
+            name = self.get_fully_qualified_name()
+            self.get_logger().info(f"unconfigured: waits for `ros2 lifecycle set {name} configure`")
 
     @property
     def _settings(self) -> NgoNodeSettings:
@@ -190,7 +193,8 @@ class NgoNode(LifecycleNode):
         listening.callback(self._inputs.clear)
         self._status.idle = ""
         listening.callback(setattr, self._status, "idle", "inactive")
-        self.get_logger().info(f"ready: {settings.world}, the last {settings.window_frames} frames")
+        name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
+        self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
     def _begin_anew(self) -> None:
         """What belongs to one trajectory."""
@@ -361,7 +365,8 @@ def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(NAME, lambda: NgoNode().start()))
+    text = usage("ngo_estimator", NAME, _SUMMARY, NgoNodeSettings)
+    sys.exit(run_node(NAME, lambda: NgoNode().start(), text))
 
 
 if __name__ == "__main__":

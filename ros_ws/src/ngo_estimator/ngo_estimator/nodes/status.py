@@ -11,8 +11,8 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
+from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.messages import to_time
-from ngo_estimator.nodes.qos import overridable
 
 _QUIET_S = 5.0
 """Least time between two warnings of one kind."""

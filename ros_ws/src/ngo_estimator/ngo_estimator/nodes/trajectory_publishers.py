@@ -13,9 +13,9 @@ from rclpy.lifecycle import LifecycleNode, LifecyclePublisher
 from rclpy.timer import Timer
 from visualization_msgs.msg import MarkerArray
 
+from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.messages import loop_markers, trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.nodes.qos import overridable
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.online.publication_pace import PublicationPace
 

@@ -10,8 +10,7 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image, LaserScan
 
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
-from ngo_sim.nodes.process import run_simulator
-from ngo_sim.nodes.simulator_node import SimulatorNode
+from ngo_sim.nodes.simulator_node import SimulatorNode, run_simulator
 from ngo_sim.simulation import Frame, World
 
 
@@ -46,14 +45,14 @@ class Maze2DNode(SimulatorNode):
             scan_time=self._world.period_s,
             range_max=math.hypot(*self._world.maze.size_m),
         )
-        scan.header.stamp, scan.header.frame_id = stamp, self.config.base_frame
+        scan.header.stamp, scan.header.frame_id = stamp, self.framed(self.config.base_frame)
         scan.ranges = array.array("f", frame.observation[::-1, 3].tobytes())
         self._scan.publish(scan)
         rays, channels = frame.observation.shape
         image = Image(
             height=1, width=rays, encoding="32FC4", step=rays * channels * 4, is_bigendian=sys.byteorder == "big"
         )
-        image.header.stamp, image.header.frame_id = stamp, self.config.camera_frame
+        image.header.stamp, image.header.frame_id = stamp, self.framed(self.config.camera_frame)
         image.data = array.array("B", frame.observation.tobytes())
         self._image.publish(image)
 
