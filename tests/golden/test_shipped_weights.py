@@ -21,7 +21,7 @@ from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive, corrected, estimat
 TOLERANCE_M, TOLERANCE_RAD = 0.001, 0.001
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def golden(world: str) -> tuple[GoldenDrive, list[RelativeStep]]:
     """A stored drive, and the odometry that the shipped local network makes of it."""
     drive = GoldenDrive.load(world)
