@@ -6,8 +6,8 @@ import torch
 
 from ngo_estimator.optimizer.gauss_newton import Factors, gauss_newton_step, node_covariance
 from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
-from tests.unit.ngo_estimator.samples import optimized, small_optimizer, trajectory_inputs
 from tests.unit.ngo_estimator.optimizer.test_gauss_newton import BLOCKS, random_graph
+from tests.unit.ngo_estimator.samples import optimized, small_optimizer, trajectory_inputs
 
 
 def equations(factors: list[Factors]) -> NormalEquations:
