@@ -15,7 +15,6 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,10 +25,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import PlaceNetworks, load_local, load_place
-from ngo_estimator.networks.compass import Compass, load_compass, read_frames
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.compass_closure import frames_to_read
 from training.common import runs
 from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
 from training.data.drive_plan import Driven, driven_in_table
@@ -45,9 +42,8 @@ if TYPE_CHECKING:
 
 _GROUP = 8  # mazes of one size
 _MADE_WITH = "networks.json"
-_COMPASS = ("compass", "compass_log_scale")
 STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
-"""The arrays of a feature store, without those of a compass."""
+"""The arrays of a feature store."""
 _MOST_STEPS = 1000  # of a stretch of a recording
 _CHUNK = 64  # steps at once: their activations stay in a CPU's cache (a fifth faster than 256)
 _FOR_ONE_OTHER = 5  # trajectories of the world's driver
@@ -73,8 +69,6 @@ class Arguments:
     """Folder with NAME/local_pose_network.safetensors and NAME/place_encoder.safetensors."""
     out: Path = runs.ROOT / "runs"
     """Folder that gets NAME/features/."""
-    compass: Path | None = None
-    """Folder with WORLD/compass.safetensors, for stores that also hold the readings of a compass."""
     part: int = 0
     """This process makes the groups of mazes whose number leaves this rest ..."""
     parts: int = 1
@@ -143,14 +137,6 @@ def step_features(
     }
 
 
-@torch.inference_mode()
-def readings_of(world: World, compass: Compass, episode: Episode) -> dict[str, np.ndarray]:
-    """What a compass reads in the ``frames_to_read`` of an episode."""
-    frames = frames_to_read(len(episode.actions), _BLOCK)
-    readings, log_scale = read_frames(compass, images_of(world, episode)[frames])
-    return {"compass": readings.numpy(), "compass_log_scale": log_scale.numpy()}
-
-
 def driven_in(arguments: Arguments, world: World) -> dict[str, Driven]:
     """The trajectories of each store that is to be made."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
@@ -194,10 +180,7 @@ def main(arguments: Arguments) -> None:
         check_networks(store, local_description, place_description)
         (store / _MADE_WITH).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
         part = (arguments.part, arguments.parts)
-        fill(store, "done", world, driven, part, lambda e: features_of(world, e, folder, (local, place)))
-        if arguments.compass is not None:
-            compass, _ = load_compass(arguments.compass / world.name, world.name)
-            fill(store, "compass_done", world, driven, part, partial(readings_of, world, compass))
+        fill(store, world, driven, part, lambda e: features_of(world, e, folder, (local, place)))
 
 
 def _check_count(store: Path, count: int) -> None:
@@ -235,16 +218,15 @@ def _main_recorded(arguments: Arguments) -> None:
 
 def fill(
     store: Path,
-    name: str,
     world: World,
     driven: Driven,
     part: tuple[int, int],
     arrays_of: Callable[[Episode], dict[str, np.ndarray]],
 ) -> None:
     """Make arrays of a store from the episodes in the mazes of ``seeds``, those of this process that are not done."""
-    progress = store / f"{name}.{part[0]}of{part[1]}.json"
+    progress = store / f"done.{part[0]}of{part[1]}.json"
     mine = set(json.loads(progress.read_text())) if progress.exists() else set()
-    done = mine | _done(store, name)
+    done = mine | _done(store)
     for first in tqdm(_groups(len(driven.seeds), *part), desc=f"{world.name} {store.name}"):
         if first in done:
             continue
@@ -276,22 +258,20 @@ def training_stores(
     return train, validation
 
 
-def open_store(store: Path, with_compass: bool = False, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:
+def open_store(store: Path, stored: Sequence[str] = STORED) -> dict[str, np.ndarray]:
     """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
-    names = [*stored, *(_COMPASS if with_compass else ())]
     hint = "run `python -m training.featurise` first, with as many trajectories as the other stores were made with"
-    if missing := [name for name in names if not (store / f"{name}.npy").exists()]:
+    if missing := [name for name in stored if not (store / f"{name}.npy").exists()]:
         raise runs.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")
-    arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in names}
+    arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in stored}
     count = len(arrays["relative"])
-    for name in ["done", *(["compass_done"] if with_compass else [])]:
-        if left := set(range(0, count, _GROUP)) - _done(store, name):
-            raise runs.RunError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
+    if left := set(range(0, count, _GROUP)) - _done(store):
+        raise runs.RunError(f"{store} lacks {len(left)} of {-(-count // _GROUP)} groups of trajectories: {hint}")
     return arrays
 
 
-def _done(store: Path, name: str) -> set[int]:
-    return {first for path in store.glob(f"{name}.*.json") for first in json.loads(path.read_text())}
+def _done(store: Path) -> set[int]:
+    return {first for path in store.glob("done.*.json") for first in json.loads(path.read_text())}
 
 
 def _array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memmap:

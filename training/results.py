@@ -28,7 +28,7 @@ from training.report.training_records import trainings_json
 from training.scoring.error_cache import Measured, measure
 from training.scoring.oracle_rows import LIMITED_WORLDS, LIMITS, limit_estimator
 from training.scoring.row_estimators import Arrays, Prepared, estimators
-from training.scoring.table_rows import COMPASS_WORLDS, ROWS, Sources, rows_of
+from training.scoring.table_rows import ROWS, Sources, rows_of
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]
     world, record = world_named(arguments.world), runs.record("results", arguments)
     trajectories, prefixes = arguments.trajectories or world.table_trajectories, arguments.prefixes or world.prefixes
     arguments = replace(arguments, trajectories=trajectories, prefixes=prefixes)
-    has_compass = world.name in COMPASS_WORLDS
-    sources = Sources(world, arguments.weights, arguments.runs, arguments.out, has_compass)
+    sources = Sources(world, arguments.weights, arguments.runs, arguments.out)
     prepare(sources, Wanted(arguments.split, arguments.trajectories, arguments.seeds), scripts or Scripts())
     stores = {table: table_data(arguments, sources, table).arrays for table in world.tables}
     measured = {table: measured_rows(arguments, sources, table) for table in world.tables}
@@ -104,7 +103,7 @@ def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "l
     own = kind.own_networks or kind.odometry is not None
     sources = sources.of_row(row, 0) if own else sources
     folder = sources.store_folder(arguments.split, table)
-    arrays = open_store(folder, sources.has_compass) if kind.odometry is None else open_odometry(folder)
+    arrays = open_store(folder) if kind.odometry is None else open_odometry(folder)
     count, steps = arrays["relative"].shape[:2]
     if count < arguments.trajectories:
         raise ValueError(

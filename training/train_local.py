@@ -30,7 +30,6 @@ from ngo_recordings.errors import RecordingError
 from training.common import runs
 from training.common.data_module import StreamedData
 from training.data.data_source import Domain
-from training.data.looks import LooksName, check_looks
 from training.data.streams import (
     ACTION_HISTORY,
     Batch,
@@ -41,15 +40,15 @@ from training.data.streams import (
     relative_poses,
     simulate,
 )
-from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
 from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
 HEADING_WEIGHT = 3.0
 LIKELIHOOD_WEIGHT = 0.1
-_ONE_LOOK = 4
-"""Mazes of one look among those that a network is measured and calibrated in, where looks are drawn."""
+CALIBRATION_MAZES = 64
+"""Mazes that the output of a world's network is calibrated in."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,6 @@ class Arguments(runs.TrainerArguments):
     """How many of the latest actions a network is told, if any; none: the world's number, twelve of recordings."""
     error_windows: tuple[int, ...] | None = None
     """Numbers of consecutive steps whose errors count added up; none: the world's."""
-    looks: LooksName | None = None
-    """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8
@@ -80,11 +77,6 @@ class Arguments(runs.TrainerArguments):
     """Highest learning rate of the one-cycle schedule."""
     validation_mazes: int = 8
     """Mazes of the validation split that each epoch is measured on."""
-    calibration_mazes: int | None = None
-    """Mazes that the network's output is calibrated in; None: 64."""
-    picture_height: int | None = None
-    """Rows of the pictures of the 3D world, a whole part of its own or a larger size of the simulator's; None: its
-    own."""
     workers: int = 1
     """Processes that simulate for each one that trains."""
     seed: int = 0
@@ -96,13 +88,8 @@ class Arguments(runs.TrainerArguments):
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
-        check_looks(self.world, self.looks)
         if self.without_action and self.world is None:
             raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
-        if self.picture_height is not None and self.world is None:
-            raise ValueError(
-                "picture_height is given with recordings; expected --reduction, which makes theirs smaller"
-            )
         if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
             raise ValueError(f"action_history is {self.action_history}; expected 1 to {ACTION_HISTORY}")
         if self.action_history is not None and self.without_action:
@@ -110,8 +97,6 @@ class Arguments(runs.TrainerArguments):
         if self.error_windows is not None and (self.world is None or min(self.error_windows, default=0) < 1):
             given = f"{self.error_windows}{' with recordings' if self.world is None else ''}"
             raise ValueError(f"error_windows is {given}; expected numbers of steps, each at least 1, of a world")
-        if self.calibration_mazes is not None and self.calibration_mazes < 1:
-            raise ValueError(f"calibration_mazes is {self.calibration_mazes}; expected at least 1")
 
 
 class LocalTraining(lightning.LightningModule):
@@ -153,9 +138,7 @@ class LocalTraining(lightning.LightningModule):
 
 def simulated_world(arguments: Arguments) -> World:
     """The world that the arguments name, as they ask for it."""
-    world = world_looking(str(arguments.world), arguments.looks)
-    if arguments.picture_height is not None:
-        world = world.with_pictures(arguments.picture_height)
+    world = world_named(str(arguments.world))
     if arguments.action_history is not None:
         world = dataclasses.replace(world, action_history=arguments.action_history)
     if arguments.error_windows is not None:
@@ -192,7 +175,7 @@ class SimulatedSteps:
         return episode_pairs(self.world, list(VALIDATION_SEEDS[: self.arguments.validation_mazes]))
 
     def unseen(self) -> list[Batch]:
-        return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-(self.arguments.calibration_mazes or 64) :]))
+        return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-CALIBRATION_MAZES:]))
 
     def typical(self) -> Tensor:
         return torch.cat([p["relative"] for p in episode_pairs(self.world, list(TRAIN_SEEDS[:8]))])
@@ -201,9 +184,7 @@ class SimulatedSteps:
 def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
     """All consecutive frames of an episode in each of the mazes ``seeds``."""
     result = []
-    together = len(seeds) if world.looks is None else _ONE_LOOK
-    groups = [seeds[first : first + together] for first in range(0, len(seeds), together)]
-    for episode in (episode for group in groups for episode in simulate(world, group, 1000)):
+    for episode in simulate(world, seeds, 1000):
         images = images_of(world, episode)
         pairs = {"earlier": images[:-1], "later": images[1:], "relative": relative_poses(episode.poses_xyyaw)}
         if world.actions:
@@ -327,7 +308,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         windows, settings = (1,), None  # pairs of recordings are shuffled one by one
     kind = "local-no_action" if arguments.without_action else "local"
     run = runs.Run(
-        arguments.runs / domain.name / (kind if arguments.looks is None else f"{kind}-{arguments.looks}"),
+        arguments.runs / domain.name / kind,
         "train_local",
         arguments,
         arguments.epochs,

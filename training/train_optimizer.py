@@ -31,9 +31,9 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.loop_closing import OVERLAPS_AFTER
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.neural_graph_optimizer import (
-    OVERLAPS_AFTER,
     NeuralGraphOptimizer,
     NeuralGraphOptimizerConfig,
 )
@@ -44,7 +44,6 @@ from training.data.trajectories import (
     StoredTrajectories,
     StretchData,
     correction_scale,
-    fixes_of,
     loops_of,
     rmse_figures,
 )
@@ -70,8 +69,6 @@ class Arguments(runs.TrainerArguments):
     """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
     iterations: int = 5
     """Attend-optimise iterations."""
-    compass: bool = False
-    """Whether it takes the readings of a compass, for rows of results of their own (2D)."""
     smoothing: bool | None = None
     """Whether odometry is smoothed before loops are closed, as ``train_smoother`` learned to; by default as suits the
     world, and not of recordings."""
@@ -151,9 +148,8 @@ class OptimizerTraining(lightning.LightningModule):
             optimizer.smoother.requires_grad_(False)  # it has learned what it can, at a rate of its own
 
     def forward(self, batch: Batch) -> Any:
-        fixes = fixes_of(batch, self.optimizer.block, self.domain.block_m)
         loops = loops_of(batch, self.registration)
-        return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops, fixes)
+        return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops)
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         block = self.optimizer.block
@@ -241,7 +237,6 @@ def config_of(
         aggregation=aggregation,
         search=search,
         network=arguments.form == "loops",
-        compass=arguments.compass,
         **changes,
     )
 
@@ -278,11 +273,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     config = config_of(arguments, domain, (1.0, 1.0, 1.0), made_of) if optimizer is None else optimizer.config
     search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
-    train = StoredTrajectories(stores[0], search, place.pair_head, block, arguments.compass)
-    validation = StoredTrajectories(stores[1], search, place.pair_head, block, arguments.compass)
-    form = arguments.form + ("-compass" if arguments.compass else "")
+    train, validation = (StoredTrajectories(some, search, place.pair_head, block) for some in stores)
     run = runs.Run(
-        arguments.runs / domain.name / f"optimizer-{form}-{arguments.iterations}-seed{arguments.seed}",
+        arguments.runs / domain.name / f"optimizer-{arguments.form}-{arguments.iterations}-seed{arguments.seed}",
         "train_optimizer",
         arguments,
         chosen.epochs,

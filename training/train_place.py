@@ -26,9 +26,8 @@ from ngo_estimator.networks.place_encoder import PlaceConfig
 from training.common import runs
 from training.common.data_module import StreamedData
 from training.data.data_source import Domain
-from training.data.looks import LooksName, check_looks
 from training.data.streams import Batch, PlaceStream, Share
-from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_looking
+from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
 from training.recordings.recording_source import (
     NO_LOOPS,
     RecordedArguments,
@@ -48,8 +47,6 @@ class Arguments(runs.TrainerArguments):
     """World to train for."""
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
     """Recordings to train on instead."""
-    looks: LooksName | None = None
-    """Looks of the 3D world's mazes; none: all textures, one light and one width."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 10
@@ -73,7 +70,6 @@ class Arguments(runs.TrainerArguments):
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
-        check_looks(self.world, self.looks)
 
 
 class PlaceTraining(lightning.LightningModule):
@@ -199,7 +195,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     places: Places
     if recorded is None:
-        world = world_looking(str(arguments.world), arguments.looks)
+        world = world_named(str(arguments.world))
         domain: Domain = world
         places = SimulatedPlaces(arguments, world)
     else:
@@ -210,7 +206,7 @@ def main(arguments: Arguments) -> dict[str, float]:
             _write_untrained(arguments, recorded, found.too_few)
             return {}
     run = runs.Run(
-        arguments.runs / domain.name / ("place" if arguments.looks is None else f"place-{arguments.looks}"),
+        arguments.runs / domain.name / "place",
         "train_place",
         arguments,
         arguments.epochs,

@@ -13,7 +13,6 @@ from training import (
     featurise,
     results,
     throughput,
-    train_compass,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -161,9 +160,6 @@ def scripts(world: Any, folder: Path) -> prerequisites.Scripts:
     return prerequisites.Scripts(
         local=local(world, folder),
         place=place(world, folder),
-        compass=train_compass.Arguments(
-            world="maze2d", width=4, epochs=1, datapoints=1, batch_size=32, validation_mazes=2, workers=0
-        ),
         features=features(world, folder),
         smoother=smoother(world, folder),
         optimizer=optimizer(world, folder),

@@ -52,7 +52,7 @@ def make_odometry(row: str, sources: Sources, split: str, table: str, count: int
         relative = steps_of(images_of(world, episode)).numpy()
         return {"relative": relative, "truth": seen_from_first(episode.poses_xyyaw)[1:]}
 
-    fill(store, "done", world, driven_in_table(world, table, split, count), (0, 1), arrays_of)
+    fill(store, world, driven_in_table(world, table, split, count), (0, 1), arrays_of)
 
 
 def _network(kind: str, folder: Path, world: str) -> tuple[Callable[[Tensor], Tensor], str]:

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from ngo_estimator.data.images import reduced
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION
 from training.data.data_source import MIRRORED_ACTIONS
@@ -23,6 +22,7 @@ from training.data.worlds import DRAWN, MazeSize, World
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
+    from ngo_sim.mazes import Maze
 
 Batch = dict[str, Tensor]
 
@@ -59,9 +59,7 @@ def episodes_in(
 
 
 def images_of(world: World, episode: Episode) -> Tensor:
-    """An episode's observations as ``(frames, height, width, channels)``, made smaller where the format says so."""
-    if world.image.reduction > 1:
-        return torch.from_numpy(np.stack([reduced(frame, world.image.reduction) for frame in episode.observations]))
+    """An episode's observations as ``(frames, height, width, channels)``."""
     return torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
 
 
@@ -275,7 +273,9 @@ class PlaceStream(_Stream):
                     "maze": torch.full((len(chosen),), maze),
                 }
                 if angles is not None:
-                    part["ranges"] = ranges_of(episode, chosen, angles)
+                    plan = episode.maze
+                    assert plan is not None
+                    part["ranges"] = torch.from_numpy(wall_ranges(plan, episode.poses_xyyaw[chosen], angles))
                 parts.append(part)
             batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             yield mirrored(batch) if count % 2 else batch
@@ -311,13 +311,17 @@ class TrajectoryStream(_Stream):
             yield mirrored(batch) if count % 2 else batch
 
 
-def ranges_of(episode: Episode, frames: np.ndarray, angles_rad: np.ndarray) -> Tensor:
-    """True ranges ``(*frames.shape, rays)`` in m of the walls in some frames of an episode in a maze."""
-    from training.data.wall_view import wall_ranges
+def wall_ranges(maze: Maze, poses_xyyaw: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
+    """True distances ``(..., rays)`` in m, float32, of the first walls along rays from poses ``(..., 3)``."""
+    from ngo_sim.raycast import cast_rays  # training on recordings does without the simulators
 
-    assert episode.maze is not None  # worlds are mazes
-    ranges = wall_ranges(episode.maze, episode.poses_xyyaw[frames.ravel()], angles_rad)
-    return torch.from_numpy(ranges).unflatten(0, frames.shape)
+    poses = poses_xyyaw.reshape(-1, 3)
+    scans = np.empty((len(poses), len(angles_rad), 4), dtype=np.float32)  # colour, not asked for, and distance
+    colours = np.zeros((*maze.walls.shape, 3), dtype=np.float32)
+    rays = np.cos(angles_rad), np.sin(angles_rad)
+    for (x, y, yaw), scan in zip(poses.tolist(), scans, strict=True):
+        cast_rays(maze.walls, maze.block_m, x, y, yaw, *rays, colours, scan)
+    return scans[..., 3].reshape(*poses_xyyaw.shape[:-1], len(angles_rad))
 
 
 def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.ndarray:

@@ -5,18 +5,14 @@ The simulators are loaded where an environment is made: training on recordings d
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
-from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
-from training.data.looks import TRAINING_LOOKS, Looks, LooksName, check_looks
 
 if TYPE_CHECKING:
     import gymnasium
@@ -78,10 +74,8 @@ class World(Domain):
     corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and ``extra_openings`` the
     ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of trajectories that
     results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how many steps their
-    errors are given. ``simulator`` holds its settings that are not its own defaults. ``looks`` is what ``make_random``
-    draws beside a size, None: nothing, the simulator's own looks. ``error_windows`` says over how many consecutive
-    steps errors of odometry are added up in training: beside those of single steps, these drift. No driver here drives
-    backwards, whether the world ``reverses`` or not.
+    errors are given. In training, errors of odometry are summed over windows of ``error_windows`` steps: errors that
+    last make the sum drift. No driver here drives backwards, whether the world ``reverses`` or not.
     """
 
     driver: str
@@ -93,12 +87,7 @@ class World(Domain):
     tables: dict[str, Table]
     table_trajectories: int = 64
     prefixes: tuple[int, ...] = (250, 500, 750, 1000)
-    looks: Looks | None = None
     error_windows: tuple[int, ...] = (1,)
-    simulator: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_looks(self.name, self.looks)
 
     @property
     def stream_drivers(self) -> tuple[str, ...]:
@@ -123,11 +112,9 @@ class World(Domain):
     def validation_stores(self) -> tuple[str, ...]:
         return tuple(f"validation_{table}" for table in self.unseen_tables)
 
-    def make(
-        self, rows: int | None = None, extra_openings: int | None = None, look: Mapping[str, Any] | None = None
-    ) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of this size and look (``Looks.draw``), by default the simulator's own."""
-        changes: dict[str, Any] = {**self.simulator, **(look or {})}
+    def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
+        """An environment with mazes of this size, by default the simulator's own."""
+        changes: dict[str, Any] = {}
         if rows is not None:
             changes.update(rows=rows, cols=rows)
         if extra_openings is not None:
@@ -143,34 +130,6 @@ class World(Domain):
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
         return Maze3D(Maze3DConfig(**changes))
-
-    def with_corridors(self, block_m: float) -> World:
-        """The world with corridors of this width, m."""
-        return dataclasses.replace(self, block_m=block_m, simulator={**self.simulator, "block_m": block_m})
-
-    def with_pictures(self, height: int) -> World:
-        """The 3D world in pictures of another height: larger ones are simulated, smaller ones means of its own pixels.
-
-        Raises ``ValueError`` in another world, or for a height that is no whole part of the world's own; the simulator
-        refuses larger ones that it cannot make.
-        """
-        own = self.image
-        if self.name != "maze3d":
-            raise ValueError(f"pictures of height {height} are asked of {self.name}; expected maze3d")
-        if height > own.height:
-            width = height * own.width // own.height
-            larger = ImageFormat(height, width, own.channels, own.dtype)
-            return dataclasses.replace(
-                self, image=larger, simulator={**self.simulator, "width": width, "height": height}
-            )
-        if height < 1 or own.height % height or own.width % (own.height // height):
-            raise ValueError(
-                f"height of pictures is {height}; expected a whole part of {own.height} that leaves one of the width of"
-                f" {own.width}, or more than that"
-            )
-        factor = own.height // height
-        smaller = ImageFormat(height, own.width // factor, own.channels, own.dtype, reduction=factor)
-        return dataclasses.replace(self, image=smaller)
 
     def table_seeds(self, table: str, split: str) -> range:
         """Seeds of a table's episodes in the ``validation`` or ``test`` split."""
@@ -199,16 +158,12 @@ class World(Domain):
         return self.tables[table].driver or self.driver
 
     def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of ``size``, a random size and number of openings where that has None.
-
-        Where the world has ``looks``, one of these is drawn after the size.
-        """
+        """An environment with mazes of ``size``; a random size and number of openings where that has None."""
         rows = int(rng.integers(self.rows[0], self.rows[1] + 1))
         openings = int(rng.integers(self.extra_openings[0], self.extra_openings[1] + 1))
         return self.make(
             rows if size.rows is None else size.rows,
             openings if size.extra_openings is None else size.extra_openings,
-            None if self.looks is None else self.looks.draw(rng),
         )
 
 
@@ -297,9 +252,3 @@ def world_named(name: str) -> World:
     if name not in WORLDS:
         raise ValueError(f"world is {name!r}; expected one of {', '.join(WORLDS)}")
     return WORLDS[name]
-
-
-def world_looking(name: str, looks: LooksName | None) -> World:
-    """The world called ``name``, with the looks of a training that have this name; None: its own."""
-    world = world_named(name)
-    return world if looks is None else dataclasses.replace(world, looks=TRAINING_LOOKS[looks])

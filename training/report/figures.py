@@ -46,9 +46,6 @@ COLORS = {
     "true_pairs": "#bcbd22",
     "oracle": "#9a9a9a",
     "end_to_end": "#e377c2",
-    "gtsam_compass": "#17becf",
-    "ngo_1_compass": "#f2a3a3",
-    "ngo_5_compass": "#d62728",
 }
 MAIN_ROWS = (
     "local",
@@ -56,14 +53,12 @@ MAIN_ROWS = (
     "paper_5",
     "gtsam",
     "oracle",
-    "gtsam_compass",
     "ngo_1",
     "registered",
     "gtsam_registered",
     "smoothed",
     "gtsam_smoothed",
     "ngo_5",
-    "ngo_5_compass",
 )
 CORRECTED_ROW = "ngo_5"
 

@@ -37,12 +37,6 @@ PAIRS = (
     ("ngo_5", "oracle"),
     ("gtsam", "oracle"),
     ("end_to_end", "ngo_5"),
-    ("gtsam_compass", "local"),
-    ("ngo_1_compass", "local"),
-    ("ngo_5_compass", "local"),
-    ("ngo_5_compass", "ngo_1_compass"),
-    ("ngo_5_compass", "gtsam_compass"),
-    ("ngo_5_compass", "ngo_5"),
 )
 """Rows that are compared on the same trajectories."""
 

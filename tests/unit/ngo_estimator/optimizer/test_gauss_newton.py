@@ -11,8 +11,9 @@ from ngo_estimator.optimizer.gauss_newton import (
     gauss_newton_step,
     node_covariance,
     pair_factors,
+    step_information,
 )
-from ngo_estimator.optimizer.loop_closure import loop_residuals
+from ngo_estimator.optimizer.loop_residuals import loop_residuals
 from tests.unit.ngo_estimator.samples import make_loops, meta_steps, with_origin
 
 DOUBLE = torch.float64
@@ -27,7 +28,7 @@ def random_graph(seed: int = 0) -> tuple[Tensor, list[Factors]]:
     step_std = 0.02 + 0.2 * torch.rand(1, BLOCKS, 3, generator=generator, dtype=DOUBLE)
     deviation = 0.1 * torch.randn(1, BLOCKS, 3, generator=generator, dtype=DOUBLE)
     information = 50.0 * torch.rand(1, 4, 3, generator=generator, dtype=DOUBLE)
-    chain = chain_factors(poses, deviation, step_std)
+    chain = chain_factors(poses, deviation, step_information(step_std))
     return poses, [chain, pair_factors(loops.nodes, poses, loop_residuals(loops, poses), information)]
 
 
@@ -97,7 +98,7 @@ def test_a_square_that_does_not_close_is_closed_as_by_hand() -> None:
     information = torch.tensor([[[1e8, 1e8, 0.0]]], dtype=DOUBLE)
     residuals = loop_residuals(loops, poses)
     factors = [
-        chain_factors(poses, torch.zeros_like(steps), step_std),
+        chain_factors(poses, torch.zeros_like(steps), step_information(step_std)),
         pair_factors(loops.nodes, poses, residuals, information),
     ]
     after = poses + gauss_newton_step(factors, 5)
@@ -129,7 +130,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
 
     def step(poses: Tensor, deviation: Tensor, step_std: Tensor, residual: Tensor, information: Tensor) -> Tensor:
         factors = [
-            chain_factors(poses, deviation, step_std),
+            chain_factors(poses, deviation, step_information(step_std)),
             pair_factors(loops.nodes, poses, residual, information),
         ]
         return gauss_newton_step(factors, BLOCKS + 1)
@@ -147,7 +148,7 @@ def test_long_chains_with_unlike_deviations_are_solved(loop_information: float) 
     step_std[:, ::2] = 1e-3
     information = torch.full((1, count, 3), loop_information, dtype=DOUBLE)
     factors = [
-        chain_factors(poses, torch.zeros_like(step_std), step_std),
+        chain_factors(poses, torch.zeros_like(step_std), step_information(step_std)),
         pair_factors(loops.nodes, poses, loop_residuals(loops, poses), information),
     ]
     step = gauss_newton_step(factors, blocks + 1)

@@ -34,7 +34,7 @@ def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
 
 @dataclass(frozen=True)
 class Switches:
-    compass: bool = False
+    seen: bool = False
     robust: bool = True
     smoothing: bool | None = None
     prefixes: tuple[int, ...] = (1, 2)
@@ -43,7 +43,7 @@ class Switches:
 @pytest.mark.parametrize(
     ("given", "flags"),
     [
-        (Switches(compass=True), " --compass"),
+        (Switches(seen=True), " --seen"),
         (Switches(robust=False), " --no-robust"),
         (Switches(smoothing=True), " --smoothing True"),
         (Switches(prefixes=(5, 6, 7)), " --prefixes 5 6 7"),

@@ -29,8 +29,8 @@ from training.data.streams import (
     relative_poses,
     revisits,
     simulate,
+    wall_ranges,
 )
-from training.data.wall_view import wall_ranges
 from training.data.worlds import DRAWN, TRAIN_SEEDS, WORLDS, World
 
 WORLD = WORLDS["maze2d"]

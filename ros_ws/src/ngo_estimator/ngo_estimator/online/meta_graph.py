@@ -17,7 +17,8 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, poses_in_blocks
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import Candidates, OnlineLoops
-from ngo_estimator.optimizer.neural_graph_optimizer import MetaSteps, NeuralGraphOptimizer, OptimizedMetaPoses
+from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.registered_odometry import registered_steps
 
 _MOST_DRIFT = 4.0

@@ -80,7 +80,7 @@ def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Te
         )
         similarity = (pick(embeddings, earlier) * pick(embeddings, later)).sum(-1)
     valid = found & (share >= LEAST_SHARED)
-    loops = Loops(
+    return Loops(
         start=torch.where(valid, earlier + 1, later),
         end=later,
         frame=frame,
@@ -92,7 +92,6 @@ def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Te
         valid=valid,
         embeddings=embeddings,
     )
-    return loops if scans.known is None else scans.known(loops)
 
 
 def _shared(config: RegistrationConfig, ranges: Tensor, poses: Tensor, min_separation: int) -> Tensor:
