@@ -5,12 +5,12 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
+
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
-
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, fan, round_trip, scan_at
 
 STEP_NS = 10**8

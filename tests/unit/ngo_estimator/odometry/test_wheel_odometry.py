@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_estimator.odometry.wheel_lag import WheelLag, WheelLagConfig
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry, WheelOdometryConfig

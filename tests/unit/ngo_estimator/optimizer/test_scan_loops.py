@@ -11,7 +11,12 @@ import pytest
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.scan_points import key_scan
-from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
+from ngo_estimator.optimizer.scan_loop_candidates import (
+    WindowConfig,
+    covariance_windows,
+    distance_windows,
+    graph_distances,
+)
 from ngo_estimator.optimizer.scan_loops import EVIDENCE, ScanLoopConfig, ScanLoopFinder, ScanLoops
 from tests.unit.ngo_estimator.optimizer.buildings import MOUNTING, between, drifted, outline, scan_at, way
 
@@ -168,10 +173,44 @@ def test_a_place_match_is_verified_where_the_robot_could_not_be() -> None:
     assert errors(with_matches[with_matches.accepted], TWICE)[0].max() < 0.1
 
 
+def test_scans_that_see_nothing_have_no_loops() -> None:
+    random = np.random.default_rng(0)
+    nothing = [scan_at(outline((100, 0), (101, 0), (101, 1)), pose, random) for pose in TWICE]
+    assert all(len(scan.points) == 0 for scan in nothing)
+    assert len(found(nothing, TWICE)) == 0
+    half = len(TWICE) // 2
+    # Submaps at the end of the first half hold the first keys that see something.
+    late = found(nothing[:half] + scanned(HALLWAY, TWICE)[half:], TWICE).pairs[:, 0]
+    assert (late > half - ScanLoopConfig().submap_keys).all()
+
+
+def test_the_graphs_distance_goes_over_loops() -> None:
+    poses = np.array([(float(k), 0.0, 0.0) for k in range(6)])
+    none, loops = np.zeros((0, 2), np.int64), np.array(((0, 4), (0, 4)))
+    np.testing.assert_allclose(graph_distances(poses, none, 5), [5, 4, 3, 2, 1, 0], atol=0.01)
+    poses[4] = (0.0, 0.5, 0.0)
+    np.testing.assert_allclose(
+        graph_distances(poses, loops, 4), [0.5, 1.5, 2.5, math.hypot(3.0, 0.5), 0.0, math.hypot(5.0, 0.5)], atol=0.01
+    )
+
+
+def test_windows_grow_with_distance_and_with_covariance_up_to_their_limit() -> None:
+    config = WindowConfig(least_m=0.3, share=0.04, most_m=8.0, least_deg=8.0, deg_per_m=0.25, most_deg=45.0)
+    windows = distance_windows(config, np.array((0.0, 100.0, 1000.0)))
+    np.testing.assert_allclose(windows[:, 0], (0.3, 4.3, 8.0))
+    np.testing.assert_allclose(np.degrees(windows[:, 2]), (8.0, 33.0, 45.0))
+    covariances = np.stack([np.diag(variances) for variances in ((1e-6, 1e-6, 1e-6), (0.04, 1.0, 0.04), (99, 99, 9))])
+    windows = covariance_windows(config, covariances)
+    np.testing.assert_allclose(windows[:, :2], ((0.3, 0.3), (3.0, 3.0), (8.0, 8.0)))
+    np.testing.assert_allclose(windows[:, 2], (math.radians(8.0), 0.6, math.radians(45.0)))
+
+
 def test_wrong_shapes_are_refused() -> None:
     scans = scanned(HALLWAY, TWICE[:2])
     with pytest.raises(ValueError, match="expected \\(keys, 3\\)"):
         ScanLoopFinder(ScanLoopConfig()).find(scans, TWICE[:3], np.ones((2, 3)))
+    with pytest.raises(ValueError, match="narrowest"):
+        ScanLoopFinder(ScanLoopConfig(every=1)).find(scans, TWICE[:2], np.zeros((2, 3)))
     with pytest.raises(ValueError, match="shares"):
         ScanLoopConfig(least_response=1.5)
     with pytest.raises(ValueError, match="shapes"):

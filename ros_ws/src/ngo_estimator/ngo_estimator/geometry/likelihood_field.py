@@ -71,8 +71,15 @@ def likelihood_field(points: Array, normals: Array, middle: Array, config: Searc
     """
     side = 2 * math.ceil(config.reach_m / config.cell_m) + 1
     corner = middle - 0.5 * side * config.cell_m
-    drawn = _joined(points, normals, config.cell_m)
-    return LikelihoodField(_field(drawn, corner, side, config.cell_m, config.deviation_m), corner, config)
+    field = LikelihoodField(np.zeros((side, side), dtype=np.float32), corner, config)
+    draw(field, points, normals)
+    return field
+
+
+def draw(field: LikelihoodField, points: Array, normals: Array) -> None:
+    """Draw more points ``(n, 2)`` with normals ``(n, 2)`` into a field."""
+    config = field.config
+    _draw(field.scores, _joined(points, normals, config.cell_m), field.corner, config.cell_m, config.deviation_m)
 
 
 def search(
@@ -129,25 +136,22 @@ def _joined(points: Array, normals: Array, spacing: float) -> Array:
 
 
 @njit(cache=True)
-def _field(points: Array, corner: Array, side: int, cell: float, deviation: float) -> NDArray[np.float32]:
-    scores = np.zeros((side, side), dtype=np.float32)
+def _draw(scores: NDArray[np.float32], points: Array, corner: Array, cell: float, deviation: float) -> None:
     reach = int(math.ceil(2.5 * deviation / cell))
     kernel = np.empty((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
     for i in range(2 * reach + 1):
         for j in range(2 * reach + 1):
             kernel[i, j] = math.exp(-0.5 * ((i - reach) ** 2 + (j - reach) ** 2) * (cell / deviation) ** 2)
-    stamped = np.zeros((side, side), dtype=np.bool_)
+    rows, columns = scores.shape
     for p in range(len(points)):
         row = int(math.floor((points[p, 1] - corner[1]) / cell))
         column = int(math.floor((points[p, 0] - corner[0]) / cell))
-        if not (reach <= row < side - reach and reach <= column < side - reach) or stamped[row, column]:
+        if not (reach <= row < rows - reach and reach <= column < columns - reach) or scores[row, column] == 1.0:
             continue
-        stamped[row, column] = True
         for i in range(2 * reach + 1):
             for j in range(2 * reach + 1):
                 r, c = row + i - reach, column + j - reach
                 scores[r, c] = max(scores[r, c], kernel[i, j])
-    return scores
 
 
 @njit(cache=True)

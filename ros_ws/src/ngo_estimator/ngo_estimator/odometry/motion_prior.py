@@ -44,14 +44,16 @@ class MotionPriorConfig:
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """The prior of a scan's pose in the odometry's frame: ``mean`` ``(3,)`` with ``covariance`` and ``information``
-    ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``step_covariance`` ``(3, 3)`` is that of the
-    motion since the last scan by wheels that are not doubted, along the odometry's axes."""
+    ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``measured`` says that wheels that are not doubted
+    made it; where they moved, ``step_covariance`` ``(3, 3)`` is that of their motion since the last scan, along the
+    odometry's axes. Wheels that stand exactly still may be frozen."""
 
     mean: Array
     covariance: Array
     information: Array
     starts: tuple[Array, ...]
-    step_covariance: Array | None
+    measured: bool = False
+    step_covariance: Array | None = None
 
 
 class MotionPrior:
@@ -103,8 +105,10 @@ class MotionPrior:
             # The wheels' way since the key scan is wrong by what was doubted: go on from the last scan.
             mean = starts[0]
         doubted = self._doubt > 0.0
-        known = None if doubted else np.diag(step_deviations**2)
-        return _prediction(mean, np.diag(deviations**2), tuple(starts), known)
+        moves = not doubted and bool(step.any())
+        return _prediction(
+            mean, np.diag(deviations**2), tuple(starts), not doubted, np.diag(step_deviations**2) if moves else None
+        )
 
     def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
         config = self.config
@@ -112,7 +116,7 @@ class MotionPrior:
         heading = math.radians(config.still_deg) + 0.5 * config.acceleration_rad_s2 * elapsed**2
         deviations = np.array((position, position, min(heading, math.radians(config.largest_deg))))
         mean = compose(last, constant)
-        return _prediction(mean, np.diag(deviations**2) + covariance, (mean,), None)
+        return _prediction(mean, np.diag(deviations**2) + covariance, (mean,))
 
     def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool) -> None:
         """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before."""
@@ -123,5 +127,11 @@ class MotionPrior:
             self._doubt = self._doubt_rad = 0.0
 
 
-def _prediction(mean: Array, covariance: Array, starts: tuple[Array, ...], step_covariance: Array | None) -> Prediction:
-    return Prediction(mean, covariance, np.linalg.inv(covariance), starts, step_covariance)
+def _prediction(
+    mean: Array,
+    covariance: Array,
+    starts: tuple[Array, ...],
+    measured: bool = False,
+    step_covariance: Array | None = None,
+) -> Prediction:
+    return Prediction(mean, covariance, np.linalg.inv(covariance), starts, measured, step_covariance)

@@ -37,6 +37,7 @@ class ScanOdometryConfig:
     poor_deg: float = 5.0
     search_deviations: float = 2.0
     good_share: float = 0.5
+    sure_share: float = 0.7
     wide_m: float = 1.0
     wide_degs: tuple[float, ...] = (30.0, 90.0)
     least_share: float = 0.2
@@ -57,10 +58,10 @@ class ScanOdometryConfig:
             raise ValueError(
                 f"submap_scans, least_points are {self.submap_scans}, {self.least_points}; expected at least 1 and 3"
             )
-        if not 0.0 < self.least_share <= self.good_share <= 1.0:
+        if not 0.0 < self.least_share <= self.good_share <= self.sure_share <= 1.0:
             raise ValueError(
-                f"least_share, good_share are {self.least_share}, {self.good_share}; expected "
-                "0 < least_share <= good_share <= 1"
+                f"least_share, good_share, sure_share are {self.least_share}, {self.good_share}, {self.sure_share}; "
+                "expected 0 < least_share <= good_share <= sure_share <= 1"
             )
 
 
@@ -147,17 +148,19 @@ class ScanOdometry:
             )
             starts.append(search(self._submap.field, on_lines, starts[0], prior, window)[0])
         best = self._best(scan, starts, prior)
+        if best.share >= config.good_share or len(on_lines) < config.least_points:
+            return best, poor
         for wide_deg in config.wide_degs:
-            if best.share >= config.good_share or len(scan.points) < config.least_points:
-                break
-            poor, window = True, (config.wide_m, math.radians(wide_deg))
+            window = (config.wide_m, math.radians(wide_deg))
             if prediction.step_covariance is None:
-                # Nothing measured this prediction, and it led to no fit: it only breaks ties.
+                # Nothing measured this motion, and it led to no fit: it only breaks ties.
                 prior = (prediction.mean, np.diag((2.0 / window[0], 2.0 / window[0], 2.0 / window[1])) ** 2)
             again = self._best(scan, [search(self._submap.field, on_lines, starts[0], prior, window)[0]], prior)
-            if again.share > best.share + 0.1:
+            if again.share > best.share + 0.1 and not self._is_unsure(again, prediction):
                 best = again
-        return best, poor
+            if best.share >= config.sure_share:
+                break
+        return best, True
 
     def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array]) -> Registration:
         """The registration, among those from all starts, that fits most points."""
@@ -184,10 +187,8 @@ class ScanOdometry:
         config = self.config
         if found.share < config.least_share or found.fitted < config.least_points:
             return True
-        if found.share >= config.good_share:
-            return False
-        far = _squared_deviations(found.pose, prediction.mean, prediction.information)
-        return far > config.farthest_deviations**2
+        far = _squared_deviations(found.pose, prediction.mean, prediction.information) > config.farthest_deviations**2
+        return far and found.share < (config.sure_share if prediction.measured else config.good_share)
 
     def _accept(
         self,

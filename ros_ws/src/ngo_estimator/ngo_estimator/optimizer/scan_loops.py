@@ -42,7 +42,8 @@ class ScanLoopConfig:
     Every ``every``-th key asks, at up to ``most_per_key`` places that are ``least_gap_m`` of path and more behind it.
     Places are every ``place_step``-th key, with ``submap_keys`` keys around each; ``source_keys`` keys are searched
     together, by ``search_points`` of their points. A place may be ``reach_m`` outside of the window. A match of places
-    is searched ``match_m`` around the place. ``most_submaps`` submaps are kept.
+    is searched ``match_m`` around the place. Points farther than ``range_m`` from the robot take no part in the search,
+    and ``most_submaps`` submaps are kept: both bound the memory.
 
     A loop needs ``least_response``, at most ``most_second`` of it at another pose, ``least_on_lines`` of the points on
     lines, at most ``most_seen_through`` of the sightings through walls, and at most ``most_disagreement`` deviations
@@ -60,8 +61,9 @@ class ScanLoopConfig:
     source_keys: int = 4
     search_points: int = 300
     reach_m: float = 2.0
-    most_submaps: int = 48
     match_m: float = 4.0
+    range_m: float = 20.0
+    most_submaps: int = 24
     least_response: float = 0.55
     most_second: float = 0.9
     least_on_lines: float = 0.6
@@ -86,11 +88,13 @@ class ScanLoopConfig:
                 "least_response, most_second, least_on_lines, most_seen_through are "
                 f"{shares}; expected shares from 0 to 1"
             )
-        lengths = (self.least_gap_m, self.reach_m, self.match_m, self.agreement_m, self.agreement_deg)
+        lengths = (
+            self.least_gap_m, self.reach_m, self.match_m, self.range_m, self.agreement_m, self.agreement_deg
+        )  # fmt: skip
         if not all(0.0 <= x < math.inf for x in lengths):
             raise ValueError(
-                f"least_gap_m, reach_m, match_m, agreement_m, agreement_deg are {lengths}; expected finite numbers "
-                "from 0 on"
+                f"least_gap_m, reach_m, match_m, range_m, agreement_m, agreement_deg are {lengths}; expected finite "
+                "numbers from 0 on"
             )
         if not (self.most_disagreement >= 0.0 and 0.0 <= self.agreeing_per_deviation < math.inf):
             raise ValueError(
@@ -157,13 +161,14 @@ class ScanLoops:
 
 @dataclass(frozen=True)
 class _Submap:
-    """Scans around a key, in its frame: ``poses`` of the keys from ``first`` on."""
+    """Scans around a key, in its frame: ``poses`` of the keys from ``first`` on, as they were when it was made. Without
+    any point there is no grid."""
 
     first: int
     poses: np.ndarray
     scans: PlacedScans
     lines: LineMap
-    grid: PooledGrid
+    grid: PooledGrid | None
 
 
 @dataclass(frozen=True)
@@ -211,9 +216,10 @@ class ScanLoopFinder:
             self._profiles.append(range_profile(scan))
             near = scan.points[np.linalg.norm(scan.points, axis=1) < 10.0]
             self._middles.append(near.mean(0) if len(near) else np.zeros(2))
-        key = count - 1
-        if key % config.every or len(scans[key].points) == 0:
+        if (count - 1) % config.every:
             return ScanLoops.none()
+        if not (windows > 0.0).all():
+            raise ValueError(f"the narrowest of the windows is {windows.min()}; expected positive half widths")
         found = ScanLoops.none()
         for candidate in self._candidates(poses, windows, matches):
             loop = self._verified(scans, poses, candidate)
@@ -221,9 +227,7 @@ class ScanLoopFinder:
                 found = found.extended(loop)
         return self._agreed(found, poses)
 
-    def _candidates(
-        self, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]
-    ) -> list["_Candidate"]:
+    def _candidates(self, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]) -> list[_Candidate]:
         config, key = self.config, len(poses) - 1
         path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))))
         last = int(np.searchsorted(path, path[-1] - config.least_gap_m)) - config.submap_keys // 2
@@ -259,20 +263,24 @@ class ScanLoopFinder:
         local = _between(poses[place], poses[first:after])
         together = placed(scans[first:after], self._profiles[first:after], local)
         lines = line_map_of_points(together.points, together.normals)
-        submap = _Submap(first, local, together, lines, pooled_grid(self.config.search, together.points))
+        near = _within(together.points, self.config.range_m)
+        grid = pooled_grid(self.config.search, near) if len(near) else None
+        submap = _Submap(first, local, together, lines, grid)
         self._submaps[place] = submap
         if len(self._submaps) > self.config.most_submaps:
             self._submaps.popitem(last=False)
         return submap
 
-    def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: "_Candidate") -> ScanLoops | None:
+    def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: _Candidate) -> ScanLoops | None:
         """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""
         config, key = self.config, len(scans) - 1
         submap = self._submap(scans, poses, candidate.place)
         first = max(0, key + 1 - config.source_keys)
         local = _between(poses[key], poses[first:])
         source = placed(scans[first:], self._profiles[first:], local)
-        chosen = _spread(source.points, config.search.resolution_m, config.search_points)
+        chosen = _spread(_within(source.points, config.range_m), config.search.resolution_m, config.search_points)
+        if submap.grid is None or len(chosen) == 0:
+            return None
         match = search(config.search, submap.grid, chosen, candidate.centre, candidate.window)
         if match is None or match.response < config.least_response:
             return None
@@ -328,6 +336,12 @@ class ScanLoopFinder:
         fresh = np.flatnonzero(accepted & ~loops.accepted)
         self.loops = ScanLoops(pairs, loops.relative, loops.covariance, evidence, accepted)
         return self.loops[fresh]
+
+
+def _within(points: np.ndarray, range_m: float) -> np.ndarray:
+    """The points ``(n, 2)`` within a range of the origin."""
+    near: np.ndarray = points[(points**2).sum(1) <= range_m**2]
+    return near
 
 
 def _spread(points: np.ndarray, cell_m: float, most: int) -> np.ndarray:
