@@ -3,10 +3,7 @@
 import dataclasses
 import hashlib
 import json
-import math
 import os
-import types
-import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +12,7 @@ import safetensors
 from safetensors.torch import load, save
 from torch import nn
 
+from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
@@ -47,7 +45,6 @@ WORLD_IMAGES = {
 ACTION_WORLDS = ("maze2d", "maze3d")
 
 Network = TypeVar("Network", bound=nn.Module)
-Config = TypeVar("Config")
 
 
 class CheckpointError(ValueError):
@@ -68,46 +65,6 @@ class PlaceNetworks(nn.Module):
         changed = PlaceNetworks(dataclasses.replace(self.config, registration=None))
         changed.load_state_dict({k: v for k, v in self.state_dict().items() if not k.startswith("encoder.ranges.")})
         return changed
-
-
-def config_from_dict(kind: type[Config], values: Any) -> Config:
-    """Build a (nested) configuration dataclass from JSON values; unknown and missing keys are errors."""
-    if not isinstance(values, dict):
-        raise ValueError(f"{kind.__name__} is {values!r}; expected an object")
-    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if unknown := sorted(set(values) - set(fields)):
-        raise ValueError(f"{kind.__name__} has unknown keys {unknown}; expected among {sorted(fields)}")
-    hints = typing.get_type_hints(kind)
-    arguments = {}
-    for name, value in values.items():
-        try:
-            arguments[name] = _from_json(hints[name], value)
-        except ValueError as error:
-            raise ValueError(f"{kind.__name__}.{name}: {error}") from error
-    try:
-        return kind(**arguments)
-    except TypeError as error:
-        raise ValueError(f"{kind.__name__}: {error}") from error
-
-
-def _from_json(hint: Any, value: Any) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return config_from_dict(typing.cast("type[Any]", hint), value)
-    if typing.get_origin(hint) is types.UnionType:  # a value or None
-        (hint,) = (one for one in typing.get_args(hint) if one is not type(None))
-        return None if value is None else _from_json(hint, value)
-    if typing.get_origin(hint) is tuple:
-        items = typing.get_args(hint)
-        if not isinstance(value, list) or (items[-1] is not Ellipsis and len(value) != len(items)):
-            raise ValueError(f"{value!r} is given where {hint} is expected")
-        return tuple(_from_json(items[0], item) for item in value)
-    # JSON has one kind of number, and true is no number.
-    allowed = (int, float) if hint is float else hint
-    if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
-        raise ValueError(f"{value!r} is given where {hint.__name__} is expected")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{value!r} is given where a finite number is expected")
-    return value
 
 
 def save_checkpoint(

@@ -4,12 +4,14 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.planar_motion import Array, between
+from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep, key_scan
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
@@ -72,6 +74,11 @@ class LidarOdometry:
         """How often the stamps jumped back by ``RESTART_AFTER_NS`` or more."""
         self.reset()
 
+    @classmethod
+    def load(cls, weights: Path, world: str | None = None) -> "LidarOdometry":
+        """Begin with the settings in the folder ``weights``; raises ``LidarFileError``, of one clear line."""
+        return cls(read_lidar_file(weights, "odometry", LidarOdometryConfig, world))
+
     def reset(self) -> None:
         """Forget everything: the next scan is the new origin of ``odom``."""
         self._core = ScanOdometry(self.config.odometry)
@@ -81,6 +88,7 @@ class LidarOdometry:
         self._last: KeyScan | None = None
         self._last_step: tuple[float, Array] | None = None
         self._origin: KeyScan | None = None
+        self._robot_odom: Array | None = None
         self._key_ns = 0
         self._origin_ns = 0
 
@@ -126,7 +134,9 @@ class LidarOdometry:
             if scan.stamp_ns == newest:
                 raise DuplicateFrame(f"scan at {scan.stamp_ns} ns came twice")
             if scan.stamp_ns > newest - RESTART_AFTER_NS:
-                raise LateFrame(f"scan at {scan.stamp_ns} ns is {(newest - scan.stamp_ns) / 1e9:.3f} s older than the last")
+                raise LateFrame(
+                    f"scan at {scan.stamp_ns} ns is {(newest - scan.stamp_ns) / 1e9:.3f} s older than the last"
+                )
             wheels, stamp_ns = self._wheels, self._newest_wheels_ns
             self.reset()
             self.restarts += 1
@@ -190,8 +200,16 @@ class LidarOdometry:
             unsure=estimate.unsure,
             key=key_step,
             origin_scan=origin,
-            robot_odom_xyyaw=None if self._wheels is None else self._wheels.pose_at(key.stamp_ns),
+            robot_odom_xyyaw=self._robot_odom_at(key.stamp_ns, estimate.step),
         )
+
+    def _robot_odom_at(self, stamp_ns: int, step: Array) -> Array | None:
+        """Pose of the newest scan in the wheels' frame; by our own step while the wheels are silent."""
+        pose = None if self._wheels is None else self._wheels.pose_at(stamp_ns)
+        if pose is None and self._robot_odom is not None:
+            pose = compose(self._robot_odom, step)
+        self._robot_odom = pose
+        return pose
 
     def _key_scan(self, scan: LidarScan) -> KeyScan:
         angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
@@ -199,7 +217,13 @@ class LidarOdometry:
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
         try:
             return key_scan(
-                scan.stamp_ns, angles, scan.ranges, (least, largest), self.mounting, self._sweep(scan), self.config.points
+                scan.stamp_ns,
+                angles,
+                scan.ranges,
+                (least, largest),
+                self.mounting,
+                self._sweep(scan),
+                self.config.points,
             )
         except ValueError as error:
             raise UnusableImage(str(error)) from error

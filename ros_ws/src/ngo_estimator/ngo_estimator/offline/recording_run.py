@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.observations import observation
-from ngo_estimator.data.relative_step import RESTART_AFTER_NS
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.odometry.frame_pairing import FramePairing
-from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
+from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.online.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.files import SpatialPoses, seconds
@@ -26,7 +26,7 @@ _REASONS: dict[type[ValueError], str] = {
 class RecordedStep:
     """What came out of one frame: its motion since the frame before, and the trajectory after it."""
 
-    local: LocalEstimate
+    local: RelativeStep
     update: TrajectoryUpdate
 
 
@@ -35,12 +35,13 @@ class RecordedRun:
     """A whole trajectory, and the truth about its frames, where there is any.
 
     ``truth_residual`` ``(frames, 3)`` is what the projection to the plane leaves out of the truth (z m, roll rad, pitch
-    rad).
+    rad). ``walls`` ``(n, 2)``: points of a lidar's scans at corrected poses.
     """
 
     trajectory: Trajectory
     truth: SpatialPoses | None
     truth_residual: np.ndarray
+    walls: np.ndarray | None = None
 
 
 class RecordingRun:

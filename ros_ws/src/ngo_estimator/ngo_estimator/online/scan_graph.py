@@ -16,10 +16,10 @@ from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.planar_motion import transformed
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
-
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
@@ -236,6 +236,15 @@ class ScanGraph:
         share = (torch.arange(len(odometry), dtype=torch.float64) - first) / length[segment]
         poses: np.ndarray = se2.compose(starts[segment], within + share.unsqueeze(-1) * bent[segment]).numpy()
         return poses
+
+    def walls(self, most: int) -> np.ndarray:
+        """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
+        total = sum(len(scan.points) for scan in self._scans)
+        every = max(1, -(-total // most))
+        parts = [
+            transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.values, self._scans, strict=True)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     @property
     def loop_frames(self) -> np.ndarray:

@@ -1,8 +1,11 @@
 """The online trajectory of a 2D lidar: relative poses and key scans in, the whole corrected trajectory out (no ROS)."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 
+from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
@@ -27,6 +30,11 @@ class ScanTrajectory:
         self._iterations_per_step = iterations_per_step or self._config.iterations
         self._log = StepLog()
         self.reset()
+
+    @classmethod
+    def load(cls, weights: Path, world: str | None = None, iterations_per_step: int = 0) -> "ScanTrajectory":
+        """Begin with the settings in the folder ``weights``; raises ``LidarFileError``, of one clear line."""
+        return cls(read_lidar_file(weights, "graph", ScanGraphConfig, world), iterations_per_step)
 
     def reset(self) -> None:
         """Forget everything: the next step begins a new trajectory."""
@@ -96,6 +104,10 @@ class ScanTrajectory:
             graph.loop_frames, graph.loop_weights, graph.loop_relative, graph.loop_std,
         )  # fmt: skip
         return Trajectory(*map(_read_only, arrays))
+
+    def walls(self, most: int) -> np.ndarray:
+        """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
+        return self._graph.walls(most)
 
     def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
         pose, covariance = self._graph.newest()

@@ -1,0 +1,97 @@
+"""A lidar's estimators over the scans and wheels of a recording, as the live nodes compute (no ROS here)."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
+from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.trajectory.files import SpatialPoses, seconds
+from ngo_recordings.scan_stream import LidarScan, WheelPose
+
+_REASONS: dict[type[ValueError], str] = {
+    DuplicateFrame: "the stamp came twice",
+    LateFrame: "older than the scan before",
+}
+_MOST_WALL_POINTS = 400_000
+
+
+class LidarRun:
+    """Feeds scans and wheel poses through both estimators as the nodes do with messages.
+
+    Args:
+        odometry, online: the estimators, which begin anew.
+        mounting: where the scanner sits on the robot.
+    """
+
+    def __init__(self, odometry: LidarOdometry, online: ScanTrajectory, mounting: Mounting) -> None:
+        self._odometry, self._online, self._mounting = odometry, online, mounting
+        self.frames = 0
+        """Scans that came."""
+        self.rejected: Counter[str] = Counter()
+        """Scans that were not used, by the reason."""
+        self.examples: dict[str, str] = {}
+        """For each reason the first such scan, in words."""
+        self.gaps = 0
+        """Steps that bridge scans that were lost."""
+        self.unsure = 0
+        """Scans that did not say where they were taken."""
+
+    @property
+    def lag_s(self) -> float:
+        """How much older the scans are than their stamps, by the wheels' clock."""
+        return self._odometry.lag_s
+
+    def run(
+        self, records: Iterable[LidarScan | WheelPose], truth: SpatialPoses | None = None
+    ) -> Iterator[RecordedStep | RecordedRun]:
+        """Every step, and after the last one of a trajectory the whole of it.
+
+        A recording whose stamps jump back by a second or more holds several trajectories.
+        """
+        self._odometry.reset()
+        self._online.reset()
+        self._odometry.mounting = self._mounting
+        for record in records:
+            if isinstance(record, WheelPose):
+                self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+            else:
+                self.frames += 1
+                restarts = self._odometry.restarts
+                try:
+                    self._odometry.add_scan(record)
+                except ValueError as error:
+                    self._reject(_REASONS.get(type(error), "not usable"), f"{seconds(record.stamp_ns)} s: {error}")
+                if self._odometry.restarts != restarts:
+                    yield from self._finished(truth)
+            yield from self._steps(at_end=False)
+        yield from self._steps(at_end=True)
+        yield from self._finished(truth)
+
+    def _steps(self, at_end: bool) -> Iterator[RecordedStep]:
+        while True:
+            try:
+                for step in self._odometry.ready(at_end):
+                    update = self._online.update(step)
+                    self.gaps += update.gap
+                    self.unsure += step.unsure
+                    yield RecordedStep(step, update)
+                return
+            except ValueError as error:
+                self._reject("not usable", str(error))
+
+    def _reject(self, reason: str, example: str) -> None:
+        self.rejected[reason] += 1
+        self.examples.setdefault(reason, example)
+
+    def _finished(self, truth: SpatialPoses | None) -> Iterator[RecordedRun]:
+        """The trajectory that ends here, if there is one."""
+        self._online.finish()
+        trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
+        self._online.reset()
+        if trajectory is not None:
+            yield RecordedRun(trajectory, truth, np.zeros((0, 3)), walls)
