@@ -1,6 +1,6 @@
 """Stand-ins for the parts of `launch` and `launch_ros` that the launch files import: no wheel has the real ones.
 
-They refuse what `launch` 3.4.0 refuses: unknown arguments, and lists within lists where it takes texts and substitutions.
+They refuse what `launch` 3.4.0 refuses: unknown arguments, and lists within lists of texts and substitutions.
 """
 
 import importlib.util

@@ -18,6 +18,7 @@ setup(
     ],
     install_requires=[
         "gymnasium",
+        "matplotlib",
         "networkx",
         "ngo_common",
         "ngo_recordings",

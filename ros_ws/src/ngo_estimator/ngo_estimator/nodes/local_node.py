@@ -114,7 +114,7 @@ class LocalNode(Node):
             except Exception as error:
                 # A fault of ours, not of the message: a robot is better off with a gap than without the node.
                 reason = f"internal error, {type(error).__name__}: {' '.join(str(error).split())}"
-                self._status.dropped(f"message on {topic}", reason)
+                self._status.dropped(f"message on '{topic}'", reason)
                 self.get_logger().debug(traceback.format_exc())
 
         self._inputs.append(Input(self, self._status, message_type, topic, qos, take, _frame_of, timeout_s))
