@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, compose
 from ngo_estimator.geometry.scan_points import Mounting, key_scan

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
+
 from ngo_estimator.geometry.likelihood_field import SearchConfig, likelihood_field, search
 from ngo_estimator.geometry.line_map import line_map
 from ngo_estimator.geometry.planar_motion import Array, between, rotated, transformed
 from ngo_estimator.geometry.scan_matching import IcpConfig, icp
-
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, fan, round_trip, scan_at
 
 A, B = np.array((2.0, 1.5, 0.4)), np.array((2.3, 1.4, 0.55))

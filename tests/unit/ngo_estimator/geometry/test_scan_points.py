@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
+
 from ngo_estimator.geometry.planar_motion import Array, between, compose, transformed
 from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan
-
 from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan, scan_at
 
 AHEAD = Mounting(np.zeros(3))

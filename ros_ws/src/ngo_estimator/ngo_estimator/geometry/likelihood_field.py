@@ -25,7 +25,8 @@ class SearchConfig:
     """How the search rates poses: cells of ``cell_m``; a point at the distance ``deviation_m`` from the closest one
     counts 0.61, at twice the distance 0.14. Cells up to ``reach_m`` from the middle are held. At most ``most_points``
     points of a scan are rated. A squared deviation from the prior costs ``prior_weight`` of the score, which is at
-    most 1, and all of it at most ``most_prior``: wheels may slip. The coarse pass steps by ``step_m`` and ``step_deg``."""
+    most 1, and all of it at most ``most_prior``: wheels may slip. The coarse pass steps by ``step_m`` and
+    ``step_deg``."""
 
     cell_m: float = 0.05
     deviation_m: float = 0.10
@@ -44,8 +45,8 @@ class SearchConfig:
             )
         if not (0.0 <= self.prior_weight < math.inf and 0.0 <= self.most_prior <= 1.0):
             raise ValueError(
-                f"prior_weight, most_prior are {self.prior_weight}, {self.most_prior}; expected a weight of at least 0, "
-                "and 0 to 1"
+                f"prior_weight, most_prior are {self.prior_weight}, {self.most_prior}; expected a weight of at least "
+                "0, and 0 to 1"
             )
         if self.most_points < 1 or not (self.step_m > 0.0 and self.step_deg > 0.0):
             raise ValueError(
@@ -88,8 +89,8 @@ def search(
     """The best pose ``(3,)`` within the window round a start, and its share of the field's largest score (0 to 1).
 
     Args:
-        points: of the scan, ``(n, 2)`` in the frame that is to be found. Points without a normal are best left out: they
-            lie far apart, and would fit where their rays met those of another scan.
+        points: of the scan, ``(n, 2)`` in the frame that is to be found. Points without a normal are best left out:
+            they lie far apart, and would fit where their rays met those of another scan.
         start: middle ``(3,)`` of the window.
         prior: mean ``(3,)`` and information ``(3, 3)`` of the pose.
         window: half sides, in m and in rad.
@@ -137,15 +138,15 @@ def _joined(points: Array, normals: Array, spacing: float) -> Array:
 
 @njit(cache=True)
 def _draw(scores: NDArray[np.float32], points: Array, corner: Array, cell: float, deviation: float) -> None:
-    reach = int(math.ceil(2.5 * deviation / cell))
+    reach = math.ceil(2.5 * deviation / cell)
     kernel = np.empty((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
     for i in range(2 * reach + 1):
         for j in range(2 * reach + 1):
             kernel[i, j] = math.exp(-0.5 * ((i - reach) ** 2 + (j - reach) ** 2) * (cell / deviation) ** 2)
     rows, columns = scores.shape
     for p in range(len(points)):
-        row = int(math.floor((points[p, 1] - corner[1]) / cell))
-        column = int(math.floor((points[p, 0] - corner[0]) / cell))
+        row = math.floor((points[p, 1] - corner[1]) / cell)
+        column = math.floor((points[p, 0] - corner[0]) / cell)
         if not (reach <= row < rows - reach and reach <= column < columns - reach) or scores[row, column] == 1.0:
             continue
         for i in range(2 * reach + 1):

@@ -20,8 +20,8 @@ _FARTHEST_M = 120.0
 
 @dataclass(frozen=True, eq=False)
 class LineMap:
-    """Points ``(n, 2)`` that have normals ``(n, 2)``, in the order of their cells; those of cell ``c`` of ``shape`` (rows,
-    columns) are ``first[c]`` to ``first[c + 1]``. ``corner`` ``(2,)`` is the grid's least x and y."""
+    """Points ``(n, 2)`` that have normals ``(n, 2)``, in the order of their cells; those of cell ``c`` of ``shape``
+    (rows, columns) are ``first[c]`` to ``first[c + 1]``. ``corner`` ``(2,)`` is the grid's least x and y."""
 
     points: Array
     normals: Array
@@ -70,8 +70,8 @@ def averaged_lines(points: Array, normals: Array, side: float = 0.06) -> tuple[A
         if normals[i, 0] == 0.0 and normals[i, 1] == 0.0:
             keys[i] = -1
             continue
-        row, column = int(math.floor(points[i, 1] / side)), int(math.floor(points[i, 0] / side))
-        direction = int(math.floor((math.atan2(normals[i, 1], normals[i, 0]) / math.pi + 1.125) * 4.0)) % 8
+        row, column = math.floor(points[i, 1] / side), math.floor(points[i, 0] / side)
+        direction = math.floor((math.atan2(normals[i, 1], normals[i, 0]) / math.pi + 1.125) * 4.0) % 8
         # 30 bits for either coordinate: thousands of kilometres.
         keys[i] = (((row + (1 << 29)) << 30 | (column + (1 << 29))) << 3) | direction
     order = np.argsort(keys)
@@ -104,8 +104,8 @@ def _cells(points: Array, corner: Array, rows: int, columns: int) -> tuple[NDArr
     cells = np.empty(len(points), dtype=np.int64)
     first = np.zeros(rows * columns + 1, dtype=np.int64)
     for i in range(len(points)):
-        row = int(math.floor((points[i, 1] - corner[1]) / CELL_M))
-        column = int(math.floor((points[i, 0] - corner[0]) / CELL_M))
+        row = math.floor((points[i, 1] - corner[1]) / CELL_M)
+        column = math.floor((points[i, 0] - corner[0]) / CELL_M)
         cells[i] = row * columns + column
         first[cells[i] + 1] += 1
     for c in range(rows * columns):

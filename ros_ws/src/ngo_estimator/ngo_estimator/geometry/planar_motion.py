@@ -1,4 +1,4 @@
-"""Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: the twin of ``se2`` without torch.
+"""Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: ``se2`` without torch.
 
 Poses have the shape ``(3,)``. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies in ``(-pi, pi]``.
 """

@@ -64,8 +64,8 @@ class IcpConfig:
 @dataclass(frozen=True, eq=False)
 class Registration:
     """Where a scan was: its pose ``(3,)`` in the map's frame, the covariance ``(3, 3)`` of that pose's components
-    (m, m, rad; prior included), the information ``(3, 3)`` of the lines alone, the share of its points with normals that
-    lie on lines, and how many these are."""
+    (m, m, rad; prior included), the information ``(3, 3)`` of the lines alone, the share of its points with normals
+    that lie on lines, and how many these are."""
 
     pose: Array
     covariance: Array
@@ -81,6 +81,7 @@ def icp(
     start: Array,
     prior: tuple[Array, Array] | None = None,
     config: IcpConfig | None = None,
+    open_share: float = 0.0,
 ) -> Registration:
     """Register points to lines.
 
@@ -92,6 +93,8 @@ def icp(
         prior: mean ``(3,)`` and information ``(3, 3)`` of the pose; without it directions that no line holds keep
             their start, at a deviation of 1 m and 1 rad.
         config: settings.
+        open_share: a direction of motion is open, and left to the prior, where the lines' mean squared slope against
+            it is below this: there the noise of normals speaks, and not the walls.
 
     Raises:
         ValueError: a shape is wrong or a number is not finite.
@@ -99,6 +102,8 @@ def icp(
     config = config or IcpConfig()
     start = np.asarray(start, dtype=np.float64)
     mean, information = (start, np.eye(3)) if prior is None else prior
+    if not 0.0 <= open_share < 0.5:
+        raise ValueError(f"open_share is {open_share}; expected 0 to below 0.5")
     if points.ndim != 2 or points.shape[1] != 2 or points.shape != normals.shape:
         raise ValueError(f"points and normals have shapes {points.shape} and {normals.shape}; expected (n, 2) twice")
     if start.shape != (3,) or mean.shape != (3,) or information.shape != (3, 3):
@@ -128,8 +133,10 @@ def icp(
         config.fit_m,
         config.noise_m,
         config.correlation,
+        open_share,
     )
-    return Registration(pose, np.linalg.inv(total), data, fitted / max(tried, 1), int(fitted))
+    covariance = np.linalg.inv(total).astype(np.float64)
+    return Registration(pose, covariance, data, fitted / max(tried, 1), int(fitted))
 
 
 @njit(cache=True)
@@ -153,6 +160,7 @@ def _icp(
     fit: float,
     noise: float,
     correlation: float,
+    open_share: float,
 ) -> tuple[Array, Array, Array, int, int]:
     pose = start.copy()
     data = np.zeros((3, 3))
@@ -204,12 +212,20 @@ def _icp(
             variance = max(squares / weights, noise * noise)
         scale = 1.0 / (variance * correlation)
         data = np.array(((h00, h01, h02), (h01, h11, h12), (h02, h12, h22))) * scale
+        slope = np.array((g0, g1, g2)) * scale
+        half_gap = math.hypot(0.5 * (h00 - h11), h01)
+        if 0.5 * (h00 + h11) - half_gap < open_share * weights:
+            direction = 0.5 * math.atan2(2.0 * h01, h00 - h11)
+            along = np.array((-math.sin(direction), math.cos(direction), 0.0))
+            data -= np.outer(along, along @ data)
+            data -= np.outer(data @ along, along)
+            slope -= along * (along @ slope)
         total = data + prior
         if step == steps:
             break
         away = pose - mean
         away[2] = wrap(away[2])
-        gradient = np.array((g0, g1, g2)) * scale + prior @ away
+        gradient = slope + prior @ away
         change = np.linalg.solve(total, gradient)
         pose = pose - change
         pose[2] = wrap(pose[2])
@@ -233,8 +249,8 @@ def _nearest(
     facing: float,
 ) -> int:
     """The nearest point whose surface faces like ``(nx, ny)``, within a cell's side, or -1."""
-    row = int(math.floor((y - corner[1]) / CELL_M))
-    column = int(math.floor((x - corner[0]) / CELL_M))
+    row = math.floor((y - corner[1]) / CELL_M)
+    column = math.floor((x - corner[0]) / CELL_M)
     best, nearest = -1, CELL_M * CELL_M
     if row < -1 or row > rows or column < -1 or column > columns:
         return best

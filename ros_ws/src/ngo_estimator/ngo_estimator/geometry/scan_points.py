@@ -1,4 +1,4 @@
-"""A raw scan as a ``KeyScan``: rays without return dropped, the sweep's motion removed, points thinned, normals fitted."""
+"""A raw scan as a ``KeyScan``: thinned points with normals, the sweep's motion removed."""
 
 import math
 from dataclasses import dataclass

@@ -19,9 +19,9 @@ class MotionPriorConfig:
     """How far predictions may be wrong.
 
     Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
-    ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as zero. Wheels
-    are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2`` allow, or where they
-    stand exactly still while constant velocity moves by ``frozen_m``.
+    ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
+    zero. Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``
+    allow, or where they stand exactly still while constant velocity moves by ``frozen_m``.
     """
 
     still_m: float = 0.03
@@ -44,14 +44,15 @@ class MotionPriorConfig:
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """The prior of a scan's pose in the odometry's frame: ``mean`` ``(3,)`` with ``covariance`` and ``information``
-    ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``measured`` says that wheels that are not doubted
-    made it; where they moved, ``step_covariance`` ``(3, 3)`` is that of their motion since the last scan, along the
-    odometry's axes. Wheels that stand exactly still may be frozen."""
+    ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``by_wheels`` says that wheels made it, and
+    ``measured`` that they are not doubted. Where these moved, ``step_covariance`` ``(3, 3)`` is that of their motion
+    since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen."""
 
     mean: Array
     covariance: Array
     information: Array
     starts: tuple[Array, ...]
+    by_wheels: bool = False
     measured: bool = False
     step_covariance: Array | None = None
 
@@ -106,8 +107,10 @@ class MotionPrior:
             mean = starts[0]
         doubted = self._doubt > 0.0
         moves = not doubted and bool(step.any())
-        return _prediction(
-            mean, np.diag(deviations**2), tuple(starts), not doubted, np.diag(step_deviations**2) if moves else None
+        total = np.diag(deviations**2)
+        step_covariance = np.diag(step_deviations**2) if moves else None
+        return Prediction(
+            mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance
         )
 
     def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
@@ -116,7 +119,9 @@ class MotionPrior:
         heading = math.radians(config.still_deg) + 0.5 * config.acceleration_rad_s2 * elapsed**2
         deviations = np.array((position, position, min(heading, math.radians(config.largest_deg))))
         mean = compose(last, constant)
-        return _prediction(mean, np.diag(deviations**2) + covariance, (mean,))
+        total = np.diag(deviations**2) + covariance
+        information = np.linalg.inv(total).astype(np.float64)
+        return Prediction(mean, total, information, (mean,))
 
     def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool) -> None:
         """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before."""
@@ -125,13 +130,3 @@ class MotionPrior:
         if is_key:
             self._anchor, self._anchor_wheels = pose, self._now_wheels
             self._doubt = self._doubt_rad = 0.0
-
-
-def _prediction(
-    mean: Array,
-    covariance: Array,
-    starts: tuple[Array, ...],
-    measured: bool = False,
-    step_covariance: Array | None = None,
-) -> Prediction:
-    return Prediction(mean, covariance, np.linalg.inv(covariance), starts, measured, step_covariance)

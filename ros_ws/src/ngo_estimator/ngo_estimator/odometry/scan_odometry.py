@@ -43,6 +43,7 @@ class ScanOdometryConfig:
     least_share: float = 0.2
     least_points: int = 15
     farthest_deviations: float = 3.5
+    open_share: float = 0.01
     icp: IcpConfig = field(default_factory=IcpConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     prior: MotionPriorConfig = field(default_factory=MotionPriorConfig)
@@ -140,6 +141,7 @@ class ScanOdometry:
         poor = max(deviation[0], deviation[1]) > config.poor_m or deviation[2] > math.radians(config.poor_deg)
         prior = (prediction.mean, prediction.information)
         starts = list(prediction.starts)
+        open_share = 0.0 if prediction.by_wheels else config.open_share
         on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
         if poor:
             window = (
@@ -147,7 +149,7 @@ class ScanOdometry:
                 min(config.search_deviations * float(deviation[2]), math.radians(config.wide_degs[0])),
             )
             starts.append(search(self._submap.field, on_lines, starts[0], prior, window)[0])
-        best = self._best(scan, starts, prior)
+        best = self._best(scan, starts, prior, open_share)
         if best.share >= config.good_share or len(on_lines) < config.least_points:
             return best, poor
         for wide_deg in config.wide_degs:
@@ -155,31 +157,34 @@ class ScanOdometry:
             if prediction.step_covariance is None:
                 # Nothing measured this motion, and it led to no fit: it only breaks ties.
                 prior = (prediction.mean, np.diag((2.0 / window[0], 2.0 / window[0], 2.0 / window[1])) ** 2)
-            again = self._best(scan, [search(self._submap.field, on_lines, starts[0], prior, window)[0]], prior)
+            start, _ = search(self._submap.field, on_lines, starts[0], prior, window)
+            again = self._best(scan, [start], prior, open_share)
             if again.share > best.share + 0.1 and not self._is_unsure(again, prediction):
                 best = again
             if best.share >= config.sure_share:
                 break
         return best, True
 
-    def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array]) -> Registration:
+    def _best(
+        self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float
+    ) -> Registration:
         """The registration, among those from all starts, that fits most points."""
-        best = self._icp(scan, starts[0], prior)
+        best = self._icp(scan, starts[0], prior, open_share)
         for start in starts[1:]:
-            other = self._icp(scan, start, prior)
+            other = self._icp(scan, start, prior, open_share)
             if other.share > best.share + 0.02:
                 best = other
         return best
 
-    def _icp(self, scan: KeyScan, start: Array, prior: tuple[Array, Array]) -> Registration:
+    def _icp(self, scan: KeyScan, start: Array, prior: tuple[Array, Array], open_share: float) -> Registration:
         mean, information = prior
-        found = icp(self._submap.lines, scan.points, scan.normals, start, prior, self.config.icp)
+        found = icp(self._submap.lines, scan.points, scan.normals, start, prior, self.config.icp, open_share)
         far = _squared_deviations(found.pose, mean, information)
         if found.share >= self.config.good_share and far > 9.0:
             # Scans that fit, far from the prior: wheels that slipped or froze must not pull.
             found = icp(
                 self._submap.lines, scan.points, scan.normals, found.pose, (mean, information * 9.0 / far),
-                self.config.icp,
+                self.config.icp, open_share,
             )  # fmt: skip
         return found
 

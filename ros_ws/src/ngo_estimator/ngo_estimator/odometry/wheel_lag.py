@@ -1,8 +1,8 @@
 """The time by which wheel odometry and scans disagree, from the turns that both measure.
 
 A scan whose stamp is right sees the turn that the wheels report between the same stamps. For every lag of a grid the
-estimator sums the squared differences between both turns; the lag with the least sum explains the stamps. A sum a lag is
-all that is kept.
+estimator sums the squared differences between both turns; the lag with the least sum explains the stamps. One sum a
+lag is kept.
 """
 
 import math
@@ -66,7 +66,7 @@ class WheelLag:
             self._waiting.append((start_s, end_s, turn))
 
     def update(self, stamps_s: Array, yaws: Array) -> bool:
-        """Compare the turns that wait with the wheels' unwrapped yaws ``(n,)`` at stamps ``(n,)``; True for a new lag."""
+        """Compare the waiting turns with the wheels' unwrapped yaws ``(n,)`` at stamps ``(n,)``; True for a new lag."""
         taken = False
         while self._waiting and len(stamps_s) and self._waiting[0][1] + self.config.largest_s <= stamps_s[-1]:
             start_s, end_s, turn = self._waiting.popleft()

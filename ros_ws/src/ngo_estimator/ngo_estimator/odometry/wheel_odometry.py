@@ -1,7 +1,7 @@
 """Wheel odometry as the action of the local estimator: motion between two scans, and how far it may be wrong.
 
-The wheels need no calibration: their deviations allow for it. Their stamps may be late or early against the scans', which
-``WheelLag`` finds out. They may freeze and jump.
+The wheels need no calibration: their deviations allow for it. Their stamps may be late or early against the scans',
+which ``WheelLag`` finds out. They may freeze and jump.
 """
 
 import math
@@ -19,8 +19,7 @@ class WheelOdometryConfig:
 
     The position's deviation is ``still_m``, and ``distance_share`` of the way, and ``turn_m`` a radian of turn; the
     heading's is ``still_deg``, and ``distance_deg`` a metre, and ``turn_share`` of the turn. ``kept`` poses are held.
-    A pose is extrapolated by at most ``extrapolated_s``; later the wheels are silent. A step that is faster than the
-    fastest of ``fastest_m_s``, ``fastest_rad_s`` is a jump.
+    A pose is extrapolated by at most ``extrapolated_s``; later the wheels are silent.
     """
 
     still_m: float = 0.03
