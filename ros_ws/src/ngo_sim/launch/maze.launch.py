@@ -16,7 +16,10 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                "world", default_value="maze3d", choices=["maze2d", "maze3d"], description="which simulator"
+                "world",
+                default_value="maze3d",
+                choices=["maze2d", "maze3d", "building2d"],
+                description="which simulator",
             ),
             DeclareLaunchArgument(
                 "parameters", default_value=shipped, description="YAML with the simulator's parameters"
