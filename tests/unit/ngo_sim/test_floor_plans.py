@@ -102,7 +102,7 @@ def test_doors_open_and_close_between_visits_and_passable_ones_stay_open() -> No
 def test_aliased_rooms_repeat_and_others_do_not() -> None:
     def repeated(aliased: bool) -> int:
         """The most circles of furniture that share one radius to the last digit."""
-        plan = draw_floor_plan(5, FloorPlanConfig(layout="ladder", scale=SMALL, aliased=aliased, clutter=0.8))
+        plan = draw_floor_plan(5, FloorPlanConfig(layout="ladder", scale=SMALL, aliased=aliased))
         radii = plan.circles_m[:, 2]
         _, counts = np.unique(radii[(radii != 0.03) & (radii > 0.0)], return_counts=True)
         return int(counts.max(initial=0))

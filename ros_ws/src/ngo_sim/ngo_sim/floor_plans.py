@@ -185,7 +185,7 @@ class _Builder:
         width = float(rng.uniform(6.0, 12.0) if kind == "open" else rng.uniform(2.4, 6.0))
         depth = float(rng.uniform(6.0, 10.0) if kind == "open" else rng.uniform(2.8, 6.5))
         slant, bulge = rng.normal(0.0, 0.35), float(rng.uniform(0.5, 1.5)) if rng.random() < 0.08 else 0.0
-        slanted = rng.random() < 0.15
+        slanted = rng.random() < 0.15 and bulge == 0.0
         width = min(width, corridor.length_m - along - 0.2)
         (a, tangent_a), (b, tangent_b) = corridor.at(along), corridor.at(along + width)
         a, b = (p + side * np.array((-t[1], t[0])) * corridor.width_m / 2 for p, t in ((a, tangent_a), (b, tangent_b)))
@@ -208,11 +208,9 @@ class _Builder:
                         (width / 2 + width / 2 * math.cos(t), lower + reach + bulge * math.sin(t)) for t in steps
                     ]
                 corners.append((0.0, lower + back_a))
-                if bulge > 0.0 and slanted:
-                    return None
                 local = np.array(corners)
                 polygon = counter_clockwise(a + local[:, :1] * u + local[:, 1:] * out)
-                if reach >= 2.2 and self._free(polygon, 0.95 * min(wall_m, 0.1)):
+                if reach >= 2.4 and self._free(polygon, 0.95 * min(wall_m, 0.1)):
                     self._add(polygon)
                     self._entrance(polygon, a, u, out, width, lower, reach, kind, rng)
                     self._windows(polygon, rng)
@@ -232,16 +230,17 @@ class _Builder:
         rng: np.random.Generator,
     ) -> None:
         """The doorway, its leaf, a glass front, and the furniture behind it."""
-        door_m = float(min(rng.uniform(0.95, 1.15) if kind != "open" else rng.uniform(1.0, 1.9), width - 0.7))
+        door_m = float(min(rng.uniform(0.95, 1.15) if kind != "open" else rng.uniform(1.0, 1.4), width - 0.7))
         where = float(rng.uniform(door_m / 2 + 0.15, width - door_m / 2 - 0.15))
         passable, leaf, frame = rng.random() < 0.65, rng.random() < 0.85, rng.uniform(0.0, 0.8)
         middle = a + where * u
         yaw = math.atan2(out[1], out[0])
         self._add(rectangle(middle + out * (lower / 2), yaw, lower + 0.5, door_m), solid=False)
-        inside_y = float(rng.uniform(0.45, 0.75)) * reach
+        # An open leaf reaches door_m into the room: ways bend behind it.
+        inside_y = max(float(rng.uniform(0.45, 0.75)) * reach, door_m + 0.5)
         inside_x = float(np.clip(rng.uniform(0.25, 0.75) * width, 0.7, width - 0.7))
         goal = a + inside_x * u + (lower + inside_y) * out
-        threshold = middle + (lower + 0.6) * out
+        threshold = middle + (lower + door_m + 0.45) * out
         clear = [lane(middle - 0.8 * out, threshold, LANE_WIDTH_M), lane(threshold, goal, LANE_WIDTH_M)]
         if leaf or not passable:
             end = float(rng.choice((-1.0, 1.0)))
@@ -255,7 +254,7 @@ class _Builder:
                 opened = np.where(rng.random(_DOOR_EPOCHS) < 0.75, 0.0, rng.uniform(0.0, widest, _DOOR_EPOCHS))
             period = float(rng.uniform(60.0, 400.0))
             closed = math.atan2(*(-end * u)[::-1])
-            door = (hinge, closed, -sense, door_m - 0.02, opened, period, float(rng.uniform(0, period)), passable)
+            door = (hinge, closed, sense, door_m - 0.02, opened, period, float(rng.uniform(0, period)), passable)
             self.doors.append(door)
             swing = hinge + out * door_m / 2
             clear.append(rectangle(swing, math.atan2(u[1], u[0]), 2 * door_m, door_m))
@@ -264,7 +263,7 @@ class _Builder:
             self.lanes += clear[:2]
         if rng.random() < self.config.glass:
             self._glass_front(a, u, out, width, lower, where, door_m)
-        if rng.random() >= 0.5 * self.config.clutter and self.config.clutter < 1.0:
+        if rng.random() >= self.config.clutter:
             return
         placer = Placer(polygon, clear, rng)
         along = math.atan2(u[1], u[0])
