@@ -189,6 +189,11 @@ class _Builder:
         width = min(width, corridor.length_m - along - 0.2)
         (a, tangent_a), (b, tangent_b) = corridor.at(along), corridor.at(along + width)
         a, b = (p + side * np.array((-t[1], t[0])) * corridor.width_m / 2 for p, t in ((a, tangent_a), (b, tangent_b)))
+        middle, tangent = corridor.at(along + width / 2)
+        at_wall = middle + side * np.array((-tangent[1], tangent[0])) * corridor.width_m / 2
+        # Around a bend the front would be far from the corridor, and the door would lead nowhere.
+        if np.hypot(*(at_wall - (a + b) / 2)) > 0.2:
+            return None
         front = b - a
         width = float(np.hypot(*front))
         if width < 2.2:
@@ -334,8 +339,8 @@ class _Builder:
         ]
         for corridor in self._layout.corridors:
             half = corridor.width_m / 2
-            for along in np.arange(0.5, corridor.length_m - 0.5, 1.1 / max(self.config.clutter, 0.05)):
-                if rng.random() > 0.42:
+            for along in np.arange(0.5, corridor.length_m - 0.5, 0.8 / max(self.config.clutter, 0.05)):
+                if rng.random() > 0.5:
                     continue
                 point, tangent = corridor.at(float(along + rng.uniform(0.0, 0.8)))
                 left, yaw = np.array((-tangent[1], tangent[0])), math.atan2(tangent[1], tangent[0])
