@@ -121,14 +121,16 @@ class Building2d:
     def _drive(self, most_scans: int, length_m: float = np.inf) -> BuildingDrive:
         if self._driver is None:
             raise RuntimeError("step() before reset()")
-        driver, poses, twists, gone = self._driver, [], [], 0.0
+        driver, gone = self._driver, 0.0
+        poses: list[Floats] = []
+        twists: list[Floats] = []
         while len(poses) < most_scans and gone < length_m:
             poses.append(driver.pose_xyyaw)
             twists.append(driver.advance())
             gone += twists[-1][0] * self.period_s
         true_poses, moved = np.array(poses), np.array(twists)
         count = len(true_poses)
-        stamps = (self._index + np.arange(count)) * self.period_s
+        stamps = (self._index + np.arange(count, dtype=np.float64)) * self.period_s
         self._index += count
         # The wheels count the period that ends at the next frame: their reading now is the one before it.
         before = self._odometry.pose_xyyaw

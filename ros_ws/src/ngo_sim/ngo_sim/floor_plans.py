@@ -365,7 +365,8 @@ def _middle_between(first: Floats, second: Floats) -> Floats:
     """The middle of the gap between two rooms, along the line from one middle to the other."""
     one, other = first.mean(axis=0), second.mean(axis=0)
     direction = (other - one) / np.hypot(*(other - one))
-    return one + direction * ((first - one) @ direction).max() / 2 + direction * ((second - one) @ direction).min() / 2
+    from_first, to_second = float(((first - one) @ direction).max()), float(((second - one) @ direction).min())
+    return np.asarray(one + direction * (from_first + to_second) / 2)
 
 
 def _short_side(polygon: Floats) -> float:

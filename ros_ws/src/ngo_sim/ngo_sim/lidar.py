@@ -82,7 +82,7 @@ class ScannerConfig:
         """(rays,) true angles in the scanner's own frame, symmetrical to straight ahead."""
         half = math.radians(self.field_of_view_deg) / 2
         first = half if self.clockwise else -half
-        return first + self.increment_rad * np.arange(self.rays)
+        return first + self.increment_rad * np.arange(self.rays, dtype=np.float64)
 
     @property
     def time_increment_s(self) -> float:

@@ -75,7 +75,7 @@ class WheelOdometry:
     @property
     def pose_xyyaw(self) -> Floats:
         """(3,) as published now."""
-        return self._state[3:6].copy()
+        return np.array(self._state[3:6])
 
     def advance(self, motions: Floats) -> Floats:
         """(k, 3) published poses after each of k motions (k, 2): way along the arc in m, turn in rad.

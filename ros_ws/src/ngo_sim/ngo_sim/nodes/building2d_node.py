@@ -173,7 +173,7 @@ def _odometry(pose_xyyaw: Floats, stamp: Time, frame: str, child: str) -> Odomet
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return run_simulator(Building2dNode, "building2d", args)  # type: ignore[arg-type]
+    return run_simulator(Building2dNode, "building2d", args)
 
 
 if __name__ == "__main__":
