@@ -31,11 +31,12 @@ setup(
     zip_safe=False,
     maintainer="NGO maintainers",
     maintainer_email="maintainers@ngo.invalid",
-    description="Maze simulators in 2D and 3D with exact ground truth, and the nodes that publish them.",
+    description="Simulators of mazes and buildings with exact ground truth, and the nodes that publish them.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     entry_points={
         "console_scripts": [
+            "building2d = ngo_sim.nodes.building2d_node:main",
             "maze2d = ngo_sim.nodes.maze2d_node:main",
             "maze3d = ngo_sim.nodes.maze3d_node:main",
         ],
