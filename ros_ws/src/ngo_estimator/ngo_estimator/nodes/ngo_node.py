@@ -24,6 +24,7 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import run_node
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
+from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
@@ -118,9 +119,12 @@ class NgoNode(LifecycleNode):
         # Imported here because torch takes seconds: a bad parameter is said at once.
         from ngo_estimator.online.map_origin import MapOrigin
         from ngo_estimator.online.online_trajectory import OnlineTrajectory
+        from ngo_estimator.online.scan_trajectory import ScanTrajectory
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
-        def load(folder: Path, world: str) -> OnlineTrajectory:
+        def load(folder: Path, world: str) -> OnlineTrajectory | ScanTrajectory:
+            if is_lidar(folder):
+                return ScanTrajectory.load(folder, world, settings.iterations_per_step)
             return OnlineTrajectory.load(
                 folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
             )
@@ -205,8 +209,8 @@ class NgoNode(LifecycleNode):
         self._smoothing.reset()
 
     def _on_relative_pose(self, message: RelativePose) -> None:
-        step = messages.relative_step(message)
         try:
+            step = messages.relative_step(message)
             with self._status.timed("time an update"):
                 update = self._core.update(step, optimize=not self._paused)
         except ValueError as error:
@@ -233,10 +237,10 @@ class NgoNode(LifecycleNode):
             self._status.took("time an optimisation", self._core.optimization_s)
         begins = self._latest is None
         self._latest = update
-        self._publish(update, step.odom_xyyaw)
+        self._publish(update, step.tf_odom_xyyaw)
         # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last one.
         self._whole.changed(loops=update.optimized or begins)
-        self._odom_xyyaw = step.odom_xyyaw
+        self._odom_xyyaw = step.tf_odom_xyyaw
         if self._core.unfinished:
             self._pending.reset()
         else:
