@@ -1,4 +1,4 @@
-"""The node that both worlds share: paces a simulation, takes actions from outside, publishes each frame."""
+"""The node that all worlds share: paces a simulation, takes actions from outside, publishes each frame."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SimulatorNode(Node):
 
     world_config_type: ClassVar[type[Settings]]
     defaults: ClassVar[dict[str, Any]] = {}
-    image_publisher: Publisher  # its subscribers are those that wait_for_subscribers counts
+    image_publisher: Publisher  # wait_for_subscribers counts its subscribers
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -51,7 +51,7 @@ class SimulatorNode(Node):
         self._live.lock()
         world.lock()
         self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
-        # Deep enough that a reliable reader may be late with its acknowledgement by far more than what is in flight.
+        # Deep enough for late acknowledgements of a reliable reader: far more than the frames in flight.
         qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
         self.outputs = Outputs(self, qos, self.config.record)
         self.outputs.set_time(time.time_ns() if self.config.use_wall_stamps else self.config.stamp_ns(0, 0.0))
@@ -61,7 +61,7 @@ class SimulatorNode(Node):
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         try:
             self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
-        except ValueError as error:  # what only the files or the world can say
+        except ValueError as error:  # an error that only the files or the world can show
             raise BadParameter(str(error)) from None
         self._pacer = Pacer()
         self._published = 0
@@ -131,7 +131,7 @@ class SimulatorNode(Node):
                 executor.spin_once(timeout_sec=idle_s)
 
     def _ready_line(self) -> str:
-        """What the node publishes, how fast, and what it waits for."""
+        """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""
         config, topics = self.config, ", ".join(sorted(self.outputs.topic_names))
         pace = f"{config.rate:g} frames a second" if config.rate else "as fast as the frames are taken"
         subscribers = f"; waits for {config.wait_for_subscribers} subscribers of the image"
@@ -140,7 +140,7 @@ class SimulatorNode(Node):
         return f"ready: {name}, seed {config.seed}, {pace}, publishes {topics}{waits}"
 
     def _idle_s(self, now_s: float) -> float:
-        """How long nothing is to be done before the next frame, 0 where it is due; messages end the wait earlier."""
+        """Time until the next frame, 0 if it is due; messages end the wait earlier."""
         config = self.config
         if self._published == 0:
             awaited = self.image_publisher.get_subscription_count() < config.wait_for_subscribers or (
