@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from abc import abstractmethod
 from collections.abc import Callable
@@ -21,8 +20,7 @@ from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.parameters import LiveSettings
-from ngo_common.nodes.process import run_node
-from ngo_common.settings import BadParameter, Settings, usage
+from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
@@ -190,10 +188,3 @@ class SimulatorNode(Node):
             self.simulation.external.command(message.action, time.monotonic())
         except ValueError as error:
             self.get_logger().warning(f"action_command dropped: {error}", throttle_duration_sec=5.0)
-
-
-def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | None = None) -> int:
-    """Run a simulator node until it has published its frames or gets a signal; returns the process's exit code."""
-    summary = (inspect.getdoc(node_type) or "").partition("\n\n")[0]
-    text = usage("ngo_sim", name, summary, SimulatorConfig, node_type.world_config_type, **node_type.defaults)
-    return run_node(name, lambda: node_type(name), text, lambda node, ended: node.run(ended), args)
