@@ -10,7 +10,7 @@ cd "$ROOT/ros_ws"
 key="$(
     {
         cat "$VENV/ngo_key"
-        find src -type f \( -name package.xml -o -name 'setup.*' -o -name CMakeLists.txt -o -name '*.cmake' \
+        find src wheels -type f \( -name package.xml -o -name 'setup.*' -o -name CMakeLists.txt -o -name '*.cmake' \
             -o -name '*.msg' -o -name '*.srv' \) -print0 | sort -z | xargs -0 sha256sum
         find src -type f -path '*/resource/*' -o -type f -path '*/launch/*' -o -type f -path '*/config/*' \
             -o -type f -path '*/weights/*' | grep -v __pycache__ | sort
@@ -26,10 +26,11 @@ unset AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PYTHONPATH
 export NGO_ENV_UNDERLAY_ONLY=1
 . "$ROOT/env.sh"
 
-options=()
-IFS=: read -ra prefixes <<<"$AMENT_PREFIX_PATH"
-for prefix in "${prefixes[@]}"; do
-    if [ -f "$prefix/share/tf2_msgs/package.xml" ]; then options=(--packages-ignore tf2_msgs); fi
-done
-step "build the workspace" colcon build --symlink-install "${options[@]}" --cmake-args -DBUILD_TESTING=OFF
+paths=(src) cmake_args=(-DBUILD_TESTING=OFF)
+if [ "$(cat "$VENV/ngo_underlay")" = wheels ]; then
+    # tf2_msgs, which the wheels lack, and a workaround for their CMake files.
+    paths+=(wheels)
+    cmake_args+=("-DCMAKE_PROJECT_INCLUDE=$ROOT/ros_ws/wheels/drop_missing_python_includes.cmake")
+fi
+step "build the workspace" colcon build --symlink-install --base-paths "${paths[@]}" --cmake-args "${cmake_args[@]}"
 echo "$key" >install/ngo_key

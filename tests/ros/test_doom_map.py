@@ -63,12 +63,13 @@ def test_the_estimators_run_unchanged_on_a_scenario_that_vizdoom_ships(probe: Pr
         ({"wad": "nowhere.wad", "map": "map01"}, "wad is 'nowhere.wad'; it must be a WAD file, or the name of one of "),
         ({"wad": "my_way_home.wad", "map": "map07"}, "map is 'map07'; my_way_home.wad has MAP01"),
         ({"wad": "my_way_home.wad"}, "wad is 'my_way_home.wad' and map is ''; they must be given both, or neither"),
+        ({**SCENARIO, "textures": "brick"}, "parameter 'textures' is 'brick'; allowed: 'all' together with wad"),
         ({**SCENARIO, "driver": "corners"}, "driver is 'corners', which needs a maze's plan; on a Doom map "),
-        ({**SCENARIO, "policy": "learned", "driver": "random"}, "policy is 'learned' and driver is 'random'; allo"),
+        ({**SCENARIO, "policy": "learned", "driver": "random"}, "parameters 'policy' and 'driver' are the same; allo"),
     ],
 )
 def test_what_does_not_fit_is_one_line_and_exit_code_2(parameters: dict[str, str], expected: str) -> None:
     with NodeProcess("ngo_sim", "maze3d", parameters) as node:
         assert node.wait() == 2, node.log
         assert len(node.lines) == 1, node.log
-        assert node.lines[0].startswith("maze3d: bad parameter: " + expected)
+        assert node.lines[0].startswith("[FATAL]") and expected in node.lines[0]

@@ -5,22 +5,25 @@ Lost, doubled, late and unusable images are in `test_estimator_nodes.py`; here a
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 import torch
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
 
 from .estimator_graph import RUN_NS, STEP_NS, Graph, image_message, scan
@@ -199,6 +202,55 @@ def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, p
         wait_for_problem(graph.probe, "/ngo_node", diagnostics, "/local_node and /twin publish on '/relative_pose'")
     assert graph.ngo.log.count("restarted, so") == restarts
     assert [to_ns(pose.header.stamp) for pose in graph.out.poses] == [graph.stamp_ns(k) for k in range(1, step)]
+
+
+def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
+    parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process, where the core can be made to fail once."""
+    given = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+    reliable = ("-p", "image_reliability:=reliable", "-p", "image_depth:=100")
+    rclpy.init(args=["--ros-args", "-r", "__ns:=/broken", *given, *reliable])
+    node, executor = LocalNode(), SingleThreadedExecutor()
+    executor.add_node(node)
+    update, broken_ns = node._core.update, RUN_NS + 2 * STEP_NS
+
+    def update_or_fail(stamp_ns: int, *inputs: Any) -> Any:
+        if stamp_ns == broken_ns:
+            raise RuntimeError("of two\nlines")
+        return update(stamp_ns, *inputs)
+
+    monkeypatch.setattr(node._core, "update", update_or_fail)
+    try:
+        with Probe("broken") as probe:
+            images = probe.node.create_publisher(Image, "/broken/image", 100)
+            actions = probe.node.create_publisher(DiscreteAction, "/broken/action", 100)
+            relative_poses = probe.collect(RelativePose, "/broken/relative_pose")
+            diagnostics = probe.collect(DiagnosticArray, "/diagnostics")
+
+            def spin_until(condition: Callable[[], object], what: str) -> None:
+                probe.spin_until(lambda: executor.spin_once(timeout_sec=0.01) or condition(), what)
+
+            ends = images.get_subscription_count, actions.get_subscription_count
+            spin_until(lambda: all(end() for end in ends), "the node's subscriptions")
+            spin_until(lambda: probe.node.count_publishers("/broken/relative_pose"), "the node's publisher")
+            for step in range(6):
+                action = DiscreteAction(action=0)
+                action.header.stamp = to_time(RUN_NS + step * STEP_NS)
+                actions.publish(action)
+                images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
+            last_ns = RUN_NS + 5 * STEP_NS
+            spin_until(lambda: relative_poses and to_ns(relative_poses[-1].header.stamp) == last_ns, "the last step")
+            assert broken_ns not in {to_ns(message.header.stamp) for message in relative_poses}
+
+            def counted() -> bool:
+                values = {pair.key: pair.value for message in diagnostics for pair in message.status[0].values}
+                return values.get("dropped: message on 'image'") == "1"
+
+            spin_until(counted, "the dropped frame among the diagnostics")
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
 def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: dict[str, Any]) -> None:

@@ -375,4 +375,7 @@ class TestAgainstARealNode:
         assert (result.returncode, result.stderr) == (1, "Parameter not set\n")
         result = ros2("topic", "echo", "/test/nothing")
         assert result.stdout == "WARNING: topic [/test/nothing] does not appear to be published yet\n"
-        assert (result.returncode, result.stderr) == (1, "Could not determine the type for the passed topic\n")
+        assert (result.returncode, result.stderr) == (
+            1,
+            "Could not determine the type for the passed topic: if its node is starting, wait for its line 'ready'\n",
+        )

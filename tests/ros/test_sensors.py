@@ -55,7 +55,7 @@ def test_the_simulators_laser_becomes_odometry(probe: Probe, tmp_path: Path) -> 
     settings = {"world": "scan", "weights": str(tmp_path), **RELIABLE}
     maze = {"frames": FRAMES, "rate": 0.0, "flow_control_topics": ["odom"], **WAITING}
     with NodeProcess("ngo_estimator", "local_node", settings) as local:
-        local.wait_for_log("ready: scan, LaserScan on 'scan'")
+        local.wait_for_log("ready: /local_node, scan, LaserScan on '/scan'")
         probe.spin_until(lambda: probe.node.count_publishers("odom"), "the estimator")
         with NodeProcess("ngo_sim", "maze2d", maze) as simulator:
             probe.spin_until(lambda: len(odometry) == len(relative_poses) == FRAMES - 1, "odometry of every scan")
@@ -86,7 +86,7 @@ def test_compressed_pictures_and_velocities_become_odometry(probe: Probe, tmp_pa
     names = {"image_topic": "camera", "image_transport": "compressed", "twist_topic": "wheels"}
     settings = {"world": "our_robot", "weights": str(tmp_path), **names, **RELIABLE}
     with NodeProcess("ngo_estimator", "local_node", settings) as local:
-        local.wait_for_log("ready: our_robot, CompressedImage on 'camera/compressed'")
+        local.wait_for_log("ready: /local_node, our_robot, CompressedImage on '/camera/compressed'")
         probe.spin_until(
             lambda: (
                 images.get_subscription_count()
@@ -134,8 +134,8 @@ def test_the_shipped_scan_model_follows_the_simulator(probe: Probe) -> None:
         NodeProcess("ngo_estimator", "local_node", {"world": "scan", **RELIABLE}) as local,
         NodeProcess("ngo_estimator", "ngo_node", {"world": "scan"}) as ngo,
     ):
-        local.wait_for_log("ready: scan")
-        ngo.wait_for_log("ready: scan")
+        local.wait_for_log("ready: /local_node, scan")
+        ngo.wait_for_log("ready: /ngo_node, scan")
         with NodeProcess("ngo_sim", "maze2d", maze) as simulator:
             probe.spin_until(lambda: len(odometry) == len(poses) == frames - 1, "a pose for every scan")
             probe.spin_until(lambda: len(truth) == frames, "the truth")

@@ -4,27 +4,31 @@ import math
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, LaserScan
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.settings import BadParameter
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
-from ngo_sim.maze3d import Maze3D
-from ngo_sim.nodes.parameters import BadParameter, ConfigParameters
+from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.simulator_config import SimulatorConfig
 
 from .processes import NodeProcess, Probe, wait_until
@@ -114,8 +118,7 @@ def test_maze2d_publishes_what_the_core_records(probe: Probe) -> None:
     assert scan.header.frame_id == image.header.frame_id == "base_link"
 
 
-def test_maze3d_publishes_what_the_core_records(probe: Probe) -> None:
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+def test_maze3d_publishes_what_the_core_records(probe: Probe, latched: QoSProfile) -> None:
     mounted = probe.collect(TFMessage, "/tf_static", latched)
     run = Run(probe, "maze3d", CameraInfo, "camera_info")
     env = Maze3D()
@@ -222,7 +225,7 @@ def test_parameters_can_be_described_and_changed_only_where_it_makes_sense(probe
         described = probe.call(
             DescribeParameters, "maze2d/describe_parameters", DescribeParameters.Request(names=["rate", "rows"])
         ).descriptors
-        assert [entry.read_only for entry in described] == [False, True]
+        assert [entry.additional_constraints.endswith("; at any time") for entry in described] == [True, False]
         assert all(entry.description for entry in described)
         assert described[0].floating_point_range[0].to_value == 10_000.0
 
@@ -248,17 +251,60 @@ def test_wall_stamps_and_a_namespace(probe: Probe) -> None:
     assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
 
 
-def declare(*arguments: str) -> SimulatorConfig:
-    """What a node of maze2d makes of its arguments, without a process."""
+@pytest.fixture
+def latched() -> QoSProfile:
+    return QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def test_two_robots_share_tf_static(probe: Probe, latched: QoSProfile) -> None:
+    """Their frames differ by the prefix, and a subscriber that comes later gets the transforms of both."""
+    robots = ("red", "blue")
+    images = {name: probe.collect(Image, f"/{name}/image") for name in robots}
+    truth = {name: probe.collect(Odometry, f"/{name}/ground_truth") for name in robots}
+    with ExitStack() as stack:
+        for seed, name in enumerate(robots):
+            frames = {"frame_prefix": f"{name}/", "truth_parent_frame": "map"}
+            node = simulator("maze3d", "-r", f"__ns:=/{name}", seed=seed, rate=50.0, wait_for_subscribers=1, **frames)
+            stack.enter_context(node)
+        probe.spin_until(lambda: all((*images.values(), *truth.values())), "frames of both")
+        transforms = probe.collect(TFMessage, "/tf_static", latched)
+        probe.spin_until(lambda: len(transforms) == 2, "the transforms of both")
+        found = {(t.header.frame_id, t.child_frame_id): t for message in transforms for t in message.transforms}
+    expected = {(f"{name}/base_link", f"{name}/camera_optical_frame") for name in robots}
+    assert found.keys() == expected | {(f"{name}/map", f"{name}/maze") for name in robots}
+    for name in robots:
+        assert images[name][0].header.frame_id == f"{name}/camera_optical_frame"
+        start = truth[name][0]
+        assert (start.header.frame_id, start.child_frame_id) == (f"{name}/maze", f"{name}/base_link")
+        placed = found[f"{name}/map", f"{name}/maze"].transform
+        yaw = 2 * math.atan2(placed.rotation.z, placed.rotation.w)
+        x, y, start_yaw = xyyaw(start)
+        turned = complex(math.cos(yaw), math.sin(yaw)) * complex(x, y)
+        at = (placed.translation.x + turned.real, placed.translation.y + turned.imag, yaw + start_yaw)
+        assert at == pytest.approx((0.0, 0.0, 0.0)), "the truth begins at the origin of map"
+
+
+@pytest.mark.parametrize("namespace", ["", "/red"])
+@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
+def test_the_shipped_parameters_hold_in_any_namespace(world: str, namespace: str) -> None:
+    """As rcl itself reads the files; 2000 is not the nodes' default."""
+    remapped = ("-r", f"__ns:={namespace}") if namespace else ()
+    arguments = ["--ros-args", *remapped]
+    for package, name in (("ngo_sim", world), ("ngo_bringup", f"graph_{world}")):
+        file = Path(get_package_share_directory(package), "config", f"{name}.yaml")
+        with own_node(world, *arguments, "--params-file", str(file)) as node:
+            live = LiveSettings(node, SimulatorConfig, beside=(Maze2DConfig, Maze3DConfig))
+            assert live.values.seed == 2000, file
+
+
+@contextmanager
+def own_node(name: str, *arguments: str) -> Iterator[Node]:
+    """A node of this process, with the arguments of a command line."""
     context = Context()
-    rclpy.init(args=["--ros-args", *arguments], context=context)
-    node = rclpy.create_node("maze2d", context=context, start_parameter_services=False)
+    rclpy.init(args=list(arguments), context=context)
+    node = rclpy.create_node(name, context=context, start_parameter_services=False)
     try:
-        parameters = ConfigParameters(node)
-        config = parameters.declare(SimulatorConfig, driver="random")
-        parameters.declare(Maze2DConfig)
-        parameters.finish()
-        return config
+        yield node
     finally:
         node.destroy_node()
         rclpy.try_shutdown(context=context)
@@ -267,51 +313,67 @@ def declare(*arguments: str) -> SimulatorConfig:
 @pytest.mark.parametrize(
     ("argument", "expected"),
     [
-        ("rows:=many", "rows is 'many'; allowed: a whole number"),
-        ("rows:=3.0", "rows is 3.0; allowed: a whole number"),
-        ("rate:=-1.0", "rate is -1.0; allowed: a number from 0 to 10000"),
-        (
-            "driver:=fast",
-            "driver is 'fast'; allowed: one of auto, corners, random_goals, distance, learned, explorer, ",
-        ),
-        ("policy:=5", "policy is 5; allowed: a string"),
-        (
-            "policy:=fast",
-            "driver is 'fast'; allowed: one of auto, corners, random_goals, distance, learned, explorer, ",
-        ),
-        ("driver:=5", "driver is 5; allowed: a string"),
+        ("rows:=many", "parameter 'rows' is 'many'; allowed: an integer from 2 to 100"),
+        ("rows:=3.0", "parameter 'rows' is 3.0; allowed: an integer from 2 to 100"),
+        ("rate:=-1.0", "parameter 'rate' is -1.0; allowed: a number from 0 to 10000"),
+        ("policy:=fast", "parameter 'driver' is 'fast'; allowed: one of auto, corners, random_goals, distance, "),
         ("extra_openings:=99", "extra_openings is 99"),
-        ("flow_control_topics:=odom", "flow_control_topics is 'odom'; allowed: a list of strings"),
-        ("drivver:=corners", "drivver is 'corners', but there is no parameter of this name; did you mean driver?"),
-        ("qqq:=1", "qqq is 1, but there is no parameter of this name; allowed: action_timeout_s, "),
+        ("flow_control_topics:=odom", "parameter 'flow_control_topics' is 'odom'; allowed: a list of topic names"),
+        ("drivver:=corners", "parameter 'drivver' is 'corners', but unknown; did you mean driver?"),
+        ("qqq:=1", "parameter 'qqq' is 1, but unknown; allowed: action_timeout_s, "),
     ],
 )
 def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(argument: str, expected: str) -> None:
-    with pytest.raises(BadParameter) as error:
-        declare("-p", argument)
+    def declare(node: Node) -> None:
+        LiveSettings(node, SimulatorConfig, beside=(Maze2DConfig,))
+        LiveSettings(node, Maze2DConfig, beside=(SimulatorConfig,))
+
+    with own_node("maze2d", "--ros-args", "-p", argument) as node, pytest.raises(BadParameter) as error:
+        declare(node)
     assert expected in str(error.value) and "\n" not in str(error.value)
-
-
-def test_good_parameters_and_defaults() -> None:
-    config = declare("-p", "rate:=10", "-p", "flow_control_topics:=[]", "-p", "seed:=3")
-    assert config == SimulatorConfig(rate=10.0, flow_control_topics=(), seed=3, driver="random")
 
 
 def test_bad_parameters_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text("maze2d:\n  ros__parameters:\n    rowz: 3\n")
     cases: list[tuple[tuple[str, ...], dict[str, Any], str]] = [
-        ((), {"rows": 1}, "rows is 1; it must be an integer from 2 to 100"),
-        ((), {"flow_control_topics": ["a b"]}, "flow_control_topics has 'a b'; allowed: names of topics"),
-        (("--params-file", str(file)), {}, "rowz is 3, but there is no parameter of this name; did you mean rows?"),
+        ((), {"rows": 1}, "parameter 'rows' is 1; allowed: an integer from 2 to 100"),
+        (("--params-file", str(file)), {}, "parameter 'rowz' is 3, but unknown; did you mean rows?"),
         (("-p", "rows"), {}, "-p rows"),
+        (("--", "seed:=3"), {}, "argument 'seed:=3' is unknown; parameters are given as --ros-args -p NAME:=VALUE"),
     ]
     for arguments, parameters, expected in cases:
-        with simulator("maze2d", *arguments, **parameters) as node:
+        with NodeProcess("ngo_sim", "maze2d", {}, (*parameter_arguments(parameters), *arguments)) as node:
             assert node.wait() == 2, node.log
-            lines = [line for line in node.log.splitlines() if "RTPS_" not in line]  # DDS may have its own worries
-            assert len(lines) == 1, node.log
-            assert lines[0].startswith("maze2d: bad parameter: ") and expected in lines[0]
+            assert len(node.lines) == 1, node.log
+            assert node.lines[0].startswith("[FATAL]") and expected in node.lines[0]
+
+
+def parameter_arguments(parameters: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(word for name, value in parameters.items() for word in ("-p", f"{name}:={value}"))
+
+
+@pytest.mark.parametrize(
+    ("executable", "flag"), [("maze3d", "--help"), ("local_node", "-h"), ("ngo_node", "--help")]
+)
+def test_help_lists_the_parameters_and_starts_no_node(executable: str, flag: str) -> None:
+    package = "ngo_sim" if executable.startswith("maze") else "ngo_estimator"
+    with NodeProcess(package, executable, {}, ("--", flag)) as node:
+        assert node.wait() == 0, node.log
+        assert node.lines[0].startswith(f"usage: ros2 run {package} {executable} ")
+        assert any(line.startswith("  frame_prefix:=''  (") for line in node.lines)
+        assert "ready" not in node.log
+
+
+def test_a_start_is_told_in_one_line(probe: Probe) -> None:
+    images = probe.collect(Image, "/red/image")
+    with simulator("maze2d", "-r", "__ns:=/red", seed=3, rate=100.0, wait_for_subscribers=1) as node:
+        probe.spin_until(lambda: images, "the first frame")
+        assert len(node.lines) == 1
+        assert node.lines[0].endswith(
+            "ready: /red/maze2d, seed 3, 100 frames a second, publishes /red/action, /red/ground_truth, /red/image, "
+            "/red/scan; waits for 1 subscribers of the image"
+        )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -336,7 +398,10 @@ def test_signals_while_it_starts_end_it_cleanly(probe: Probe, numbers: tuple[sig
         assert "Traceback" not in node.log
 
 
-def test_a_killed_maze3d_takes_its_engine_along(probe: Probe) -> None:
+def test_a_killed_maze3d_takes_its_engine_along_and_leaves_no_files(
+    probe: Probe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
     images = probe.collect(Image, "image")
     with simulator("maze3d", rate=50) as node:
         probe.spin_until(lambda: len(images) > 2, "some frames")
@@ -354,3 +419,4 @@ def test_a_killed_maze3d_takes_its_engine_along(probe: Probe) -> None:
                 return True
 
         wait_until(ended, "the engine's end")
+        assert not list(tmp_path.iterdir())

@@ -8,13 +8,14 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {
+    "ngo_common": ROOT / "ros_ws/src/ngo_common/ngo_common",
     "ngo_recordings": ROOT / "ros_ws/src/ngo_recordings/ngo_recordings",
     "ngo_sim": ROOT / "ros_ws/src/ngo_sim/ngo_sim",
     "ngo_estimator": ROOT / "ros_ws/src/ngo_estimator/ngo_estimator",
 }
 OUTSIDE = {name: ROOT / name for name in ("training", "benchmarks", "demo", "tests")}
-# Recordings serve both packages and know of neither.
-SHARED = ("ngo_recordings",)
+# These serve both packages and know of neither; they do not know each other.
+SHARED = ("ngo_common", "ngo_recordings")
 # What nodes are built from without being nodes: benchmarks send the same messages, and time the same writer.
 PARTS_OF_NODES = ("ngo_estimator.nodes.messages", "ngo_estimator.nodes.path_message")
 ROS = ("rclpy", "builtin_interfaces", "ament_index_python", "rosidl_runtime_py", "launch", "launch_ros")
@@ -104,14 +105,14 @@ def crossings(imports: Mapping[str, set[str]]) -> Iterator[str]:
             if top in PACKAGES:
                 if not in_node and (target in ROS or target.endswith("_msgs")):
                     yield f"{module} imports {name}: only nodes know of ROS"
-                if target in PACKAGES and target not in (top, *SHARED):
+                if target in PACKAGES and target not in ((top,) if top in SHARED else (top, *SHARED)):
                     yield f"{module} imports {name}: the packages meet in training, in tests, or through messages"
                 if target in OUTSIDE:
                     yield f"{module} imports {name}: a package imports nothing that is not installed with it"
             if target == "vizdoom" and module != "ngo_sim.doom_engine" and top != "tests":
                 yield f"{module} imports {name}: only ngo_sim.doom_engine does"
             for package in PACKAGES:
-                own = is_below(module, f"{package}.nodes")
+                own = is_below(module, f"{package}.nodes") or (package in SHARED and in_node)
                 own |= top == "benchmarks" and any(is_below(name, part) for part in PARTS_OF_NODES)
                 if is_below(name, f"{package}.nodes") and not own and top != "tests":
                     yield f"{module} imports {name}: nothing imports a node"
@@ -170,6 +171,10 @@ def test_no_import_crosses_a_layer() -> None:
         ("ngo_estimator.odometry.local_odometry", "from ..nodes.local_node import LocalNode", "nothing imports a node"),
         ("benchmarks.online", "from ngo_estimator.nodes.ngo_node import NgoNode", "nothing imports a node"),
         ("ngo_sim.mazes", "from .episodes import Episode", "later layer"),
+        ("ngo_common.settings", "import rclpy", "only nodes know of ROS"),
+        ("ngo_common.settings", "from ngo_recordings import errors", "the packages meet"),
+        ("ngo_common.nodes.process", "from ngo_sim import mazes", "the packages meet"),
+        ("ngo_sim.maze2d", "from ngo_common.nodes.process import run_node", "nothing imports a node"),
     ],
 )
 def test_a_planted_crossing_is_caught(module: str, source: str, complaint: str) -> None:
@@ -200,6 +205,8 @@ def test_a_crossing_through_other_modules_is_caught() -> None:
         ("tests.ros.test_path", "from ngo_estimator.nodes import path_message"),
         ("ngo_estimator.odometry.local_odometry", "from ngo_estimator.checkpoint import load_checkpoint"),
         ("ngo_sim.nodes.maze2d_node", "from ngo_recordings.writer import RecordingWriter"),
+        ("ngo_sim.maze2d", "from ngo_common.settings import setting"),
+        ("ngo_sim.nodes.maze2d_node", "from ngo_common.nodes.process import run_node"),
     ],
 )
 def test_an_allowed_import_is_not_reported(module: str, source: str) -> None:

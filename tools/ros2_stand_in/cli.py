@@ -12,7 +12,7 @@ from ros2_stand_in.errors import CommandError
 SERVED = "run, topic list|echo|hz, node list, param list|get|set, service list|call, lifecycle get|set"
 DESCRIPTION = f"""\
 This is not the real `ros2` command but a stand-in for it: the ROS 2 wheels come without one.
-It serves exactly: {SERVED}. What these print is what the real command prints.
+It serves exactly: {SERVED}. They print the same as the real command.
 Where a real `ros2` is on PATH, that one is run instead."""
 NOT_SERVED = f"the stand-in for ros2 serves only: {SERVED}; install ROS 2 for the others"
 

@@ -40,7 +40,7 @@ def full_topic_name(node: Node, topic: str) -> str:
 
 
 def published_type(node: Node, topic: str) -> str | None:
-    """The type of the messages on a topic, or None where nobody publishes or subscribes it."""
+    """The type of the messages on a topic, or None for a topic without publishers and subscribers."""
     types = dict(node.get_topic_names_and_types()).get(topic)
     if types is None:
         return None
@@ -78,7 +78,9 @@ def echo(topic: str, type_name: str | None, once: bool, field: str | None, trunc
         found = poll(lambda: published_type(node, name)) if type_name is None else type_name
         if found is None:
             print(f"WARNING: topic [{topic}] does not appear to be published yet")
-            raise CommandError("Could not determine the type for the passed topic")
+            raise CommandError(
+                "Could not determine the type for the passed topic: if its node is starting, wait for its line 'ready'"
+            )
         kind = message_class(found)
         if type_name is not None:
             # The profile follows the publishers that are there; with a type given none has been waited for.

@@ -1,21 +1,10 @@
 """Installs the simulators and their nodes."""
 
-from pathlib import Path
+from glob import glob
 
 from setuptools import find_packages, setup
 
 NAME = "ngo_sim"
-
-
-def files_below(folder: str) -> list[tuple[str, list[str]]]:
-    """Pairs of install folder and files for every file below `folder`, if there are any."""
-    by_parent: dict[Path, list[str]] = {}
-    for path in sorted(Path(folder).rglob("*")):
-        hidden = any(part.startswith((".", "__pycache__")) for part in path.parts)
-        if path.is_file() and not hidden:
-            by_parent.setdefault(path.parent, []).append(str(path))
-    return [(str(Path("share") / NAME / parent), paths) for parent, paths in by_parent.items()]
-
 
 setup(
     name=NAME,
@@ -25,10 +14,20 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        *files_below("launch"),
-        *files_below("config"),
+        *((f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*.*"))) for folder in ("config", "launch")),
     ],
-    install_requires=["setuptools"],
+    install_requires=[
+        "gymnasium",
+        "matplotlib",
+        "networkx",
+        "ngo_common",
+        "ngo_recordings",
+        "numba",
+        "numpy",
+        "pymunk",
+        "safetensors",
+        "vizdoom",
+    ],
     zip_safe=False,
     maintainer="NGO maintainers",
     maintainer_email="maintainers@ngo.invalid",

@@ -42,7 +42,7 @@ _WORKING_DIRECTORY_LOCK = threading.Lock()
 
 
 class DoomEngine:
-    """ViZDoom's process and the files that it reads and writes.
+    """ViZDoom's process.
 
     width, height: of an observation, one of RESOLUTIONS; what is rendered is twice as large. tics: in a step.
     """
@@ -51,7 +51,6 @@ class DoomEngine:
         self._resolution = RESOLUTIONS[width, height]
         self._field_of_view_deg, self._tics = field_of_view_deg, tics
         self._game: vizdoom.DoomGame | None = None
-        self._folder: Path | None = None
         self._harmless = False
 
     @property
@@ -65,13 +64,18 @@ class DoomEngine:
         """
         self.close()
         self._harmless = harmless
-        folder = self._folder = Path(tempfile.mkdtemp(prefix="ngo_maze3d_"))
+        # The running process keeps its files open and needs their names no more: nothing is left of a killed one.
+        with tempfile.TemporaryDirectory(prefix="ngo_maze3d_", ignore_cleanup_errors=True) as folder:
+            self._game = self._started(Path(folder), lumps, first_map, game_wad)
+
+    def _started(self, folder: Path, lumps: Sequence[Lump], first_map: str, game_wad: Path) -> vizdoom.DoomGame:
+        """The process, started with its files in ``folder``."""
         write_lumps(folder / "maps.wad", lumps)
         game = vizdoom.DoomGame()
         game.set_vizdoom_path(str(_launcher(folder)))
         game.set_doom_game_path(str(game_wad))
         game.set_doom_scenario_path(str(folder / "maps.wad"))
-        game.set_doom_config_path(str(folder / "engine.ini"))
+        game.set_doom_config_path(os.devnull)
         game.set_doom_map(first_map)
         game.set_screen_resolution(self._resolution)
         game.set_screen_format(vizdoom.ScreenFormat.RGB24)
@@ -89,7 +93,7 @@ class DoomEngine:
             [GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE]
         )
         # The camera of a walking player goes up and down by default.
-        game.set_game_args("+movebob 0 +stillbob 0" + (" -nomonsters" if harmless else ""))
+        game.set_game_args("+movebob 0 +stillbob 0" + (" -nomonsters" if self._harmless else ""))
         with _WORKING_DIRECTORY_LOCK:
             # The process makes a folder in its working directory, which it can only inherit.
             caller = os.open(".", os.O_RDONLY)
@@ -99,7 +103,7 @@ class DoomEngine:
             finally:
                 os.fchdir(caller)
                 os.close(caller)
-        self._game = game
+        return game
 
     def enter(self, map_name: str) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """Begin a map; return the first picture and pose, as advance() does."""
@@ -143,13 +147,10 @@ class DoomEngine:
         return state.screen_buffer, np.array([x / UNITS_PER_M, y / UNITS_PER_M, yaw])
 
     def close(self) -> None:
-        """End the process, then delete its files, among them some that it writes at its end."""
+        """End the process."""
         game, self._game = self._game, None
         if game is not None:
             game.close()
-        folder, self._folder = self._folder, None
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _launcher(folder: Path) -> Path:

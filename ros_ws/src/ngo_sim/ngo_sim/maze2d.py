@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pymunk
 
+from ngo_common.settings import Settings, setting
 from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_maze_size, prim_maze
 from ngo_sim.raycast import cast_rays
@@ -25,36 +26,40 @@ _PIXELS_A_BLOCK = 24
 
 
 @dataclass(frozen=True)
-class Maze2DConfig:
+class Maze2DConfig(Settings):
     """The 2D world. Speeds and accelerations are given a step, as in v <- travel_decay (v + thrust_m)."""
 
-    rows: int = 7  # cells of the maze along y [2 to 100]
-    cols: int = 7  # cells of the maze along x [2 to 100]
-    extra_openings: int = 0  # walls opened on top of the spanning tree, each one a cycle [0 to (rows - 1) (cols - 1)]
-    block_m: float = 1.0  # side of a block and width of a corridor, m [0.01 to 100]
-    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it [0 to 1]
-    period_s: float = 0.1  # time between two frames, s [0.001 to 10]
-    thrust_m: float = 0.06  # gain of forward speed by one forward action, m a step [0 to block_m]
-    travel_decay: float = 0.8  # share of the speed that a step leaves [0 to 0.99]
-    turn_deg: float = 6.0  # gain of turn rate by one turn action, degrees a step [0 to 90]
-    turn_decay: float = 0.6  # share of the turn rate that a step leaves [0 to 0.99]
-    radius_m: float = 0.2  # of the robot's body, m [0.001 to 0.45 block_m]
-    rays: int = 241  # in one observation, left to right [2 to 10000]
-    field_of_view_deg: float = 300.0  # from the first ray to the last, straight ahead in the middle [1 to 360]
+    rows: int = setting(7, "Cells of the maze along y.", minimum=2, maximum=100)
+    cols: int = setting(7, "Cells of the maze along x.", minimum=2, maximum=100)
+    extra_openings: int = setting(
+        0,
+        "Walls opened on top of the spanning tree, each one a cycle.",
+        allowed="an integer from 0 to (rows - 1) (cols - 1)",
+    )
+    block_m: float = setting(1.0, "Side of a block and width of a corridor, m.", minimum=0.01, maximum=100.0)
+    actuation_noise: float = setting(
+        0.1, "Standard deviation of an action's acceleration as a fraction of it.", minimum=0.0, maximum=1.0
+    )
+    period_s: float = setting(0.1, "Time between two frames, s.", minimum=0.001, maximum=10.0)
+    thrust_m: float = setting(
+        0.06, "Gain of forward speed by one forward action, m a step.", allowed="a number from 0 to block_m"
+    )
+    travel_decay: float = setting(0.8, "Share of the speed that a step leaves.", minimum=0.0, maximum=0.99)
+    turn_deg: float = setting(6.0, "Gain of turn rate by one turn action, degrees a step.", minimum=0.0, maximum=90.0)
+    turn_decay: float = setting(0.6, "Share of the turn rate that a step leaves.", minimum=0.0, maximum=0.99)
+    radius_m: float = setting(
+        0.2, "Radius of the robot's body, m.", allowed="a number from 0.001 block_m to 0.45 block_m"
+    )
+    rays: int = setting(241, "Rays of one observation, left to right.", minimum=2, maximum=10_000)
+    field_of_view_deg: float = setting(
+        300.0, "Angle from the first ray to the last, straight ahead in the middle.", minimum=1.0, maximum=360.0
+    )
 
     def __post_init__(self) -> None:
-        _check_number("block_m", self.block_m, 0.01, 100.0)
+        super().__post_init__()
         check_maze_size(self.rows, self.cols, self.extra_openings)
-        if isinstance(self.rays, bool) or not isinstance(self.rays, int) or not 2 <= self.rays <= 10_000:
-            raise ValueError(f"rays is {self.rays!r}; it must be an integer from 2 to 10000")
-        _check_number("actuation_noise", self.actuation_noise, 0.0, 1.0)
-        _check_number("period_s", self.period_s, 0.001, 10.0)
         _check_number("thrust_m", self.thrust_m, 0.0, self.block_m)
-        _check_number("travel_decay", self.travel_decay, 0.0, 0.99)
-        _check_number("turn_deg", self.turn_deg, 0.0, 90.0)
-        _check_number("turn_decay", self.turn_decay, 0.0, 0.99)
         _check_number("radius_m", self.radius_m, 0.001 * self.block_m, 0.45 * self.block_m)
-        _check_number("field_of_view_deg", self.field_of_view_deg, 1.0, 360.0)
 
 
 class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from ngo_common.settings import BadParameter, Settings, setting
 from ngo_sim.doom_engine import RESOLUTIONS, DoomEngine
 from ngo_sim.doom_level import DoomLevel, load_level
 from ngo_sim.doom_map import (
@@ -38,47 +39,70 @@ _STANDING_M, _STEPS_A_PRESS = 0.02, 24
 _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TURN_RIGHT: -1.0}
 
 
+# A Doom map brings its own walls, looks and things.
+_OF_MAZES = ("rows", "cols", "extra_openings", "block_m", "light_level", "textures", "decorations")
+
+
 @dataclass(frozen=True)
-class Maze3DConfig:
+class Maze3DConfig(Settings):
     """The 3D world. Turn rates are given a step, as in w <- turn_decay w + turn_deg."""
 
-    rows: int = 5  # cells of the maze along y [2 to 100]
-    cols: int = 5  # cells of the maze along x [2 to 100]
-    extra_openings: int = 2  # walls opened on top of the spanning tree, each one a cycle [0 to (rows - 1) (cols - 1)]
-    block_m: float = 3.0  # side of a block and width of a corridor, m [2 to 5]
-    actuation_noise: float = 0.1  # standard deviation of an action's acceleration as a fraction of it [0 to 1]
-    width: int = 80  # of an observation, pixels [80, 160, 200, 256 or 320]
-    height: int = 60  # of an observation, pixels [3/4 of width]
-    field_of_view_deg: int = 108  # from the left to the right border of the picture [30 to 150]
-    frame_skip: int = 2  # tics of 1/35 s in a step [1 to 35]
-    thrust: int = 25  # Doom's forward command in whole units, into which noise is rounded: 25 walks, 50 runs [1 to 50]
-    turn_deg: float = 2.2  # gain of turn rate by one turn action, degrees a step [0 to 90]
-    turn_decay: float = 0.75  # share of the turn rate that a step leaves [0 to 0.99]
-    light_level: int = 208  # of the whole maze, 0 is black [0 to 255]
-    textures: str = "all"  # set that walls, floor and ceiling are drawn from [all, stone, brick, tech or industrial]
-    decorations: int = 0  # things that lie, stand or hang in the maze and are in nobody's way [0 to 1000]
-    wad: str = ""  # Doom map to walk in instead of a maze: its file [a WAD file, or the name of one that ViZDoom ships]
-    map: str = ""  # name of the map in that file, as MAP01 [a map of the wad; empty without one]
+    rows: int = setting(5, "Cells of the maze along y.", minimum=2, maximum=100)
+    cols: int = setting(5, "Cells of the maze along x.", minimum=2, maximum=100)
+    extra_openings: int = setting(
+        2,
+        "Walls opened on top of the spanning tree, each one a cycle.",
+        allowed="an integer from 0 to (rows - 1) (cols - 1)",
+    )
+    # Doom's coordinates end at 32767 units, its player is a square of 1 m.
+    block_m: float = setting(
+        3.0,
+        "Side of a block and width of a corridor, m.",
+        minimum=4 * PLAYER_RADIUS_UNITS / UNITS_PER_M,
+        maximum=5.0,
+    )
+    actuation_noise: float = setting(
+        0.1, "Standard deviation of an action's acceleration as a fraction of it.", minimum=0.0, maximum=1.0
+    )
+    width: int = setting(80, "Width of an observation, pixels.", allowed="80, 160, 200, 256 or 320")
+    height: int = setting(60, "Height of an observation, pixels.", allowed="3/4 of width")
+    field_of_view_deg: int = setting(
+        108, "Angle from the left to the right border of the picture.", minimum=30, maximum=150
+    )
+    frame_skip: int = setting(2, "Tics of 1/35 s in a step.", minimum=1, maximum=TICS_PER_S)
+    thrust: int = setting(
+        25,
+        "Doom's forward command in whole units, into which noise is rounded; 25 walks, 50 runs.",
+        minimum=1,
+        maximum=50,
+    )
+    turn_deg: float = setting(2.2, "Gain of turn rate by one turn action, degrees a step.", minimum=0.0, maximum=90.0)
+    turn_decay: float = setting(0.75, "Share of the turn rate that a step leaves.", minimum=0.0, maximum=0.99)
+    light_level: int = setting(208, "Light of the whole maze; 0 is black.", minimum=0, maximum=255)
+    textures: str = setting("all", "Set of the textures of walls, floor and ceiling.", choices=tuple(TEXTURE_SETS))
+    decorations: int = setting(0, "Number of things in the maze that block nobody.", minimum=0, maximum=1000)
+    wad: str = setting(
+        "",
+        "File of a Doom map to drive in instead of a maze.",
+        allowed="a WAD file, or the name of one that ViZDoom ships",
+    )
+    map: str = setting("", "Name of the map in wad, as MAP01.", allowed="a map of the wad; empty without one")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_maze_size(self.rows, self.cols, self.extra_openings)
-        # Doom's coordinates end at 32767 units, its player is a square of 1 m.
-        _check_number("block_m", self.block_m, 4 * PLAYER_RADIUS_UNITS / UNITS_PER_M, 5.0)
-        _check_number("actuation_noise", self.actuation_noise, 0.0, 1.0)
         if (self.width, self.height) not in RESOLUTIONS:
             allowed = ", ".join(f"{width} x {height}" for width, height in RESOLUTIONS)
             raise ValueError(f"width x height is {self.width} x {self.height}; it must be one of {allowed}")
-        _check_integer("field_of_view_deg", self.field_of_view_deg, 30, 150)
-        _check_integer("frame_skip", self.frame_skip, 1, TICS_PER_S)
-        _check_integer("thrust", self.thrust, 1, 50)
-        _check_number("turn_deg", self.turn_deg, 0.0, 90.0)
-        _check_number("turn_decay", self.turn_decay, 0.0, 0.99)
-        _check_integer("light_level", self.light_level, 0, 255)
-        if self.textures not in TEXTURE_SETS:
-            raise ValueError(f"textures is {self.textures!r}; it must be one of {', '.join(TEXTURE_SETS)}")
-        _check_integer("decorations", self.decorations, 0, 1000)
         if bool(self.wad) != bool(self.map):
             raise ValueError(f"wad is {self.wad!r} and map is {self.map!r}; they must be given both, or neither")
+        for item in fields(self) if self.wad else ():
+            value = getattr(self, item.name)
+            if item.name in _OF_MAZES and value != item.default:
+                raise BadParameter(
+                    f"parameter '{item.name}' is {value!r}; allowed: {item.default!r} together with wad, for it shapes "
+                    "mazes alone"
+                )
 
     @property
     def period_s(self) -> float:
@@ -117,8 +141,8 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
     door opens to who walks against it. Raises ValueError for a map that is not there.
 
-    The engine is a process with files of its own, which end with close(), with the environment or
-    with the interpreter, whichever comes first.
+    The engine is a process, which ends with close(), with the environment or with the interpreter,
+    whichever comes first.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": TICS_PER_S}
@@ -226,7 +250,7 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         return None if self.render_mode is None or self._picture is None else self._picture.copy()
 
     def close(self) -> None:
-        """End the engine and delete its files; another reset starts it again."""
+        """End the engine; another reset starts it again."""
         self._engine.close()
 
     def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
@@ -275,13 +299,3 @@ def _generator(seed: int, stream: int) -> np.random.Generator:
 
 def _map_name(index: int) -> str:
     return f"M{index:07d}"
-
-
-def _check_integer(name: str, value: int, low: int, high: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}; it must be an integer from {low} to {high}")
-
-
-def _check_number(name: str, value: float, low: float, high: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")

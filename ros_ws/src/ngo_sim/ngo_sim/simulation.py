@@ -119,3 +119,10 @@ def body_twist(
 def yaw_quaternion_zw(yaw: float) -> tuple[float, float]:
     """The z and w of the quaternion of a turn about +z; its x and y are 0."""
     return math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+def inverse_pose(pose_xyyaw: npt.NDArray[np.float64]) -> tuple[float, float, float]:
+    """The pose (x, y, yaw) of a frame's parent, seen from the frame that has pose (3,) in it."""
+    x, y, yaw = pose_xyyaw.tolist()
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return -cos * x - sin * y, sin * x - cos * y, -yaw

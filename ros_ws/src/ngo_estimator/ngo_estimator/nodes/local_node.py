@@ -2,6 +2,7 @@
 
 import math
 import sys
+import traceback
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,12 +17,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.nodes.process import StartError, run_node
+from ngo_common.nodes.qos import checked_overrides, overridable
+from ngo_common.settings import usage
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
-from ngo_estimator.nodes.parameters import LiveSettings
-from ngo_estimator.nodes.process import StartError, run_node
-from ngo_estimator.nodes.qos import checked_overrides, overridable
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
@@ -33,16 +35,17 @@ NAME = "local_node"
 _ACTIONS = (DiscreteAction.FORWARD, DiscreteAction.TURN_LEFT, DiscreteAction.TURN_RIGHT)
 _TWISTS = {"TwistStamped": TwistStamped, "Twist": Twist, "Odometry": Odometry}
 _DEPTH = 100
+_SUMMARY = "Publishes relative poses, odometry and odom -> base_link from images or laser scans."
 
 
 class LocalNode(Node):
     """Publishes relative poses, odometry and odom -> base_link.
 
-    What it subscribes is what the networks of its weights take: images or laser scans; actions, velocities or neither.
+    It subscribes to the inputs of the networks in its weights: images or laser scans; actions, velocities or neither.
     """
 
     def __init__(self) -> None:
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        super().__init__(NAME)
         self._live = LiveSettings(self, LocalNodeSettings)
         self._settings = settings = self._live.values
         # Imported here because torch takes seconds: a bad parameter is said at once.
@@ -76,7 +79,8 @@ class LocalNode(Node):
         self.create_service(Reset, "~/reset", self._on_reset)
         self._live.on_change(self._on_settings)
         self._live.lock()
-        self.get_logger().info(f"ready: {settings.world}, {self._sensor_type.__name__} on '{topic}'")
+        kind, topic = self._sensor_type.__name__, self.resolve_topic_name(self._sensor_topic)
+        self.get_logger().info(f"ready: {self.get_fully_qualified_name()}, {settings.world}, {kind} on '{topic}'")
 
     def _create_topics(self) -> None:
         settings = self._settings
@@ -101,9 +105,19 @@ class LocalNode(Node):
         return self.create_publisher(message_type, topic, depth, qos_overriding_options=overridable())
 
     def _listen(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
-        """Take messages of one publisher, which its frame tells from others where they have one."""
+        """Take the messages of one publisher; their frames, where they have any, tell publishers apart."""
         timeout_s = self._settings.source_timeout_s
-        self._inputs.append(Input(self, self._status, message_type, topic, qos, callback, _frame_of, timeout_s))
+
+        def take(message: Any) -> None:
+            try:
+                callback(message)
+            except Exception as error:
+                # A fault of ours, not of the message: a robot is better off with a gap than without the node.
+                reason = f"internal error, {type(error).__name__}: {' '.join(str(error).split())}"
+                self._status.dropped(f"message on '{topic}'", reason)
+                self.get_logger().debug(traceback.format_exc())
+
+        self._inputs.append(Input(self, self._status, message_type, topic, qos, take, _frame_of, timeout_s))
 
     def _on_sensor(self, message: Any) -> None:
         stamp_ns = messages.to_ns(message.header.stamp)
@@ -206,7 +220,7 @@ def _frame_of(message: Any) -> str:
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(NAME, LocalNode))
+    sys.exit(run_node(NAME, LocalNode, usage("ngo_estimator", NAME, _SUMMARY, LocalNodeSettings)))
 
 
 if __name__ == "__main__":

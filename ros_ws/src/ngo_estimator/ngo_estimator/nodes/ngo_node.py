@@ -20,12 +20,13 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.nodes.process import run_node
+from ngo_common.nodes.qos import checked_overrides, overridable
+from ngo_common.settings import usage
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
-from ngo_estimator.nodes.parameters import LiveSettings
-from ngo_estimator.nodes.process import run_node
-from ngo_estimator.nodes.qos import checked_overrides, overridable
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 NAME = "ngo_node"
 _DEPTH = 100
 _PENDING_S = 0.3
+_SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -48,23 +50,24 @@ class NgoNode(LifecycleNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        super().__init__(NAME)
         self._live = LiveSettings(self, NgoNodeSettings)
         self._live.on_change(self._on_settings)
-        self._built, self._listening = ExitStack(), ExitStack()  # what cleanup and deactivate undo
+        self._built, self._listening = ExitStack(), ExitStack()  # undone by cleanup and deactivate
         self._failure: Exception | None = None
         self._starting = False
         self._inputs: list[Input] = []
         self._configured = False
         if not self._settings.autostart:
-            self.get_logger().info("unconfigured: waits to be told, as with ros2 lifecycle set")
+            name = self.get_fully_qualified_name()
+            self.get_logger().info(f"unconfigured: waits for `ros2 lifecycle set {name} configure`")
 
     @property
     def _settings(self) -> NgoNodeSettings:
         return self._live.values
 
     def start(self) -> "NgoNode":
-        """Configure and activate, where ``autostart`` says so; raises what keeps the node from starting."""
+        """Configure and activate if ``autostart`` is set; raises the error that keeps the node from starting."""
         if self._settings.autostart:
             self._starting = True
             for transition in (self.trigger_configure, self.trigger_activate):
@@ -83,12 +86,12 @@ class NgoNode(LifecycleNode):
         return self._attempt(self._listen, self._listening)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no more; what comes meanwhile is a gap that the odometry bridges."""
+        """Stop taking relative poses. The odometry bridges the gap after the next activation."""
         self._listening.close()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the trajectory and the networks."""
+        """Drop the trajectory and the networks."""
         self._built.close()
         return super().on_cleanup(state)
 
@@ -105,7 +108,7 @@ class NgoNode(LifecycleNode):
         except Exception as error:  # rclpy itself would say nothing about it
             undo.close()
             self._failure = error
-            if not self._starting:  # whoever starts the node says it
+            if not self._starting:  # the caller of start() reports it
                 self.get_logger().error(" ".join(str(error).split()) or repr(error))
             return _FAILURE
         return _SUCCESS
@@ -190,10 +193,11 @@ class NgoNode(LifecycleNode):
         listening.callback(self._inputs.clear)
         self._status.idle = ""
         listening.callback(setattr, self._status, "idle", "inactive")
-        self.get_logger().info(f"ready: {settings.world}, the last {settings.window_frames} frames")
+        name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
+        self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
     def _begin_anew(self) -> None:
-        """What belongs to one trajectory."""
+        """Reset the state that belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
         self._covariance = np.zeros((3, 3))
         self._last_correction_m = 0.0
@@ -283,7 +287,7 @@ class NgoNode(LifecycleNode):
     async def _on_save(
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
-        """Have a thread write the file: relative poses go on meanwhile."""
+        """Write the file in a thread, so that relative poses are processed meanwhile."""
         path, trajectory = Path(request.path).expanduser().absolute(), self._trajectory()
         done, executor = Future(), self.executor
 
@@ -348,20 +352,21 @@ class NgoNode(LifecycleNode):
 
 
 def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
-    """Write a file; returns whether that went well, and what to say."""
+    """Write a file; returns whether it succeeded, and a message for the user."""
     try:
         if trajectory is None:
             raise ValueError("the trajectory is empty; nothing was written")
         edges = edges_of(trajectory) if path.suffix == ".g2o" else ()
         write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw, edges)
-    except Exception as error:  # whatever it is, whoever called must get an answer
+    except Exception as error:  # the caller of the service gets an answer in any case
         return False, " ".join(str(error).split()) or repr(error)
     return True, f"wrote {len(trajectory.stamps_ns)} poses to {path}"
 
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(NAME, lambda: NgoNode().start()))
+    text = usage("ngo_estimator", NAME, _SUMMARY, NgoNodeSettings)
+    sys.exit(run_node(NAME, lambda: NgoNode().start(), text))
 
 
 if __name__ == "__main__":

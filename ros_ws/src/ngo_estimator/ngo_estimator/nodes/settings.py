@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from ngo_estimator.nodes.parameters import BadParameter, Settings, frame, frame_prefix, pose, setting, topic
+from ngo_common.settings import BadParameter, FramedSettings, frame, pose, setting, topic
 
 SHIPPED_WORLDS = ("maze2d", "maze3d", "scan")
 """Worlds whose weights are in the package."""
@@ -15,8 +15,8 @@ _TWISTS = ("TwistStamped", "Twist", "Odometry")
 
 
 @dataclass(frozen=True)
-class EstimatorSettings(Settings):
-    """What every estimator node needs."""
+class EstimatorSettings(FramedSettings):
+    """Parameters of every estimator node."""
 
     world: str = setting(
         "maze3d",
@@ -26,7 +26,6 @@ class EstimatorSettings(Settings):
     )
     weights: str = setting("", "Folder of weights for that world; empty: the ones that ship with the package.")
     threads: int = setting(1, "Threads that the networks compute with.", minimum=1, maximum=64)
-    frame_prefix: str = frame_prefix("", "Put before the names of all frames, for several robots on one tf_topic.")
     odom_frame: str = frame("odom", "Frame in which the odometry is smooth and drifts.")
     publish_tf: bool = setting(True, "Whether to publish the transform on tf_topic.")
     relative_pose_topic: str = topic("relative_pose", "Steps of the odometry, from local_node to ngo_node.")
@@ -35,8 +34,7 @@ class EstimatorSettings(Settings):
     )
     source_timeout_s: float = setting(
         1.0,
-        "How long, of several publishers on an input topic, the one that was first may be silent before another takes "
-        "its place.",
+        "Silence of an input topic's publisher after which another publisher of the topic takes its place.",
         minimum=0.01,
         maximum=3600.0,
         live=True,
@@ -50,10 +48,6 @@ class EstimatorSettings(Settings):
         if not self.weights and self.world not in SHIPPED_WORLDS:
             raise BadParameter(f"parameter 'world' is {self.world!r}; allowed: {_WORLD_NAMES}")
 
-    def framed(self, name: str) -> str:
-        """The name of a frame with this robot's prefix."""
-        return self.frame_prefix + name
-
 
 @dataclass(frozen=True)
 class LocalNodeSettings(EstimatorSettings):
@@ -61,39 +55,41 @@ class LocalNodeSettings(EstimatorSettings):
 
     image_topic: str = topic("image", "Images to estimate motion from, with weights that take images.")
     image_transport: str = setting(
-        "raw", "Whether images come as Image, or as CompressedImage on image_topic/compressed.", choices=_TRANSPORTS
+        "raw", "Type of the images: Image, or CompressedImage on image_topic/compressed.", choices=_TRANSPORTS
     )
     scan_topic: str = topic("scan", "Laser scans to estimate motion from, with weights that take scans.")
     scan_yaw_deg: float = setting(
         0.0,
-        "Where angle 0 of a scan points, counter-clockwise from straight ahead.",
+        "Direction of a scan's angle 0, counter-clockwise from straight ahead, degrees.",
         minimum=-360.0,
         maximum=360.0,
     )
     image_reliability: str = setting(
-        "best_effort", "Whether lost images or scans are sent again.", choices=("best_effort", "reliable")
+        "best_effort",
+        "Reliability of image_topic or scan_topic; reliable: lost messages are sent again.",
+        choices=("best_effort", "reliable"),
     )
     image_depth: int = setting(5, "Queue of image_topic or scan_topic.", minimum=1, maximum=10_000)
     action_topic: str = topic("action", "Actions, stamped with the image at which they were taken.")
     action_timeout_s: float = setting(
         1.0,
-        "How far newer images run ahead before one whose action or velocity is missing is dropped.",
+        "Time after which an image without its action or velocity is dropped, by the stamps of newer images.",
         minimum=0.001,
         maximum=60.0,
     )
     action_capacity: int = setting(
         64,
-        "How many images may wait for their actions or velocities before the oldest is dropped.",
+        "Number of images that may wait for actions or velocities; then the oldest is dropped.",
         minimum=1,
         maximum=10_000,
     )
     twist_topic: str = topic("twist", "Velocities of the robot, with weights that take them.")
     twist_type: str = setting(
-        "TwistStamped", "Type of twist_topic; a Twist has no stamp: the time of its arrival counts.", choices=_TWISTS
+        "TwistStamped", "Type of twist_topic; a Twist has no stamp, so the time of its arrival counts.", choices=_TWISTS
     )
     twist_tolerance_s: float = setting(
         0.5,
-        "How much older than an image a velocity may be, where none came since the image before.",
+        "Greatest age of a velocity at an image, where no velocity came since the previous image.",
         minimum=0.0,
         maximum=60.0,
     )
@@ -113,40 +109,46 @@ class LocalNodeSettings(EstimatorSettings):
 class NgoNodeSettings(EstimatorSettings):
     """Parameters of ``ngo_node``."""
 
-    autostart: bool = setting(True, "Whether the node configures and activates itself, or waits to be told.")
+    autostart: bool = setting(
+        True, "Whether the node configures and activates itself; otherwise it waits for lifecycle transitions."
+    )
     window_frames: int = setting(
         2000,
-        "How many of the newest frames are optimised together; older ones move with them.",
+        "Number of newest frames that are optimised together; older frames move with them.",
         minimum=16,
         maximum=100_000,
     )
     key_frames: int = setting(
         128,
-        "How many places from before the window are remembered, so that coming back to them closes a loop.",
+        "Number of remembered places from before the window; a return to one of them closes a loop.",
         minimum=2,
         maximum=100_000,
     )
     iterations_per_step: int = setting(
         1,
-        "Iterations of an optimisation for each relative pose, so that none takes much longer than the others; 0: all "
-        "at the one that completes a meta-pose.",
+        "Iterations of an optimisation at each relative pose, which spreads its time; 0: all of them at the relative "
+        "pose that completes a meta-pose.",
         minimum=0,
         maximum=100,
     )
     map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump.")
     initial_pose: tuple[float, float, float] = pose(
-        (0.0, 0.0, 0.0), "Where in map_frame the first frame of a trajectory lies, from the next one on.", live=True
+        (0.0, 0.0, 0.0),
+        "Pose of a trajectory's first frame in map_frame; a change holds from the next trajectory on.",
+        live=True,
     )
     initial_pose_topic: str = topic(
-        "initialpose", "Where in map_frame the robot is now: the whole trajectory moves there."
+        "initialpose", "Current pose of the robot in map_frame; the whole trajectory moves there."
     )
     path_topic: str = topic("ngo/path", "Corrected trajectory.")
-    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, for every relative pose.")
-    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory in flat arrays, and how far each pose moved.")
-    loops_topic: str = topic("ngo/loops", "Lines between poses that the optimizer takes for the same place.")
+    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, after every relative pose.")
+    trajectory_topic: str = topic(
+        "ngo/trajectory", "Corrected trajectory in flat arrays, with the distance that each pose moved."
+    )
+    loops_topic: str = topic("ngo/loops", "Loop closures as lines between poses.")
     path_rate_hz: float = setting(
         10.0,
-        "How often path_topic, trajectory_topic and loops_topic are published at most; 0: after every relative pose.",
+        "Highest rate of path_topic, trajectory_topic and loops_topic; 0: after every relative pose.",
         minimum=0.0,
         maximum=1000.0,
         live=True,
@@ -160,7 +162,7 @@ class NgoNodeSettings(EstimatorSettings):
     )
     lost_position_std_m: float = setting(
         2.0,
-        "Standard deviation of the newest position from which on diagnostics call the robot lost.",
+        "Standard deviation of the newest position above which diagnostics call the robot lost, m.",
         minimum=0.001,
         maximum=1e6,
         live=True,

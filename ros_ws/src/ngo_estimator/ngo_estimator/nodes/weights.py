@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from ament_index_python.packages import get_package_share_directory
 
-from ngo_estimator.nodes.process import StartError
+from ngo_common.nodes.process import StartError
 from ngo_estimator.nodes.settings import EstimatorSettings
 
 Core = TypeVar("Core")

@@ -1,4 +1,4 @@
-"""Those who take a simulator's frames, as the topics that they answer on, heard by their stamps alone."""
+"""The nodes that process a simulator's frames, known by the stamps on the topics that they publish."""
 
 from __future__ import annotations
 
@@ -10,23 +10,15 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from ngo_sim.flow_control import FlowControl, header_stamp_ns
-from ngo_sim.nodes.parameters import BadParameter
 
 
 class Consumers:
-    """Feeds a FlowControl from topics of any stamped type. Call look() now and then: consumers come and go.
+    """Feeds a FlowControl from topics of any stamped type. Call look() regularly, because consumers come and go.
 
-    Messages are never deserialised: the stamp is read from the bytes of the header. Raises BadParameter for a topic
-    name that ROS does not allow.
+    Messages are never deserialised: the stamp is read from the bytes of the header.
     """
 
     def __init__(self, node: Node, topics: Sequence[str], flow: FlowControl) -> None:
-        for topic in topics:
-            try:
-                node.resolve_topic_name(topic)
-            except (RuntimeError, ValueError) as error:
-                reason = " ".join(str(error).split())
-                raise BadParameter(f"flow_control_topics has {topic!r}; allowed: names of topics ({reason})") from None
         self._node = node
         self._topics = tuple(topics)
         self._flow = flow
@@ -67,7 +59,7 @@ class Consumers:
         return self._flow.in_flight() == 0 or self._stalled(now_s, stall_timeout_s)
 
     def _stalled(self, now_s: float, stall_timeout_s: float) -> bool:
-        """Whether nothing was heard for too long; if so, warn and count the frames in hand as lost."""
+        """Whether the timeout has passed without an answer; if so, warn and count the frames in flight as lost."""
         if self._answers:
             self._answers, self._progress_s = 0, now_s
         if stall_timeout_s == 0.0 or now_s - self._progress_s < stall_timeout_s:

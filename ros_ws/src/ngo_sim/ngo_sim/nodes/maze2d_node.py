@@ -13,6 +13,7 @@ from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.nodes.process import run_simulator
 from ngo_sim.nodes.simulator_node import SimulatorNode
 from ngo_sim.simulation import Frame, World
+from ngo_sim.simulator_config import SimulatorConfig
 
 
 class Maze2DNode(SimulatorNode):
@@ -46,21 +47,21 @@ class Maze2DNode(SimulatorNode):
             scan_time=self._world.period_s,
             range_max=math.hypot(*self._world.maze.size_m),
         )
-        scan.header.stamp, scan.header.frame_id = stamp, self.config.base_frame
+        scan.header.stamp, scan.header.frame_id = stamp, self.framed(self.config.base_frame)
         scan.ranges = array.array("f", frame.observation[::-1, 3].tobytes())
         self._scan.publish(scan)
         rays, channels = frame.observation.shape
         image = Image(
             height=1, width=rays, encoding="32FC4", step=rays * channels * 4, is_bigendian=sys.byteorder == "big"
         )
-        image.header.stamp, image.header.frame_id = stamp, self.config.camera_frame
+        image.header.stamp, image.header.frame_id = stamp, self.framed(self.config.camera_frame)
         image.data = array.array("B", frame.observation.tobytes())
         self._image.publish(image)
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return run_simulator(Maze2DNode, "maze2d", args)
+    return run_simulator(Maze2DNode, "maze2d", (SimulatorConfig, Maze2DConfig), args, **Maze2DNode.defaults)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ import sys
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
-from tf2_msgs.msg import TFMessage
 
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.nodes.process import run_simulator
 from ngo_sim.nodes.simulator_node import SimulatorNode
 from ngo_sim.simulation import Frame, World
+from ngo_sim.simulator_config import SimulatorConfig
 
 # An optical frame looks along z, with x to the right and y down (REP-103).
 _BASE_FROM_OPTICAL = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
@@ -25,7 +24,7 @@ _BASE_FROM_OPTICAL = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
 class Maze3DNode(SimulatorNode):
     """Publishes `image` (rgb8) and `camera_info`: a pinhole at the middle of the robot, without distortion.
 
-    The two focal lengths differ: Doom's pixels are higher than wide. Where the camera is, is on `/tf_static`.
+    The two focal lengths differ: Doom's pixels are higher than wide. The camera's pose on the robot is on `/tf_static`.
     """
 
     world_config_type = Maze3DConfig
@@ -36,13 +35,6 @@ class Maze3DNode(SimulatorNode):
         self._camera_info = self.outputs.create(CameraInfo, "camera_info")
         self._image = self.outputs.create(Image, "image")
         self.image_publisher = self._image.publisher
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._static_tf = self.outputs.create(TFMessage, "/tf_static", latched)
-        if self.config.camera_frame != self.config.base_frame:
-            mounted = TransformStamped(child_frame_id=self.config.camera_frame)
-            mounted.header.frame_id = self.config.base_frame
-            mounted.transform = Transform(rotation=_BASE_FROM_OPTICAL)
-            self._static_tf.publish(TFMessage(transforms=[mounted]))
         config: Maze3DConfig = self.world_config
         focal_x, focal_y = config.focal_lengths_px
         # The middle of the picture, where the centre of pixel 0 is 0.
@@ -67,9 +59,19 @@ class Maze3DNode(SimulatorNode):
                     os.set_inheritable(descriptor, False)
         return Maze3D(self.world_config)
 
+    def static_transforms(self) -> list[TransformStamped]:
+        """The camera on the robot, beside those of every simulator."""
+        transforms = super().static_transforms()
+        if self.config.camera_frame != self.config.base_frame:
+            mounted = TransformStamped(child_frame_id=self.framed(self.config.camera_frame))
+            mounted.header.frame_id = self.framed(self.config.base_frame)
+            mounted.transform = Transform(rotation=_BASE_FROM_OPTICAL)
+            transforms.append(mounted)
+        return transforms
+
     def publish_sensors(self, frame: Frame, stamp: Time) -> None:
         """Publish the camera's description and the picture of a frame."""
-        self._camera.header.stamp, self._camera.header.frame_id = stamp, self.config.camera_frame
+        self._camera.header.stamp, self._camera.header.frame_id = stamp, self.framed(self.config.camera_frame)
         self._camera_info.publish(self._camera)
         height, width, channels = frame.observation.shape
         image = Image(header=self._camera.header, height=height, width=width, encoding="rgb8", step=width * channels)
@@ -79,7 +81,7 @@ class Maze3DNode(SimulatorNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return run_simulator(Maze3DNode, "maze3d", args)
+    return run_simulator(Maze3DNode, "maze3d", (SimulatorConfig, Maze3DConfig), args, **Maze3DNode.defaults)
 
 
 if __name__ == "__main__":

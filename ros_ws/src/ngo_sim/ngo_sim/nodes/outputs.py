@@ -1,7 +1,8 @@
-"""What a node publishes, and on request a recording of it."""
+"""The topics of a simulator node, and on request a recording of them."""
 
 from __future__ import annotations
 
+import copy
 import weakref
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 
+from ngo_common.nodes.qos import checked_overrides, overridable
+from ngo_common.settings import BadParameter
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.writer import RecordingWriter
-from ngo_sim.nodes.parameters import BadParameter
 
 
 class Output:
@@ -34,7 +36,7 @@ class Output:
 
 
 class Recording:
-    """A file being written, and the log time of what is written next."""
+    """A file being written, and the log time of the next message."""
 
     def __init__(self, path: Path) -> None:
         self.writer = RecordingWriter(path, library="ngo_sim")
@@ -50,22 +52,28 @@ class Outputs:
 
     def __init__(self, node: Node, qos: QoSProfile, record: str) -> None:
         self._node, self._qos = node, qos
+        self.topic_names: list[str] = []
+        """The resolved names of all topics."""
         self._recording: Recording | None = None
         if record:
             path = Path(record).expanduser()
             if path.exists():
-                raise BadParameter(f"record is {record!r}, which exists; allowed: a new .mcap file or a new folder")
+                raise BadParameter(
+                    f"parameter 'record' is {record!r}, which exists; allowed: a new .mcap file or a new folder"
+                )
             try:
                 self._recording = Recording(path)
             except (OSError, RecordingError) as error:
-                raise BadParameter(f"record is {record!r}, which cannot be written: {error}") from None
-            # A node that is interrupted while it starts has nobody to close it.
+                raise BadParameter(f"parameter 'record' is {record!r}, which cannot be written: {error}") from None
+            # Nothing else closes the file of a node that is interrupted while it starts.
             weakref.finalize(self, self._recording.writer.close)
 
     def create(self, message_type: type, topic: str, qos: QoSProfile | None = None) -> Output:
-        """A topic to publish on; qos: another one than that of the sensors."""
-        qos = self._qos if qos is None else qos
-        publisher = self._node.create_publisher(message_type, topic, qos)
+        """A topic to publish on; qos: that of the sensors by default."""
+        qos = copy.copy(self._qos if qos is None else qos)  # rclpy writes the overrides into it
+        with checked_overrides():
+            publisher = self._node.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
+        self.topic_names.append(publisher.topic_name)
         if self._recording is not None:
             package = message_type.__module__.partition(".")[0]
             type_name = f"{package}/msg/{message_type.__name__}"
@@ -75,16 +83,16 @@ class Outputs:
                     publisher.topic_name, type_name, depth=qos.depth, transient_local=latched
                 )
             except RecordingError as error:
-                raise BadParameter(f"record is set, but {error}") from None
+                raise BadParameter(f"parameter 'record' is set, but {error}") from None
         return Output(publisher, self._recording)
 
     def set_time(self, stamp_ns: int) -> None:
-        """What is published from now on has this log time."""
+        """Set the log time of the next messages."""
         if self._recording is not None:
             self._recording.now_ns = stamp_ns
 
     def flush_if_due(self) -> None:
-        """Let what is recorded get to the file now and then."""
+        """Write buffered messages to the file once a period."""
         if self._recording is not None:
             self._recording.writer.flush_if_due()
 

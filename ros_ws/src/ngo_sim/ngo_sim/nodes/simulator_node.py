@@ -1,4 +1,4 @@
-"""The node that both worlds share: paces a simulation, takes actions from outside, publishes each frame."""
+"""The node that all worlds share: paces a simulation, takes actions from outside, publishes each frame."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
+from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
-from ngo_sim.nodes.parameters import BadParameter, ConfigParameters, changed
-from ngo_sim.simulation import Frame, Simulation, World, yaw_quaternion_zw
+from ngo_sim.simulation import Frame, Simulation, World, inverse_pose, yaw_quaternion_zw
 from ngo_sim.simulator_config import SimulatorConfig
 
 _LOOK_AT_GRAPH_S = 0.1
@@ -34,24 +34,22 @@ _LISTEN_S = 0.002
 
 
 class SimulatorNode(Node):
-    """Publishes the frames of one world; a subclass makes the world and publishes what the robot sees."""
+    """Publishes the frames of one world; a subclass makes the world and publishes the sensors."""
 
-    world_config_type: ClassVar[type]
+    world_config_type: ClassVar[type[Settings]]
     defaults: ClassVar[dict[str, Any]] = {}
-    image_publisher: Publisher  # its subscribers are those that wait_for_subscribers counts
+    image_publisher: Publisher  # wait_for_subscribers counts its subscribers
 
     def __init__(self, name: str) -> None:
-        try:
-            super().__init__(name)
-        except InvalidParameterTypeException as error:  # of one of those that every node declares by itself
-            raise BadParameter(str(error)) from None
-        parameters = ConfigParameters(self)
-        self.config = parameters.declare(SimulatorConfig, **self.defaults)
-        self.world_config: Any = parameters.declare(self.world_config_type)
-        parameters.finish()
-        self.add_on_set_parameters_callback(self._on_parameters)
+        super().__init__(name)
+        types = SimulatorConfig, self.world_config_type
+        self._live = LiveSettings(self, SimulatorConfig, defaults=self.defaults, beside=types)
+        world = LiveSettings(self, self.world_config_type, beside=types)
+        self.world_config: Any = world.values
+        self._live.lock()
+        world.lock()
         self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
-        # Deep enough that a reliable reader may be late with its acknowledgement by far more than what is in flight.
+        # Deep enough for late acknowledgements of a reliable reader: far more than the frames in flight.
         qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
         self.outputs = Outputs(self, qos, self.config.record)
         self.outputs.set_time(time.time_ns() if self.config.use_wall_stamps else self.config.stamp_ns(0, 0.0))
@@ -61,31 +59,56 @@ class SimulatorNode(Node):
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         try:
             self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
-        except ValueError as error:  # what only the files or the world can say
+        except ValueError as error:  # an error that only the files or the world can show
             raise BadParameter(str(error)) from None
         self._pacer = Pacer()
         self._published = 0
         self._looked_s = 0.0
         self._stamp = Time()
+        if transforms := self.static_transforms():
+            # One message: of a second one on this topic, a subscriber that comes later would get that alone.
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self.outputs.create(TFMessage, "/tf_static", latched).publish(TFMessage(transforms=transforms))
 
     def destroy_node(self) -> None:
-        """End the world and the recording, too."""
+        """End the recording and the world."""
         self.outputs.close()
         self.simulation.world.close()
         super().destroy_node()
 
     @abstractmethod
     def make_world(self) -> World:
-        """The world of world_config; the seed comes with its reset. Raises ValueError for a config that cannot be."""
+        """The world of world_config; the seed comes with its reset. Raises ValueError for an impossible config."""
 
     @abstractmethod
     def publish_sensors(self, frame: Frame, stamp: Time) -> None:
-        """Publish what the robot sees."""
+        """Publish the sensors of a frame."""
+
+    @property
+    def config(self) -> SimulatorConfig:
+        """How the node runs, as it is set now."""
+        return self._live.values
+
+    def framed(self, name: str) -> str:
+        """The name of a frame with this robot's prefix."""
+        return self.config.framed(name)
+
+    def static_transforms(self) -> list[TransformStamped]:
+        """Transforms for /tf_static: where the ground truth begins, on request."""
+        if not self.config.truth_parent_frame:
+            return []
+        placed = TransformStamped(child_frame_id=self.framed(self.config.ground_truth_frame))
+        placed.header.frame_id = self.framed(self.config.truth_parent_frame)
+        x, y, yaw = inverse_pose(self.simulation.frame.pose_xyyaw)
+        placed.transform.translation.x, placed.transform.translation.y = x, y
+        placed.transform.rotation.z, placed.transform.rotation.w = yaw_quaternion_zw(yaw)
+        return [placed]
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Publish frames until there are enough and all are taken, or until ``ended`` says so."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
+        self.get_logger().info(self._ready_line())
         listened_s = 0.0
         while not ended():
             now_s = time.monotonic()
@@ -105,8 +128,17 @@ class SimulatorNode(Node):
                 listened_s = now_s
                 executor.spin_once(timeout_sec=idle_s)
 
+    def _ready_line(self) -> str:
+        """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""
+        config, topics = self.config, ", ".join(sorted(self.outputs.topic_names))
+        pace = f"{config.rate:g} frames a second" if config.rate else "as fast as the frames are taken"
+        subscribers = f"; waits for {config.wait_for_subscribers} subscribers of the image"
+        waits = subscribers if config.wait_for_subscribers else ""
+        name = self.get_fully_qualified_name()
+        return f"ready: {name}, seed {config.seed}, {pace}, publishes {topics}{waits}"
+
     def _idle_s(self, now_s: float) -> float:
-        """How long nothing is to be done before the next frame, 0 where it is due; messages end the wait earlier."""
+        """Time until the next frame, 0 if it is due; messages end the wait earlier."""
         config = self.config
         if self._published == 0:
             awaited = self.image_publisher.get_subscription_count() < config.wait_for_subscribers or (
@@ -125,7 +157,7 @@ class SimulatorNode(Node):
             action = simulation.choose_action(now_s, config.action_timeout_s, hold=config.rate > 0)
             assert action is not None  # ready() said so
             message = DiscreteAction(action=int(action))
-            message.header.stamp, message.header.frame_id = self._stamp, config.base_frame
+            message.header.stamp, message.header.frame_id = self._stamp, self.framed(config.base_frame)
             self._action.publish(message)
             simulation.advance(action)
         frame = simulation.frame
@@ -142,8 +174,8 @@ class SimulatorNode(Node):
         self._pacer.taken(now_s, config.rate)
 
     def _publish_truth(self, frame: Frame) -> None:
-        message = Odometry(child_frame_id=self.config.base_frame)
-        message.header.stamp, message.header.frame_id = self._stamp, self.config.ground_truth_frame
+        message = Odometry(child_frame_id=self.framed(self.config.base_frame))
+        message.header.stamp, message.header.frame_id = self._stamp, self.framed(self.config.ground_truth_frame)
         x, y, yaw = frame.pose_xyyaw.tolist()
         pose, twist = message.pose.pose, message.twist.twist
         pose.position.x, pose.position.y = x, y
@@ -156,7 +188,3 @@ class SimulatorNode(Node):
             self.simulation.external.command(message.action, time.monotonic())
         except ValueError as error:
             self.get_logger().warning(f"action_command dropped: {error}", throttle_duration_sec=5.0)
-
-    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        self.config, result = changed(self.config, parameters)
-        return result

@@ -1,6 +1,7 @@
 # The rosidl targets of the ROS 2 wheels name include folders of the interpreter that built the wheels
 # (below /opt/python/), which exist on no other machine, and CMake refuses a target whose include folder is missing.
-# Removes exactly those: on any other ROS 2 there are none, and this does nothing.
+# Removes exactly those. scripts/build.sh has CMake include this file in every package (CMAKE_PROJECT_INCLUDE), so that the
+# packages themselves are the same on any ROS 2.
 function(_drop_missing_python_includes)
   get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
   foreach(target IN LISTS targets)

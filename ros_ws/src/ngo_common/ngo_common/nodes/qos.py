@@ -1,4 +1,4 @@
-"""Quality of service that a user may override for each topic, the way that ROS 2 has for it."""
+"""Quality of service that a user may override for each topic, with ROS 2's own parameters for it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.qos import QoSPolicyKind
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 
-from ngo_estimator.nodes.parameters import BadParameter
+from ngo_common.settings import BadParameter
 
 _POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
 
@@ -19,7 +19,7 @@ def overridable() -> QoSOverridingOptions:
 
 @contextmanager
 def checked_overrides() -> Iterator[None]:
-    """Around the making of topics: raises ``BadParameter`` where rclpy stumbles over what a user overrides."""
+    """Around the creation of topics: raises ``BadParameter`` for an override that rclpy refuses."""
     try:
         yield
     except (InvalidQosOverridesError, ParameterException, RuntimeError, ValueError) as error:

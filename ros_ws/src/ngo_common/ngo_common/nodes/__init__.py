@@ -1,0 +1,1 @@
+"""Parameters, quality of service, and the process around a node."""

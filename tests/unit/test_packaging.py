@@ -1,0 +1,178 @@
+"""What the packages import is what they declare, and their cores install and run without ROS."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import pytest
+import setuptools
+
+from tests.unit.test_layers import imported_names
+
+ROOT = Path(__file__).parents[2]
+WORKSPACE = ROOT / "ros_ws"
+SOURCES = {path.parent.name: path.parent for path in sorted(WORKSPACE.glob("*/*/package.xml"))}
+PYTHON = [name for name, folder in SOURCES.items() if (folder / "setup.py").exists()]
+# Programs of the repository, which are not installed: requirements/ has what they import.
+PROGRAMS = ("training", "benchmarks", "demo", "tests", "tools", "scripts")
+# Modules whose distribution has another name.
+DISTRIBUTIONS = {"PIL": "pillow", "yaml": "pyyaml", "mcap_ros2": "mcap-ros2-support"}
+OWN = {*PYTHON, *PROGRAMS, "ros2_stand_in"}
+ROS = ("rclpy", "ament_index_python", "launch", "launch_ros")
+VERSION = "0.1.0"
+
+
+def is_of_ros(module: str) -> bool:
+    """Whether a module comes with ROS: in package.xml, not in requirements/."""
+    return module in ROS or module.endswith(("_msgs", "_srvs", "_interfaces"))
+
+
+def imports_below(folder: Path) -> set[str]:
+    """The names of all modules from elsewhere that files below a folder import, without those of Python itself."""
+    names: set[str] = set()
+    for path in folder.rglob("*.py"):
+        if path.name != "setup.py":
+            names |= {name.partition(".")[0] for name in imported_names(path.read_text(), "a.b") if name}
+    return names - set(sys.stdlib_module_names) - {"a", "__future__", folder.name}
+
+
+def ros_packages_in_launch_files(folder: Path) -> set[str]:
+    """Packages that launch files name: those whose nodes they start, and whose folders they look into."""
+    named: set[str] = set()
+    for path in folder.glob("launch/*.py"):
+        named |= {
+            node.value
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in SOURCES
+        }
+    return named
+
+
+def declared_for_ros(folder: Path) -> set[str]:
+    root = ElementTree.parse(folder / "package.xml").getroot()
+    return {element.text or "" for tag in ("depend", "exec_depend") for element in root.iter(tag)}
+
+
+def setup_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The arguments that a setup.py gives to setuptools."""
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, "setup", given.update)
+    monkeypatch.chdir(folder)
+    exec(compile((folder / "setup.py").read_text(), "setup.py", "exec"), {"__name__": "setup"})
+    return given
+
+
+def distribution(module: str) -> str:
+    return DISTRIBUTIONS.get(module, module.replace("_", "-"))
+
+
+def required(*files: str) -> set[str]:
+    lines = [line for name in files for line in (ROOT / "requirements" / name).read_text().splitlines()]
+    return {re.split(r"[=\[<>; ]", line, maxsplit=1)[0] for line in lines if line and line[0] not in "#-"}
+
+
+@pytest.mark.parametrize("name", PYTHON)
+def test_a_package_declares_what_it_imports_and_no_more(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = SOURCES[name]
+    imported = imports_below(folder)
+    of_ros = {module for module in imported if is_of_ros(module) or module in SOURCES}
+    forwarded = {"ngo_bringup"} if name != "ngo_bringup" else set()  # which depends on those that forward to it
+    assert declared_for_ros(folder) == of_ros | ros_packages_in_launch_files(folder) - forwarded - {name}
+    of_pip = {module if module in SOURCES else distribution(module) for module in imported if not is_of_ros(module)}
+    assert set(setup_of(folder, monkeypatch).get("install_requires", [])) == of_pip
+    assert of_pip - set(SOURCES) <= required("runtime.txt"), "requirements/runtime.txt has all that is imported"
+
+
+def test_programs_import_what_the_requirements_have() -> None:
+    imported = set().union(*(imports_below(ROOT / folder) for folder in PROGRAMS))
+    # What a test finds beside itself, and examples of bad imports.
+    local = {path.stem for path in (ROOT / "tests").rglob("*.py")} | OWN
+    modules = {module for module in imported - local if not is_of_ros(module)}
+    names = {distribution(module) for module in modules}
+    assert names <= required("runtime.txt", "test.txt", "build.txt")
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_all_packages_have_one_version(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = ElementTree.parse(SOURCES[name] / "package.xml").getroot()
+    facts = {key: root.findtext(key) for key in ("name", "version", "license")}
+    assert facts == {"name": name, "version": VERSION, "license": "Apache-2.0"}
+    if name in PYTHON:
+        given = setup_of(SOURCES[name], monkeypatch)
+        assert {key: given[key] for key in facts} == facts
+        assert given["description"] == root.findtext("description")
+    assert f"## [{VERSION}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+CORE = '''
+import importlib, pkgutil, sys
+from pathlib import Path
+
+class NoRos:
+    """An interpreter without ROS."""
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top in ("rclpy", "ament_index_python") or top.endswith(("_msgs", "_srvs", "_interfaces")):
+            raise ModuleNotFoundError(f"{name} is of ROS")
+
+sys.meta_path.insert(0, NoRos())
+here = Path(sys.argv[1])
+for package in ("ngo_common", "ngo_recordings", "ngo_estimator"):
+    module = importlib.import_module(package)
+    assert Path(module.__file__).is_relative_to(here), module.__file__
+    for found in pkgutil.walk_packages(module.__path__, package + "."):
+        if ".nodes" not in found.name:
+            importlib.import_module(found.name)
+
+import torch
+torch.set_num_threads(1)
+from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.offline.recording_run import RecordingRun
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_recordings.frames import Frame
+import numpy as np
+
+weights = here / "weights"
+weights.mkdir()
+write_untrained(weights, "maze2d")
+rng = np.random.default_rng(0)
+frames = [
+    Frame(10**9 + k * 10**8, rng.random((1, 241, 4), dtype=np.float32), action=(k - 1) % 3 if k else None)
+    for k in range(5)
+]
+run = RecordingRun(LocalOdometry.load(weights, "maze2d"), OnlineTrajectory.load(weights, 64, "maze2d"))
+events = list(run.run(frames))
+print(type(events[-1]).__name__, len(events[-1].trajectory.stamps_ns))
+assert (here / "share/ngo_estimator/weights/maze2d/neural_graph_optimizer.safetensors").exists()
+'''
+
+
+def test_the_core_installs_with_pip_and_runs_without_ros(tmp_path: Path) -> None:
+    """From copies, because pip builds within the sources; without an index, so that nothing is downloaded."""
+    packages = [tmp_path / name for name in ("ngo_common", "ngo_recordings", "ngo_estimator")]
+    for copy in packages:
+        shutil.copytree(SOURCES[copy.name], copy, ignore=shutil.ignore_patterns("__pycache__", "maze3d", "scan"))
+    target = tmp_path / "installed"
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input", "-q"]
+    options = ["--no-deps", "--no-index", "--no-build-isolation", "--no-compile", "--target", str(target)]
+    subprocess.run([*pip, "install", *options, *map(str, packages)], check=True, cwd=tmp_path, timeout=120)
+    program = tmp_path / "core.py"
+    program.write_text(CORE)
+    result = subprocess.run(
+        [sys.executable, str(program), str(target)],
+        env={**os.environ, "PYTHONPATH": str(target), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == ["RecordedRun", "5"]
