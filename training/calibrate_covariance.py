@@ -18,9 +18,9 @@ from tqdm import tqdm
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training.common import runs
-from training.data.streams import simulate
+from training.data.episodes import simulate
+from training.data.features import features_of
 from training.data.worlds import VALIDATION_SEEDS, WorldName, world_named
-from training.featurise import features_of
 from training.scoring.online_estimate import steps_of
 
 _OWN = ("format", "network", "world", "sha256", "config")

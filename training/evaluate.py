@@ -31,14 +31,14 @@ from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_of
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings
 from training.common import runs
-from training.data.streams import simulate
+from training.data.episodes import simulate
+from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
-from training.featurise import features_of
 from training.recordings.recording_source import RecordedArguments, open_recorded
+from training.report.held_out import evaluate_recorded
 from training.scoring.file_errors import evaluate_files
 from training.scoring.metrics import TrajectoryError, trajectory_error
 from training.scoring.online_estimate import run_online, with_origin
-from training.scoring.recording_errors import FEATURES, evaluate_recorded
 
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
@@ -118,7 +118,7 @@ def main(arguments: Arguments) -> dict[str, object]:
         for group in (seeds[i : i + 8] for i in range(0, len(seeds), 8)):
             for episode in simulate(world, group, frames):
                 features = features_of(world, episode, folder, (local, place))
-                arrays = [torch.from_numpy(features[name]) for name in FEATURES]
+                arrays = [torch.from_numpy(features[name]) for name in OPTIMIZER_INPUTS]
                 corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
                 poses = {
                     "odometry": with_origin(se2.r2g(arrays[0]).numpy()),

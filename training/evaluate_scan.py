@@ -29,12 +29,11 @@ from ngo_estimator.online.online_trajectory import optimize_offline
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2DConfig
 from training.common import runs
+from training.data.episodes import simulate
+from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.scans import ScannedMaze
-from training.data.streams import simulate
 from training.data.worlds import WORLDS
-from training.featurise import features_of
 from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
-from training.scoring.recording_errors import FEATURES
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as drawn in training": {},
@@ -113,7 +112,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
             lengths = []
             for episode in episodes(row, arguments.trajectories, arguments.frames):
                 features = features_of(world, episode, folder, (local, place))
-                arrays = [torch.from_numpy(features[name]) for name in FEATURES]
+                arrays = [torch.from_numpy(features[name]) for name in OPTIMIZER_INPUTS]
                 corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
                 for name, poses in (("odometry", se2.r2g(arrays[0])), ("corrected", corrected)):
                     from_origin = np.concatenate((np.zeros((1, 3)), poses.numpy()))

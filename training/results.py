@@ -17,15 +17,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from training.baselines.network_odometry import open_odometry
 from training.common import runs
 from training.common.curves import write_at_once
+from training.data.feature_store import open_store
 from training.data.worlds import world_named
-from training.featurise import open_store
+from training.prerequisites import Scripts, Wanted, prepare
 from training.report import attention, figures, results_page, tables
-from training.report.prerequisites import Scripts, Wanted, prepare
 from training.report.training_records import trainings_json
 from training.scoring.error_cache import Measured, measure
+from training.scoring.network_odometry import open_odometry
 from training.scoring.oracle_rows import LIMITED_WORLDS, LIMITS, limit_estimator
 from training.scoring.row_estimators import Arrays, Prepared, estimators
 from training.scoring.table_rows import ROWS, Sources, rows_of

@@ -14,7 +14,8 @@ import tyro
 from torch.utils.data import IterableDataset
 
 from training.common.curves import memory_mb, rows
-from training.data.streams import Batch, PairStream, PlaceStream, TrajectoryStream, loader
+from training.data.batches import Batch
+from training.data.streams import PairStream, PlaceStream, TrajectoryStream, loader
 from training.data.worlds import TRAIN_SEEDS, world_named
 
 _WARM_UP = 16  # batches: the processes have started, the simulator is compiled, and none lies ready

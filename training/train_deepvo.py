@@ -22,14 +22,16 @@ from torch import Tensor
 from ngo_estimator.checkpoint import save_checkpoint
 from ngo_estimator.geometry import se2
 from training.baselines.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
+from training.baselines.graph_settings import fit_calibration
 from training.common import runs
-from training.common.data_module import StreamedData
-from training.data import streams
-from training.data.streams import ALL, Batch, PairStream, Share, images_of, mirrored, relative_poses, simulate
+from training.common.step_losses import step_losses, step_metrics, windows_within
+from training.data import episodes
+from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, seen_from_first
+from training.data.data_module import StreamedData
+from training.data.episodes import images_of, simulate
+from training.data.streams import PairStream
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.scoring.metrics import seen_from_first
-from training.train_local import episode_pairs, step_losses, step_metrics, windows_within
-from training.tune_pose_graph import fit_calibration
+from training.train_local import episode_pairs
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
@@ -87,7 +89,7 @@ class StretchStream(PairStream):
 
     @property
     def batches_a_group(self) -> int:
-        return streams._GROUP * self.stretches_a_maze // self.batch_size
+        return episodes.GROUP * self.stretches_a_maze // self.batch_size
 
     def batches(self, episodes: list["Episode"], rng: np.random.Generator) -> Iterator[Batch]:
         images = [images_of(self.world, episode) for episode in episodes]

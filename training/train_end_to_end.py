@@ -34,11 +34,12 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
 from training.common import runs
-from training.common.data_module import StreamedData
-from training.data.streams import Batch, Share, TrajectoryStream
+from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
+from training.data.batches import Batch, Share
+from training.data.data_module import StreamedData
+from training.data.streams import TrajectoryStream
 from training.data.trajectories import rmse_figures
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
-from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.train_optimizer import trajectory_loss
 
 

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 import tyro
 from torch import Tensor
-from torch.nn.functional import smooth_l1_loss
 from torch.utils.data import IterableDataset
 
 from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
@@ -28,25 +27,18 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from training.common import runs
-from training.common.data_module import StreamedData
+from training.common.command_line import run_command
+from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics
+from training.data.batches import ACTION_HISTORY, Batch, Share, action_histories, relative_poses
+from training.data.data_module import StreamedData
 from training.data.data_source import Domain
-from training.data.streams import (
-    ACTION_HISTORY,
-    Batch,
-    PairStream,
-    Share,
-    action_histories,
-    images_of,
-    relative_poses,
-    simulate,
-)
+from training.data.episodes import images_of, simulate
+from training.data.streams import PairStream
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
-HEADING_WEIGHT = 3.0
-LIKELIHOOD_WEIGHT = 0.1
 CALIBRATION_MAZES = 64
 """Mazes that the output of a world's network is calibrated in."""
 
@@ -218,47 +210,6 @@ def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, 
     return pose_loss + of_fused[0], likelihood + of_fused[1]
 
 
-def windows_within(steps: int, windows: tuple[int, ...]) -> tuple[int, ...]:
-    """Those of the ``windows`` that so many steps which follow each other have room for."""
-    return tuple(window for window in windows if window <= steps)
-
-
-def step_losses(
-    mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor, windows: tuple[int, ...] = (1,)
-) -> tuple[Tensor, Tensor]:
-    """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says.
-
-    The first is the mean over ``windows``: of ``k`` steps that follow each other along the last axis but one, the
-    errors are added up and divided by the root of ``k``, so that windows weigh the same where errors are independent.
-    Where they last, as what a robot with momentum does beside its actions, the longer windows weigh more. The sum of
-    the steps' errors is the drift in heading, and nearly that in position while the robot turns little.
-    """
-    error = (mean - truth) / std
-    weight = error.new_tensor([1.0, 1.0, HEADING_WEIGHT])
-    pose_loss = error.new_zeros(())
-    for window in windows:
-        drift = error if window == 1 else error.unfold(-2, window, 1).sum(-1) / math.sqrt(window)
-        loss = smooth_l1_loss(drift, torch.zeros_like(drift), reduction="none", beta=0.1)
-        pose_loss = pose_loss + (loss * weight).mean() / len(windows)
-    log_scale = log_std - std.log()
-    # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
-    likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
-    return pose_loss, likelihood
-
-
-def step_metrics(mean: Tensor, log_std: Tensor, truth: Tensor) -> dict[str, float]:
-    """Errors a step: RMSE (m, deg), constant bias (m, deg) and how many predicted deviations the errors have."""
-    error = mean - truth
-    error = se2.wrapped(error).double()
-    return {
-        "rmse_m": float(error[:, :2].square().sum(1).mean().sqrt()),
-        "rmse_deg": float(error[:, 2].square().mean().sqrt().rad2deg()),
-        "bias_forward_m": float(error[:, 0].mean()),
-        "bias_deg": float(error[:, 2].mean().rad2deg()),
-        "normalized_error": float((error / log_std.exp()).square().mean().sqrt()),
-    }
-
-
 @torch.no_grad()
 def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig:
     """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares).
@@ -406,4 +357,4 @@ def measure(network: LocalPoseNetwork, pairs: list[Batch], rpe_steps: int = 0) -
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

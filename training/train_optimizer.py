@@ -38,8 +38,10 @@ from ngo_estimator.optimizer.neural_graph_optimizer import (
     NeuralGraphOptimizerConfig,
 )
 from training.common import runs
+from training.common.command_line import run_command
+from training.data.batches import Batch
 from training.data.data_source import Domain
-from training.data.streams import Batch
+from training.data.feature_store import training_stores
 from training.data.trajectories import (
     StoredTrajectories,
     StretchData,
@@ -48,8 +50,7 @@ from training.data.trajectories import (
     rmse_figures,
 )
 from training.data.worlds import WorldName, world_named
-from training.featurise import training_stores
-from training.recordings.recording_source import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
+from training.recordings.recording_source import NO_LOOPS, RecordedArguments, check_source, open_recorded
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
@@ -339,4 +340,4 @@ def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], 
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

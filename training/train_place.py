@@ -24,18 +24,13 @@ from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_chec
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PlaceConfig
 from training.common import runs
-from training.common.data_module import StreamedData
+from training.common.command_line import run_command
+from training.data.batches import Batch, Share
+from training.data.data_module import StreamedData
 from training.data.data_source import Domain
-from training.data.streams import Batch, PlaceStream, Share
+from training.data.streams import PlaceStream
 from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import (
-    NO_LOOPS,
-    RecordedArguments,
-    RecordedData,
-    check_source,
-    open_recorded,
-    run_script,
-)
+from training.recordings.recording_source import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded
 from training.recordings.recording_streams import RecordedPlaces
 
 
@@ -278,4 +273,4 @@ def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> 
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

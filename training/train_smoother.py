@@ -22,13 +22,14 @@ from ngo_estimator.networks.local_pose_network import LocalPoseConfig
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training.common import runs
+from training.common.command_line import run_command
+from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
+from training.data.batches import Batch
 from training.data.data_source import TRAIN_STORE
-from training.data.streams import Batch
+from training.data.feature_store import training_stores
 from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
 from training.data.worlds import WorldName, world_named
-from training.featurise import training_stores
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
-from training.train_local import LIKELIHOOD_WEIGHT, step_losses, windows_within
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
 
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
@@ -178,4 +179,4 @@ def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[Odom
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

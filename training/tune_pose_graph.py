@@ -24,6 +24,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.optimizer.loop_closure import LoopSearch
+from training.baselines.graph_settings import REGISTRATIONS, fit_calibration
 from training.baselines.loop_factors import (
     LoopFactors,
     MoreLoops,
@@ -35,8 +36,8 @@ from training.baselines.loop_factors import (
 )
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.common import runs
+from training.data.feature_store import open_store
 from training.data.worlds import world_named
-from training.featurise import open_store
 from training.scoring.metrics import trajectory_error
 
 GRID: tuple[tuple[dict[str, Any], ...], ...] = (
@@ -66,9 +67,6 @@ GRID: tuple[tuple[dict[str, Any], ...], ...] = (
 
 _ARRAYS = ("relative", "log_std", "codes", "origin_code", "truth")
 FORMS = ("loops", "registered", "smoothed")
-REGISTRATIONS = 5
-"""Steps of each registration for the pose graph, where ranges are registered: as many as for our optimizer."""
-
 _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was there first stays
 
 
@@ -142,7 +140,7 @@ class Objective:
             steps = settings.calibrated(odometry[0])
             more = overlaps_of(self._pair_head, self.arrays["codes"], steps, search, settings.block)
         graphs = zip(*odometry, self.loops(settings), more, strict=True)
-        return self.error(optimize(*steps, loops, settings, overlaps) for *steps, loops, overlaps in graphs)
+        return self.error(optimize(steps, std, loops, settings, more) for steps, std, loops, more in graphs)
 
     def error(self, poses: Iterable[np.ndarray]) -> float:
         """Mean position RMSE (m) of trajectories ``(steps, 3)``."""
@@ -155,22 +153,6 @@ class Objective:
                 ]
             )
         )
-
-
-def fit_calibration(relative: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Gain and bias of each component of a step that fit the true steps best, by least squares.
-
-    Args:
-        relative: steps ``(trajectories, steps, 3)``; truth: true poses after each of them.
-    """
-    true_steps = se2.g2r(torch.from_numpy(np.array(truth))).numpy()
-    fits = []
-    for k in range(3):
-        steps = np.ravel(relative[..., k]).astype(np.float64)
-        design = np.column_stack((steps, np.ones_like(steps)))
-        fits.append(np.linalg.lstsq(design, np.ravel(true_steps[..., k]))[0].tolist())
-    gain, bias = zip(*fits, strict=True)
-    return {"odometry_gain": gain, "odometry_bias": bias}
 
 
 def tune(
@@ -204,17 +186,6 @@ def tune(
 def _searching(change: dict[str, Any], **how: int) -> dict[str, Any]:
     """The change, where it is one of the search, with what all searches have in common."""
     return {name: replace(value, **how) if name == "search" else value for name, value in change.items()}
-
-
-def load_settings(path: Path) -> PoseGraphSettings:
-    """The settings in a file that this script wrote; raises ``ValueError`` naming what is wrong with it."""
-    try:
-        values = dict(json.loads(path.read_text())["settings"])
-        search = LoopSearch(**values.pop("search"))
-        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
-        return PoseGraphSettings(**{**values, **lists, "search": search})
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}; expected what `python -m training.tune_pose_graph` writes") from error
 
 
 def main(arguments: Arguments) -> PoseGraphSettings:

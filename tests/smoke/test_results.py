@@ -21,8 +21,8 @@ from training import (
     tune_pose_graph,
 )
 from training.data import worlds
+from training.data.feature_store import open_store
 from training.data.worlds import MazeSize, Table, world_named
-from training.featurise import open_store
 from training.scoring.metrics import trajectory_error
 from training.scoring.table_rows import ROWS, Sources, rows_of
 

@@ -44,7 +44,7 @@ from training import (
 )
 from training.baselines.deepvo import DEEPVO
 from training.common import runs
-from training.data import worlds
+from training.data import feature_store, worlds
 
 
 class Killed(RuntimeError):
@@ -143,7 +143,7 @@ def test_a_smoother_of_another_local_network_is_refused(tmp_path: Path, monkeypa
         train_optimizer.main(asked)
     # Nor does a run on the features of one network go on with those of another.
     monkeypatch.setattr(train_smoother, "load_local", lambda folder, _: (load_local(before)[0], {"sha256": "another"}))
-    monkeypatch.setattr(featurise, "check_networks", lambda *_: None)
+    monkeypatch.setattr(feature_store, "check_networks", lambda *_: None)
     with pytest.raises(runs.RunError, match="given local_pose_network_sha256 another"):
         train_smoother.main(toy.smoother("maze2d", tmp_path))
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -14,14 +13,13 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from ngo_estimator.checkpoint import CheckpointError, load_local
+from ngo_estimator.checkpoint import load_local
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
-from training.common.runs import RunError
+from training.data.batches import ACTION_HISTORY, relative_poses
 from training.data.data_source import MIRRORED_ACTIONS, Domain
-from training.data.streams import ACTION_HISTORY, relative_poses
 from training.recordings.recording_store import StoredRecording, make_store
 from training.recordings.recording_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
 
@@ -70,14 +68,6 @@ class RecordedArguments:
             raise ValueError(f"scan_yaw_deg is {self.scan_yaw_deg:g}; expected a finite number")
         if "/" in self.name or not self.name:
             raise ValueError(f"name is {self.name!r}; expected one that a folder can have")
-
-
-def run_script(main: Callable[[Any], object], arguments: type[Any], description: str | None) -> None:
-    """Run a script with the command line's arguments; what recordings, weights or runs lack ends it with one line."""
-    try:
-        main(tyro.cli(arguments, description=description))
-    except (RecordingError, CheckpointError, RunError) as error:
-        sys.exit(f"unusable: {error}")
 
 
 def check_source(world: str | None, recordings: RecordedArguments) -> None:

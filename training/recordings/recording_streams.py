@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ngo_recordings.errors import RecordingError
+from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, reversed_in_time
 from training.data.data_source import Domain
-from training.data.streams import ALL, Batch, Share, mirrored, relative_poses, reversed_in_time
 from training.recordings.recording_source import RecordedData
 from training.recordings.recording_tracks import Track
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.data.streams import action_histories
+from training.data.batches import action_histories
 from training.recordings.recording_store import StoredRecording
 
 Part = Literal["train", "optimizer", "validation", "test"]

@@ -20,11 +20,11 @@ from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines import loop_factors
+from training.baselines.graph_settings import REGISTRATIONS, fit_calibration, load_settings
 from training.baselines.loop_factors import LoopFactors, MoreLoops, Seen
 from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
-from training.featurise import open_store
+from training.data.feature_store import open_store
 from training.scoring.table_rows import ROWS, Sources
-from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
 
 Arrays = dict[str, np.ndarray]
 """Arrays of a feature store ``(trajectories, steps, ...)``."""

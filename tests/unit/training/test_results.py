@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from training.data.streams import simulate
+from training.data.batches import seen_from_first
+from training.data.episodes import GROUP, simulate
 from training.data.worlds import world_named
-from training.featurise import _GROUP
 from training.report import results_page, tables
 from training.report.maze_views import in_maze, maze_and_start
 from training.report.results_page import number, page
 from training.results import Arguments
 from training.scoring.error_cache import Measured
-from training.scoring.metrics import seen_from_first
 from training.scoring.scores import METRICS
 
 WORLD = world_named("maze2d")
@@ -132,10 +131,10 @@ def test_joined_words() -> None:
     assert results_page._joined([0, 1, 2]) == "0, 1 and 2"
 
 
-@pytest.mark.parametrize("index", [1, _GROUP + 1])
+@pytest.mark.parametrize("index", [1, GROUP + 1])
 def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
     seeds = WORLD.table_seeds("cycles", "validation")
-    first = index // _GROUP * _GROUP
+    first = index // GROUP * GROUP
     episodes = list(simulate(WORLD, list(seeds[first : index + 1]), 60, WORLD.tables["cycles"].size))
     episode = episodes[index - first]
     maze, start = maze_and_start(WORLD, "cycles", "validation", index)

@@ -14,9 +14,10 @@ from ngo_recordings.images import ScanGeometry
 from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_recordings import messages as m
 from tests.unit.training import drives
+from training.common.command_line import run_command
 from training.common.runs import RunError
 from training.recordings import recording_source
-from training.recordings.recording_source import RecordedArguments, open_recorded, run_script
+from training.recordings.recording_source import RecordedArguments, open_recorded
 from training.recordings.recording_store import MOST_RAYS, format_of, make_store
 from training.recordings.recording_tracks import PARTS
 
@@ -176,4 +177,4 @@ def test_a_run_that_does_not_fit_ends_a_script_with_one_line(monkeypatch: pytest
 
     monkeypatch.setattr("sys.argv", ["train_local"])
     with pytest.raises(SystemExit, match=r"^unusable: the folder holds another run$"):
-        run_script(main, RecordedArguments, None)
+        run_command(main, RecordedArguments, None)

@@ -9,8 +9,8 @@ import torch
 from ngo_estimator.geometry import se2
 from ngo_recordings.errors import RecordingError
 from tests.unit.training import drives
+from training.data.batches import Share, mirrored
 from training.data.data_source import Domain
-from training.data.streams import Share, mirrored
 from training.recordings.recording_source import RecordedArguments, RecordedData, open_recorded
 from training.recordings.recording_streams import RecordedPairs, RecordedPlaces, known_to, pairs_at, revisited, windows
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from ngo_estimator.checkpoint import LOCAL, load_local
 from training.baselines.deepvo import DEEPVO, load_deepvo, trajectory_steps
 from training.common import runs
-from training.data.drive_plan import driven_in_table
-from training.data.streams import images_of
-from training.featurise import fill, open_store
-from training.scoring.metrics import seen_from_first
+from training.data.batches import seen_from_first
+from training.data.drive_plan import drives_of_table
+from training.data.episodes import images_of
+from training.data.feature_store import fill, open_store
 from training.scoring.table_rows import ROWS, Sources
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def make_odometry(row: str, sources: Sources, split: str, table: str, count: int
         relative = steps_of(images_of(world, episode)).numpy()
         return {"relative": relative, "truth": seen_from_first(episode.poses_xyyaw)[1:]}
 
-    fill(store, world, driven_in_table(world, table, split, count), (0, 1), arrays_of)
+    fill(store, world, drives_of_table(world, table, split, count), (0, 1), arrays_of)
 
 
 def _network(kind: str, folder: Path, world: str) -> tuple[Callable[[Tensor], Tensor], str]:

@@ -26,10 +26,10 @@ from training import (
     tune_pose_graph,
 )
 from training.baselines.deepvo import DEEPVO
-from training.baselines.network_odometry import make_odometry, open_odometry
 from training.common.curves import write_at_once
 from training.data.data_source import TRAIN_STORE
-from training.featurise import open_store
+from training.data.feature_store import open_store
+from training.scoring.network_odometry import make_odometry, open_odometry
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
 

@@ -20,15 +20,15 @@ from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_offline
 from ngo_estimator.trajectory.plot import TRUTH, save_plot
-from training.data.streams import relative_poses
-from training.featurise import Networks, features_of_track
+from training.data.batches import relative_poses, seen_from_first
+from training.data.features import OPTIMIZER_INPUTS, Networks
+from training.recordings.recording_features import features_of_track
 from training.recordings.recording_source import NO_LOOPS, RecordedData
 from training.recordings.recording_tracks import Track
 from training.report.training_records import learning_curve
-from training.scoring.metrics import TrajectoryError, path_length_m, seen_from_first, trajectory_error
+from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
 from training.scoring.online_estimate import online_poses, with_origin
 
-FEATURES = ("relative", "log_std", "motion", "codes", "origin_code")
 COLORS = {"odometry": "#2ca02c", "online": "#9467bd", "corrected": "#ff7f0e"}
 _MEAN_STEP = "mean step"
 _CURVES = {
@@ -62,7 +62,7 @@ def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: boo
     measured: list[tuple[Track, Poses]] = []
     for track in tqdm(tracks, desc=f"{name} held out"):
         features = features_of_track(data.domain, track, networks)
-        arrays = [torch.from_numpy(features[key]) for key in FEATURES]
+        arrays = [torch.from_numpy(features[key]) for key in OPTIMIZER_INPUTS]
         corrected = optimize_offline(optimizer, networks.place.pair_head, *arrays).poses[0]
         poses = {_MEAN_STEP: mean_steps.poses(track), "odometry": with_origin(se2.r2g(arrays[0]).numpy())}
         if online:
