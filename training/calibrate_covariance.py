@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training.common import runs
+from training.common.command_line import run_command
 from training.data.episodes import simulate
 from training.data.features import features_of
 from training.data.worlds import VALIDATION_SEEDS, WorldName, world_named
@@ -77,4 +77,4 @@ def normalized_errors(core: OnlineTrajectory, features: dict[str, np.ndarray]) -
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

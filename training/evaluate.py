@@ -34,7 +34,7 @@ from training.common import runs
 from training.data.episodes import simulate
 from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, open_recorded
+from training.recordings.recording_source import RecordedArguments
 from training.report.held_out import evaluate_recorded
 from training.scoring.file_errors import evaluate_files
 from training.scoring.metrics import TrajectoryError, trajectory_error
@@ -98,8 +98,7 @@ class Arguments:
 def main(arguments: Arguments) -> dict[str, object]:
     """Print the table and return it."""
     if arguments.recordings.data:
-        data = open_recorded(arguments.recordings, arguments.runs)
-        return evaluate_recorded(data, arguments.weights, arguments.runs, arguments.online)
+        return evaluate_recorded(arguments.recordings, arguments.weights, arguments.runs, arguments.online)
     if arguments.world is None:
         assert arguments.truth is not None
         return {**evaluate_files(arguments.estimate, arguments.truth, arguments.report_settings)}

@@ -106,23 +106,27 @@ def main(arguments: Arguments) -> None:
 
 
 def _main_recorded(arguments: Arguments) -> None:
-    data = open_recorded(arguments.recordings, arguments.out)
-    folder = arguments.weights / data.domain.name
-    local, local_description = load_local(folder, data.domain.name)
-    place, place_description = load_place(folder, data.domain.name)
+    name = arguments.recordings.name
+    local, local_description = load_local(arguments.weights / name, name)
+    place, place_description = load_place(arguments.weights / name, name)
+    data = open_recorded(arguments.recordings, arguments.out, (local, local_description))
+    if place.config.image != local.config.image:
+        raise runs.RunError(
+            f"the place encoder of {name} takes {place.config.image}, its local network {local.config.image}; expected "
+            "one sensor: train the place encoder anew"
+        )
     stores: tuple[tuple[str, Part, int], ...] = (
         (TRAIN_STORE, "optimizer", 8 * _BLOCK),
         ("validation", "validation", 2 * _BLOCK),
     )
-    data.check_trained(local.config)
-    for name, part, fewest in stores:
+    for split, part, fewest in stores:
         found = windows(data.domain, data.tracks(part), _MOST_STEPS, fewest, _BLOCK)
-        store = arguments.out / data.domain.name / "features" / name
+        store = arguments.out / data.domain.name / "features" / split
         # Made in minutes: rather anew than from several versions of networks or recordings.
         shutil.rmtree(store, ignore_errors=True)
         store.mkdir(parents=True)
         (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
-        for row, (track, mirror) in enumerate(tqdm(found.cuts, desc=f"{data.domain.name} {name}")):
+        for row, (track, mirror) in enumerate(tqdm(found.cuts, desc=f"{name} {split}")):
             features = features_of_track(data.domain, track, Networks(local, place), mirror)
             write_row(store, row, len(found.cuts), features)
         (store / "done.0of1.json").write_text(json.dumps(groups_of(len(found.cuts), 0, 1)))

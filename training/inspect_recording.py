@@ -74,6 +74,8 @@ def text(report: Report) -> list[str]:
         clock = (
             "no header: when it was logged counts"
             if times.without_header
+            else "stamps of simulated time"
+            if times.simulated
             else (
                 f"stamp less log time {1e3 * times.skew_median_s:+.1f} ms (spread {1e3 * times.skew_spread_s:.1f} ms)"
             )

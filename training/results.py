@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from training.common import runs
+from training.common.command_line import run_command
 from training.common.curves import write_at_once
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
@@ -189,4 +189,4 @@ def summary(
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

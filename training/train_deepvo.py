@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import lightning
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import save_checkpoint
@@ -24,6 +23,7 @@ from ngo_estimator.geometry import se2
 from training.baselines.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
 from training.baselines.graph_settings import fit_calibration
 from training.common import runs
+from training.common.command_line import run_command
 from training.common.step_losses import step_losses, step_metrics, windows_within
 from training.data import episodes
 from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, seen_from_first
@@ -212,4 +212,4 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

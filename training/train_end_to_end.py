@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import lightning
 import torch
-import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import (
@@ -34,6 +33,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
 from training.common import runs
+from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.data.batches import Batch, Share
 from training.data.data_module import StreamedData
@@ -232,4 +232,4 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

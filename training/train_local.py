@@ -35,7 +35,7 @@ from training.data.data_source import Domain
 from training.data.episodes import images_of, simulate
 from training.data.streams import PairStream
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, told_to
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
@@ -296,9 +296,8 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         config = network.config
         if (config.actions, config.twist) != (domain.actions, domain.twist):
             raise RecordingError(
-                f"{folder} takes {_told(config.actions, config.twist)}, {domain.name} has "
-                f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave "
-                "them out)"
+                f"{folder} takes {told_to(config)}, {domain.name} has {told_to(domain)}; expected the same "
+                "(--action none, --twist none leave them out)"
             )
         if config.image != domain.image:
             raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")
@@ -330,10 +329,6 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         action_history=domain.action_history if domain.actions else 1,
     )
     return LocalPoseNetwork(config), {}
-
-
-def _told(actions: int, twist: bool) -> str:
-    return "actions" if actions else "velocities" if twist else "images alone"
 
 
 @torch.no_grad()

@@ -39,6 +39,7 @@ from ngo_estimator.optimizer.neural_graph_optimizer import (
 )
 from training.common import runs
 from training.common.command_line import run_command
+from training.common.precision import Precision
 from training.data.batches import Batch
 from training.data.data_source import Domain
 from training.data.feature_store import training_stores
@@ -50,7 +51,7 @@ from training.data.trajectories import (
     rmse_figures,
 )
 from training.data.worlds import WorldName, world_named
-from training.recordings.recording_source import NO_LOOPS, RecordedArguments, check_source, open_recorded
+from training.recordings.recording_source import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
@@ -89,7 +90,7 @@ class Arguments(runs.TrainerArguments):
     """Highest learning rate."""
     seed: int = 0
     """Seed of initial weights and of the order of the data."""
-    precision: Literal["bf16-mixed", "32-true"] = field(default="32-true", kw_only=True)
+    precision: Precision = field(default="32-true", kw_only=True)
     """Arithmetic of the network; what closes loops is in float64 always."""
     weights: Path = runs.WEIGHTS
     """Folder with NAME's other networks."""
@@ -244,12 +245,15 @@ def config_of(
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
-    domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
+    name = arguments.world or arguments.recordings.name
+    folder = arguments.weights / name
+    local, local_description = load_local(folder, name)
+    recorded: RecordedData | None = None
+    if arguments.world is None:
+        recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
+    domain = world_named(name) if recorded is None else recorded.domain
     chosen = choices(arguments, domain)
     arguments = replace(arguments, **chosen._asdict())  # a run's record says what was trained
-    folder = arguments.weights / domain.name
-    _, local_description = load_local(folder, domain.name)
     place, place_description = load_place(folder, domain.name)
     about: dict[str, Any] = {"place_encoder_sha256": place_description["sha256"]}
     smooths: dict[str, Any] = {}

@@ -30,7 +30,14 @@ from training.data.data_module import StreamedData
 from training.data.data_source import Domain
 from training.data.streams import PlaceStream
 from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded
+from training.recordings.recording_source import (
+    NO_LOOPS,
+    RecordedArguments,
+    RecordedData,
+    check_source,
+    open_recorded,
+    trained_local,
+)
 from training.recordings.recording_streams import RecordedPlaces
 
 
@@ -187,7 +194,10 @@ def main(arguments: Arguments) -> dict[str, float]:
 
     There are none where recordings hold too few places.
     """
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
+    recorded: RecordedData | None = None
+    if arguments.world is None:
+        local = trained_local(arguments.out, arguments.recordings.name)
+        recorded = open_recorded(arguments.recordings, arguments.runs, local)
     places: Places
     if recorded is None:
         world = world_named(str(arguments.world))

@@ -9,7 +9,7 @@ where ``train_optimizer`` takes them where it smooths (``--smoothing True``).
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning
 import torch
@@ -23,13 +23,14 @@ from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, Smoother
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training.common import runs
 from training.common.command_line import run_command
+from training.common.precision import Precision
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
 from training.data.batches import Batch
 from training.data.data_source import TRAIN_STORE
 from training.data.feature_store import training_stores
 from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
 from training.data.worlds import WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
+from training.recordings.recording_source import RecordedArguments, RecordedData, check_source, open_recorded
 
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
@@ -56,7 +57,7 @@ class Arguments(runs.TrainerArguments):
     """Highest learning rate."""
     seed: int = 0
     """Seed of initial weights and of the order of the data."""
-    precision: Literal["bf16-mixed", "32-true"] = field(default="32-true", kw_only=True)
+    precision: Precision = field(default="32-true", kw_only=True)
     """Arithmetic of the network."""
     weights: Path = runs.WEIGHTS
     """Folder with NAME's local network and place encoder, of which the features are."""
@@ -122,10 +123,13 @@ def smoothing_loss(relative: Tensor, log_std: Tensor, truth: Tensor, step_std: T
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
-    domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
-    folder = arguments.weights / domain.name
-    local, local_description = load_local(folder, domain.name)
+    name = arguments.world or arguments.recordings.name
+    folder = arguments.weights / name
+    local, local_description = load_local(folder, name)
+    recorded: RecordedData | None = None
+    if arguments.world is None:
+        recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
+    domain = world_named(name) if recorded is None else recorded.domain
     place, place_description = load_place(folder, domain.name)
     features = arguments.runs / domain.name / "features"
     stores = training_stores(features, _STORES, domain, local_description, place_description)

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_place, load_smoother
@@ -36,6 +35,7 @@ from training.baselines.loop_factors import (
 )
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.common import runs
+from training.common.command_line import run_command
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.scoring.metrics import trajectory_error
@@ -242,4 +242,4 @@ def main(arguments: Arguments) -> PoseGraphSettings:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

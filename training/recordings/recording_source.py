@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +14,12 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from ngo_estimator.checkpoint import load_local
+from ngo_estimator.checkpoint import LOCAL, load_local
 from ngo_estimator.data.images import ImageFormat
-from ngo_estimator.networks.local_pose_network import LocalPoseConfig
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
+from training.common.runs import recorded_values
 from training.data.batches import ACTION_HISTORY, relative_poses
 from training.data.data_source import MIRRORED_ACTIONS, Domain
 from training.recordings.recording_store import StoredRecording, make_store
@@ -90,15 +92,6 @@ class RecordedData:
         """The tracks of some parts."""
         return [track for part in parts for track in self.parts.tracks[part]]
 
-    def check_trained(self, config: LocalPoseConfig) -> None:
-        """Raise ``RecordingError`` unless a network was trained on what the recordings give with these settings."""
-        domain = self.domain
-        if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
-            raise RecordingError(
-                f"the weights of {domain.name} were trained on these recordings with other settings: give the same "
-                "--data, topics, --reduction and --from-weights as to train_local, or train anew"
-            )
-
     @property
     def about(self) -> dict[str, Any]:
         """For the JSON beside the weights: which recordings, how they were split, and what the plane leaves out."""
@@ -123,13 +116,81 @@ class RecordedData:
         }
 
 
-def open_recorded(arguments: RecordedArguments, runs: Path) -> RecordedData:
+TrainedLocal = tuple[LocalPoseNetwork, dict[str, Any]]
+"""A local network and its description, as ``load_local`` gives them."""
+
+_ANEW = "give every script of one training the same, or train the local network anew"
+
+
+def trained_local(weights: Path, name: str) -> TrainedLocal | None:
+    """The local network of this name, None where there is none yet."""
+    folder = weights / name
+    return load_local(folder, name) if (folder / f"{LOCAL}.safetensors").exists() else None
+
+
+def open_recorded(arguments: RecordedArguments, runs: Path, local: TrainedLocal | None = None) -> RecordedData:
     """Read the recordings into ``runs/NAME/data`` (once), split them, and print how.
 
+    Args:
+        local: network that must have learned from the same, if there is one; arguments are compared before reading.
+
     Raises:
-        RecordingError: of one line, about what is missing in them.
+        RecordingError: of one line, about what is missing in the recordings, or differs from those of ``local``.
     """
-    return _opened(arguments, runs)
+    if local is not None:
+        check_same_arguments(arguments, local[1])
+    data = _opened(arguments, runs)
+    if local is not None:
+        check_same_data(data, local)
+    return data
+
+
+def check_same_arguments(arguments: RecordedArguments, description: dict[str, Any]) -> None:
+    """Raise ``RecordingError`` where arguments choose other recordings or topics than a network was trained with."""
+    then = description.get("training", {}).get("arguments", {})
+    if "data_sha256" not in then:
+        raise RecordingError(f"the local network of {arguments.name} was not trained on recordings; {_ANEW}")
+    defaults = {**recorded_values(RecordedArguments()), **recorded_values(TopicArguments())}
+    now = {**defaults, **recorded_values(arguments), **recorded_values(arguments.topics)}
+    names = ("data", "holdout", "reduction", "scan_yaw_deg", *recorded_values(TopicArguments()))
+    expected = {name: then.get(name, defaults[name]) for name in names}
+    given = json.loads(json.dumps({name: now[name] for name in names}))
+    expected = json.loads(json.dumps(expected))
+    if differing := [name for name in names if given[name] != expected[name]]:
+        raise RecordingError(
+            f"the local network of {arguments.name} learned from other data: given {_flags(given, differing)}; "
+            f"expected {_flags(expected, differing)}: {_ANEW}"
+        )
+
+
+def check_same_data(data: RecordedData, local: TrainedLocal) -> None:
+    """Raise ``RecordingError`` where a network learned from another sensor, other side information or other files."""
+    network, description = local
+    config, domain = network.config, data.domain
+    if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
+        raise RecordingError(
+            f"the local network of {domain.name} takes {config.image} and {told_to(config)}; these recordings give "
+            f"{domain.image} and {told_to(domain)}: {_ANEW}"
+        )
+    if description["training"]["arguments"]["data_sha256"] != data.sha256:
+        raise RecordingError(
+            f"the recordings of {domain.name} are not those that its local network learned from: files, their folders "
+            f"or --from-weights have changed: {_ANEW}"
+        )
+
+
+def told_to(network: Domain | LocalPoseConfig) -> str:
+    """What a network is told of each step beside its two frames."""
+    return "actions" if network.actions else "velocities" if network.twist else "images alone"
+
+
+def _flags(values: dict[str, Any], names: Sequence[str]) -> str:
+    def words(value: Any) -> str:
+        if value is None or value == []:
+            return "left out"
+        return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+    return ", ".join(f"--{name.replace('_', '-')} {words(values[name])}" for name in names)
 
 
 @lru_cache(maxsize=2)  # one script after another in one process asks for the same
@@ -231,7 +292,7 @@ def _print(data: RecordedData) -> None:
     made = f", made {image.reduction} times smaller" if image.reduction > 1 else ""
     made += f", {image.field_of_view_deg:g} deg" if image.field_of_view_deg is not None else ""
     print(f"frames: {size}{made}, one each {domain.period_s:.4f} s")
-    told = "actions" if domain.actions else "velocities" if domain.twist else "images alone"
+    told = told_to(domain)
     print(f"each step is estimated from the two frames and: {told}" if told != "images alone" else f"steps from {told}")
     print(f"places: within {domain.place_radius_m:.2f} m and {math.degrees(domain.heading_limit_rad):.0f} deg")
     print(

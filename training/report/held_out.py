@@ -23,7 +23,7 @@ from ngo_estimator.trajectory.plot import TRUTH, save_plot
 from training.data.batches import relative_poses, seen_from_first
 from training.data.features import OPTIMIZER_INPUTS, Networks
 from training.recordings.recording_features import features_of_track
-from training.recordings.recording_source import NO_LOOPS, RecordedData
+from training.recordings.recording_source import NO_LOOPS, RecordedArguments, open_recorded
 from training.recordings.recording_tracks import Track
 from training.report.training_records import learning_curve
 from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
@@ -40,7 +40,7 @@ _CURVES = {
 Poses = dict[str, np.ndarray]
 
 
-def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: bool = True) -> dict[str, Any]:
+def evaluate_recorded(recordings: RecordedArguments, weights: Path, runs: Path, online: bool = True) -> dict[str, Any]:
     """Print the table, write plots into ``runs/NAME/results`` and return the table.
 
     ``mean step`` is what an estimator does that knows the actions and looks at nothing: every step is the mean of those
@@ -49,10 +49,11 @@ def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: boo
     Raises:
         ValueError: there are no steps to measure on, or the networks were trained on other ones.
     """
-    name = data.domain.name
+    name = recordings.name
     folder = weights / name
-    networks = Networks(load_local(folder, name)[0], load_place(folder, name)[0])
-    data.check_trained(networks.local.config)
+    local = load_local(folder, name)
+    data = open_recorded(recordings, runs, local)
+    networks = Networks(local[0], load_place(folder, name)[0])
     optimizer, description = load_optimizer(folder, name)
     tracks = [track for track in data.tracks("test") if len(track) > 2 * optimizer.block]
     tracks = [track for track in tracks if path_length_m(track.poses_xyyaw) > 0.0]
