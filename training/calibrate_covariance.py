@@ -1,10 +1,10 @@
-"""Fit how far errors of the corrected pose are beyond the covariance that the optimizer states, on validation mazes.
+"""Fit the covariance of the corrected pose to its errors on validation mazes.
 
     python -m training.calibrate_covariance --world maze3d
 
-The covariance follows from what the optimizer believes of steps and loops, and it believes too much where their errors
-are alike. One factor, the mean normalised squared error of the newest pose (1 where the covariance is right), goes into
-the description of the weights.
+The optimizer treats errors of steps and loops as independent. They are not, so its covariance is too small. One factor
+corrects this: the mean normalised squared error of the newest pose (1 where the covariance is right). It goes into the
+description of the weights.
 """
 
 import dataclasses

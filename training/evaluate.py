@@ -4,11 +4,10 @@
     python -m training.evaluate --data drive_1.mcap drive_2.mcap --name my_robot
     python -m training.evaluate --estimate odometry.tum online.tum corrected.tum --truth truth.tum
 
-With `--world`, a world's networks drive through whole trajectories of a split: their odometry, the online estimate
-(each pose as it was first published) and the corrected one (the final path). With `--data`, what was trained on
-recordings is measured on the one that was held out, with plots in RUNS/NAME/results. With `--estimate`,
-trajectories in the TUM format are compared by ATE, RPE and KITTI's segment errors, as evo does. The last line printed
-is the table as one JSON object.
+`--world` drives through whole mazes of a split. It measures the odometry, the online estimate (each pose when it was
+first published) and the corrected path at the end. `--data` measures the networks of a robot on the recording that was
+held out, with plots in RUNS/NAME/results. `--estimate` compares TUM files by ATE, RPE and KITTI's segment errors, as evo
+does. The last line is the table as one JSON object.
 """
 
 import dataclasses

@@ -1,10 +1,10 @@
-"""Measure the scan model for scanners of many qualities, on validation mazes.
+"""Measure the scan model with lidars of many qualities, on validation mazes.
 
     python -m training.evaluate_scan
 
-Each row replaces one or two properties of the scanners that are drawn; noise of 5 cm and dropouts of 20 % are beyond
-what the networks learned from, and `maze2d` is the scanner of that simulator, free of noise, in its own mazes. The last
-line printed is the table as one JSON object.
+Each row changes one or two properties of the drawn lidars. Noise of 5 cm and dropouts of 20 % lie outside of the
+training data. The row `maze2d` has the noise-free lidar of that simulator, in its own mazes. The last line is the table
+as one JSON object.
 """
 
 import dataclasses

@@ -1,10 +1,10 @@
-"""Compute the optimizer's training data once: odometry, motion features and place codes of whole trajectories.
+"""Make the feature store: odometry, motion features and place codes of whole trajectories.
 
     python -m training.featurise --world maze2d
     python -m training.featurise --data drive_1.mcap drive_2.mcap --name my_robot
 
-Images are far too many to keep (2000 a trajectory): what the local network and the place encoder make of them goes into
-memory-mapped arrays, the features as float16. Run again, it goes on where it was stopped.
+Smoother and optimizer learn from this store. Images of a trajectory are not kept: the local network and the place
+encoder turn them into features once, in memory-mapped arrays. Run it again to continue after a stop.
 """
 
 from __future__ import annotations
@@ -92,17 +92,17 @@ def main(arguments: Arguments) -> None:
     local, local_description = load_local(folder, world.name)
     place, place_description = load_place(folder, world.name)
     features, chosen = arguments.out / world.name / "features", planned_drives(arguments, world)
-    for split, driven in chosen.items():
-        check_count(features / split, len(driven.seeds))
-    for split, driven in chosen.items():
-        if not driven.seeds:
+    for split, drives in chosen.items():
+        check_count(features / split, len(drives.seeds))
+    for split, drives in chosen.items():
+        if not drives.seeds:
             continue
         store = features / split
         store.mkdir(parents=True, exist_ok=True)
         check_networks(store, local_description, place_description)
         (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
         part = (arguments.part, arguments.parts)
-        fill(store, world, driven, part, lambda e: features_of(world, e, folder, (local, place)))
+        fill(store, world, drives, part, lambda e: features_of(world, e, folder, (local, place)))
 
 
 def _main_recorded(arguments: Arguments) -> None:

@@ -1,10 +1,10 @@
-"""Look at a recording before training on it: what is in it, what is used for what, and what is wrong with it.
+"""Report on a recording before training: its topics, their use, and its faults.
 
     python -m training.inspect_recording drive.mcap
     python -m training.inspect_recording part_0.mcap part_1.mcap --ground-truth tf:map:base_link --out drive.png
 
-Prints a report and draws a picture beside the first file. Exit code 1 where the recording cannot be used at all, with
-one line that says why and what to do.
+Prints the report and draws a picture beside the first file. The exit code is 1 where the recording cannot be used, with
+one line that gives the reason and the remedy.
 """
 
 from __future__ import annotations

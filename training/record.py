@@ -1,10 +1,10 @@
-"""Record the topics of a running graph, until Ctrl-C or for a time.
+"""Record topics of a running graph, until Ctrl-C or for some seconds.
 
     python -m training.record --out drive.mcap
     python -m training.record --out drive --topics /camera/image_raw /odom /tf /tf_static --seconds 60
 
-A name that ends in .mcap is the file; any other is a new folder in the layout of rosbag2, for `ros2 bag info` and
-`ros2 bag play`. A recorder that is killed leaves a file that is readable up to its last second.
+A name that ends in .mcap is the file. Any other name is a new folder in the layout of rosbag2, for `ros2 bag info` and
+`ros2 bag play`. If the recorder is killed, the file is readable up to its last second.
 """
 
 import signal

@@ -1,10 +1,10 @@
-"""Train DeepVO, the baseline of the results, on the mazes and frames that the local network learns from.
+"""Train DeepVO, the baseline of the results, in the mazes of the local network.
 
     python -m training.train_deepvo --world maze3d
 
-It sees stretches of trajectories where the local network sees single pairs, with the same number of frame pairs, the
-same schedule and loss, mirror images and calibration; as in the original it is not told the actions. Run again, it goes
-on where it was stopped.
+DeepVO sees stretches of trajectories where the local network sees single pairs. Number of frame pairs, schedule, loss,
+mirror images and calibration are the same. As in the original it is not told the actions. Run it again to continue after
+a stop.
 """
 
 import dataclasses

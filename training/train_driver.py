@@ -1,11 +1,11 @@
-"""Train the learned driver of the 3D world: a network that drives as far as it can, by advantage actor-critic (PPO).
+"""Train the learned driver of the 3D world: a network that drives as far as it can, by PPO.
 
     python -m training.train_driver
 
-The reward is the distance travelled (paper, section 4.2). It begins with lessons (DAgger) of a teacher that knows the
-maze and drives for distance: turning about at the end of a long corridor costs before it pays, and was not found
-without them. Run again, it goes on after its last checkpoint, in mazes that it has not met. It ends with the weights
-written into the simulator's package. Progress goes to `metrics.csv` in its folder below `runs/`, beside `run.json`.
+The reward is the distance travelled (paper, section 4.2). The training begins with lessons (DAgger) of a teacher that
+knows the maze: without them the driver never found that turning about at the end of a long corridor pays. The weights go
+into the package of the simulator, the progress into `metrics.csv` beside `run.json` below `runs/`. Run it again to
+continue after the last checkpoint, in mazes that it has not met.
 """
 
 from __future__ import annotations

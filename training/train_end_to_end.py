@@ -1,12 +1,11 @@
-"""Fine-tune all networks of a world together, from the weights of the stages, on short trajectories.
+"""Fine-tune all networks of a world together, from their trained weights, on short trajectories.
 
     python -m training.train_end_to_end --world maze2d
 
-Worker processes simulate the trajectories, each in a maze of its own and each used once. The loss of the corrected
-trajectory reaches back through optimizer, loop measurements and aggregation into both encoders; not through a
-registration, so that where loops are registered the place encoder learns which are loops alone, and the ranges that it
-sees stay as they are. Run again, it goes on where it was stopped. It ends with a set of weights of its own that the
-estimator takes like those of the stages.
+Each simulated trajectory is in a maze of its own and is used once. The loss of the corrected trajectory reaches both
+encoders through optimizer, loop measurements and aggregation, but no registration of scans: there the place encoder
+learns loops alone, and its ranges stay. The result is a set of weights of its own for the estimator. Run it again to
+continue after a stop.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,12 @@
-"""Train the local pose network of a world on pairs of frames that worker processes simulate.
+"""Train the local pose network on pairs of consecutive frames.
 
     python -m training.train_local --world maze2d
     python -m training.train_local --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. With `--data`, it learns from recordings, each pair many times over, and
-keeps the epoch that was best on the parts that it does not learn from. It ends with the network's output calibrated on
-mazes (or those parts) that it has not seen, one bias and scale a component, folded into its normalisation, and its
-weights written into the estimator's package.
+Pairs come from simulated mazes (`--world`) or from recordings (`--data`). After the training the output is calibrated
+on frames that the network has not seen: one bias and one scale for each component. The weights go into the package of
+the estimator. Training on recordings keeps the epoch with the smallest validation loss. Run it again to continue after
+a stop.
 """
 
 import dataclasses
@@ -249,8 +249,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         domain: Domain = world
         steps = SimulatedSteps(arguments, world)
         windows = world.error_windows
-        told = {"action_history": world.action_history, "error_windows": list(windows)}
-        settings: dict[str, Any] | None = {**told, **world.stream_settings}
+        of_steps = {"action_history": world.action_history, "error_windows": list(windows)}
+        settings: dict[str, Any] | None = {**of_steps, **world.stream_settings}
     else:
         domain = recorded.domain
         if arguments.action_history is not None:

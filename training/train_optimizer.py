@@ -3,9 +3,9 @@
     python -m training.train_optimizer --world maze2d
     python -m training.train_optimizer --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. Trained on recordings, an optimizer that does not correct the trajectories
-of the validation part is replaced by one that closes no loops and leaves the odometry as it is. It ends with the
-weights written into the estimator's package.
+The weights go into the package of the estimator. Training on recordings checks the optimizer on the validation part: if
+it does not correct these trajectories, an optimizer that closes no loops is written instead. Run it again to continue
+after a stop.
 """
 
 import dataclasses

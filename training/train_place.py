@@ -1,11 +1,11 @@
-"""Train the place encoder and its pair head on pairs of frames that show one place, well apart in time.
+"""Train the place encoder and its pair head on pairs of frames of one place, well apart in time.
 
     python -m training.train_place --world maze2d
     python -m training.train_place --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. Recordings in which too few places are seen twice teach nothing about
-places: then it says so and writes the encoder untrained, and the optimizer will close no loops. It ends with the
-weights written into the estimator's package.
+The weights go into the package of the estimator. Recordings in which the robot returns to too few places teach nothing
+about places: the command says so, writes an untrained encoder, and the optimizer closes no loops. Run it again to
+continue after a stop.
 """
 
 import dataclasses

@@ -1,10 +1,10 @@
-"""Train what smooths the odometry, on whole trajectories of the feature store, before the optimizer that it is part of.
+"""Train the smoother of the odometry on whole trajectories of the feature store.
 
     python -m training.train_smoother --world maze3d
     python -m training.train_smoother --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. It ends with the weights written beside those of the other networks, from
-where ``train_optimizer`` takes them where it smooths (``--smoothing True``).
+The weights go beside those of the other networks. `train_optimizer` takes them from there where it smooths
+(`--smoothing True`), so train the smoother first. Run it again to continue after a stop.
 """
 
 from dataclasses import dataclass, field

@@ -2,8 +2,8 @@
 
     python -m training.tune_pose_graph --world maze2d
 
-From the default settings on, one group of settings after the other takes the value of its grid with the smallest mean
-position RMSE, over and over until nothing gets better. Nothing is drawn at random.
+A coordinate search: each group of settings in turn takes the value of its grid with the smallest mean position RMSE,
+until nothing gets better. Nothing is random.
 """
 
 import dataclasses
@@ -163,19 +163,19 @@ def tune(
 ) -> tuple[PoseGraphSettings, float]:
     """Coordinate search for the settings with the smallest ``objective``, from ``start``; returns both."""
     groups = [list(group) for group in grid]
-    known: dict[PoseGraphSettings, float] = {}
+    tried: dict[PoseGraphSettings, float] = {}
     best, least = start, objective(start)
-    known[best] = least
+    tried[best] = least
     with tqdm(total=passes * sum(map(len, groups)), desc="tune", unit="setting") as bar:
         for _ in range(passes):
             before = best
             for group in groups:
                 for change in group:
                     candidate = replace(best, **change)
-                    if candidate not in known:
-                        known[candidate] = objective(candidate)
-                    if known[candidate] < least * (1.0 - _SMALLEST_GAIN):
-                        best, least = candidate, known[candidate]
+                    if candidate not in tried:
+                        tried[candidate] = objective(candidate)
+                    if tried[candidate] < least * (1.0 - _SMALLEST_GAIN):
+                        best, least = candidate, tried[candidate]
                     bar.update()
                     bar.set_postfix(least=f"{least:.4f}")
             if best == before:

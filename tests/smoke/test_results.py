@@ -122,7 +122,7 @@ def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, di
     try:
         for path in new.iterdir():
             (old / path.name).write_bytes(path.read_bytes())
-        found = results.measured_rows(arguments(folder), sources, "cycles")["ngo_5"]
+        found = results.evaluate_rows(arguments(folder), sources, "cycles")["ngo_5"]
     finally:
         for name, content in kept.items():
             (old / name).write_bytes(content)

@@ -1,7 +1,7 @@
 """DeepVO, the paper's baseline: Wang et al., "DeepVO: towards end-to-end visual odometry with deep recurrent
 convolutional neural networks" (2017).
 
-It belongs to the results alone, and is no part of what the estimator ships.
+It is part of the results alone; the estimator does not ship it.
 """
 
 from dataclasses import dataclass

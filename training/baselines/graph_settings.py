@@ -1,4 +1,4 @@
-"""Settings of the classical pose graph: where they come from, and how its odometry is calibrated."""
+"""Settings of the classical pose graph: read from their file, and the calibration of its odometry."""
 
 import json
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""The loops that the classical pose graph gets: found by place codes, or known from the truth.
+"""Loops for the classical pose graph: found by place codes, or known from the truth.
 
-What ``found_loops`` gives is what our own optimizer gets. True revisits, measured by the pair head or known exactly,
-tell how much of the error that remains lies in retrieval, and how much in measuring.
+``found_loops`` gives the loops of our own optimizer. True revisits show the causes of the remaining error: retrieval, if
+they help when the pair head measures them; measurement, if they help only when they are known exactly.
 """
 
 import math

@@ -1,8 +1,7 @@
 """The classical baseline: a pose graph of the same odometry and loops as ours, optimised with GTSAM.
 
 Nodes are the ends of the meta-steps. Odometry factors are composed meta-steps with the network's own deviations, loop
-factors are what ``find_loops`` gives. A few numbers say how far either is to be believed: ``training.tune_pose_graph``
-chooses them on validation mazes.
+factors come from ``find_loops``. ``training.tune_pose_graph`` chooses the scales of both on validation mazes.
 """
 
 import math

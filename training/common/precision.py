@@ -1,4 +1,4 @@
-"""Which arithmetic trains networks faster on the device of a run: bfloat16 where it pays, float32 otherwise."""
+"""The faster arithmetic for the device of a run: bfloat16 where it pays, float32 otherwise."""
 
 import time
 from typing import Literal

@@ -1,4 +1,4 @@
-"""What all training scripts share: the folder of a run with its record, and the trainer."""
+"""The folder of a run with its record, and its trainer, for all trainings."""
 
 import dataclasses
 import json
@@ -14,7 +14,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 
-from training.common.curves import Batch, Curves, rows, write_at_once
+from training.common.curves import Batch, Curves, batch_size, write_at_once
 from training.common.precision import Precision, resolved
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -144,7 +144,7 @@ class Run:
         arguments: TrainerArguments,
         epochs: int,
         seed: int,
-        datapoints: Callable[[Batch], int] = rows,
+        datapoints: Callable[[Batch], int] = batch_size,
         best: str | None = None,
         data: str | None = None,
         settings: Mapping[str, Any] | None = None,

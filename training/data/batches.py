@@ -1,4 +1,4 @@
-"""Batches of frames and motions, whether from a simulator or from recordings, and what can be made of them."""
+"""Batches of frames and motions, from a simulator or from recordings, and their mirror images."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,8 @@ ACTION_HISTORY = 12
 
 def action_histories(actions: np.ndarray) -> Tensor:
     """The latest actions ``(..., steps, ACTION_HISTORY)`` of each step, its own last, of ``(..., steps)`` actions."""
-    known = torch.from_numpy(actions).long()
-    return torch.nn.functional.pad(known, (ACTION_HISTORY - 1, 0), value=NO_ACTION).unfold(-1, ACTION_HISTORY, 1)
+    latest = torch.from_numpy(actions).long()
+    return torch.nn.functional.pad(latest, (ACTION_HISTORY - 1, 0), value=NO_ACTION).unfold(-1, ACTION_HISTORY, 1)
 
 
 def relative_poses(poses_xyyaw: np.ndarray) -> Tensor:
@@ -53,8 +53,8 @@ def reversed_in_time(batch: Batch) -> Batch:
     """Frame pairs (without actions) as a robot meets them that drives the same way backwards."""
     origin = torch.zeros_like(batch["relative"])
     relative = se2.between(batch["relative"], origin)
-    told = {"twist": -batch["twist"]} if "twist" in batch else {}
-    return {**batch, "earlier": batch["later"], "later": batch["earlier"], "relative": relative, **told}
+    twist = {"twist": -batch["twist"]} if "twist" in batch else {}
+    return {**batch, "earlier": batch["later"], "later": batch["earlier"], "relative": relative, **twist}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a training gets its batches from: a stream for each epoch, and batches to be measured on that are made once."""
+"""Batches of a training for Lightning: a stream for each epoch, and validation batches that are made once."""
 
 from collections.abc import Callable
 from functools import cached_property

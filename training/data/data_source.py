@@ -1,4 +1,4 @@
-"""What a training must know of where its data come from, a simulated world or a robot's recordings."""
+"""The sensor, the robot and the scale of the training data, from a simulated world or from recordings."""
 
 from dataclasses import dataclass
 

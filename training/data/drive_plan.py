@@ -1,4 +1,4 @@
-"""Which trajectories are driven for a feature store: in what mazes, from what seeds, by whom."""
+"""Which trajectories are driven for a feature store: their mazes, seeds and driver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated episodes, and what networks get of them."""
+"""Simulated episodes, and their images and ranges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The feature store: memory-mapped arrays of whole trajectories, filled group by group, by one process or several."""
+"""The feature store: memory-mapped arrays of whole trajectories, filled by one process or several."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Features of whole trajectories: what local network and place encoder make of their frames."""
+"""Features of whole trajectories, by the local network and the place encoder."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Endless training data: worker processes simulate beside the training, and each datapoint is used once.
 
-An epoch of a stream is a function of its number alone (through its maze seeds), so a resumed training meets exactly
-the data that an unbroken one would have met.
+An epoch follows from its number alone, through its maze seeds. A resumed training therefore meets the same data as one
+that was not stopped.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class _Stream(IterableDataset[Batch]):
             rng = np.random.default_rng([seeds[0], 1])
             drivers = self.world.stream_drivers
             driver = drivers[(seeds[0] - self.first_seed) // episodes.GROUP % len(drivers)]
-            driven = episodes_in(self.world, seeds, seeds, self.frames, DRAWN, driver)
-            yield from self.batches(list(driven), rng)
+            drives = episodes_in(self.world, seeds, seeds, self.frames, DRAWN, driver)
+            yield from self.batches(list(drives), rng)
 
     def __len__(self) -> int:
         return len(self.groups) * self.batches_a_group

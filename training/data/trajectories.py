@@ -1,4 +1,4 @@
-"""What the optimizer trains on: stretches of the stored trajectories, with their loop candidates."""
+"""Stretches of stored trajectories with their loop candidates, for smoother and optimizer."""
 
 import contextlib
 import dataclasses

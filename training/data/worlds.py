@@ -1,6 +1,6 @@
-"""The simulated worlds as training data: which mazes, which seeds, which driver.
+"""The simulated worlds as training data: their mazes, seeds and drivers.
 
-The simulators are loaded where an environment is made: training on recordings does without them.
+The simulators are imported where an environment is made: training on recordings works without them.
 """
 
 from __future__ import annotations

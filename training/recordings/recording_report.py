@@ -1,4 +1,4 @@
-"""What a recording holds, how good it is, and what it can be used for: the numbers behind inspect_recording."""
+"""The numbers behind inspect_recording: content of a recording, its quality and its faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings as arrays on disk: every frame as it enters the networks, made once for all scripts of a training."""
+"""Recordings as arrays on disk: every frame as networks take it, made once for all commands of a training."""
 
 from __future__ import annotations
 

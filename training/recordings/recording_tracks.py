@@ -1,4 +1,4 @@
-"""Stretches of recordings that can be learned from, and which of them are for what: parts that never meet."""
+"""Tracks of recordings without gaps, and their split into parts that never meet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an optimizer's attention does: where it looks, and how much of it falls on true revisits."""
+"""The attention of an optimizer: its entropy, and its share on true revisits."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Measure what was trained on recordings on the recording that was held out: the table of the simulators, and plots."""
+"""The errors of networks of a robot on the recording that was held out: a table, and plots."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def evaluate_recorded(recordings: RecordedArguments, weights: Path, runs: Path, 
     if not tracks:
         raise ValueError(f"the held-out part has no stretch of {2 * optimizer.block} steps in which the robot moves")
     mean_steps = MeanSteps(data.tracks("train"))
-    measured: list[tuple[Track, Poses]] = []
+    estimates: list[tuple[Track, Poses]] = []
     for track in tqdm(tracks, desc=f"{name} held out"):
         features = features_of_track(data.domain, track, networks)
         arrays = [torch.from_numpy(features[key]) for key in OPTIMIZER_INPUTS]
@@ -69,14 +69,14 @@ def evaluate_recorded(recordings: RecordedArguments, weights: Path, runs: Path, 
         if online:
             core = OnlineTrajectory(optimizer, networks.place.pair_head, max(len(track), 2 * optimizer.block))
             poses["online"] = online_poses(core, features)
-        measured.append((track, {**poses, "corrected": with_origin(corrected.numpy())}))
-    result = {"name": name, "split": list(data.parts.words), **_table(name, measured)}
+        estimates.append((track, {**poses, "corrected": with_origin(corrected.numpy())}))
+    result = {"name": name, "split": list(data.parts.words), **_table(name, estimates)}
     if NO_LOOPS in description:
         result[NO_LOOPS] = description[NO_LOOPS]
         print(f"no loops are closed: {description[NO_LOOPS]}")
     out = runs / name / "results"
     out.mkdir(parents=True, exist_ok=True)
-    for path in draw(out, runs / name, measured):
+    for path in draw(out, runs / name, estimates):
         print(path)
     (out / "table.json").write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result))
@@ -102,18 +102,18 @@ def _actions(track: Track) -> Tensor:
     return torch.zeros(len(track) - 1) if track.actions is None else torch.from_numpy(track.actions)
 
 
-def _table(name: str, measured: list[tuple[Track, Poses]]) -> dict[str, Any]:
+def _table(name: str, estimates: list[tuple[Track, Poses]]) -> dict[str, Any]:
     columns = [field.name for field in dataclasses.fields(TrajectoryError)]
-    frames = sum(len(track) for track, _ in measured)
-    driven = sum(path_length_m(track.poses_xyyaw) for track, _ in measured)
+    frames = sum(len(track) for track, _ in estimates)
+    path_m = sum(path_length_m(track.poses_xyyaw) for track, _ in estimates)
     table = Table(
-        title=f"{name}, held out: {len(measured)} trajectories, {frames} frames, {driven:.1f} m: mean (median)"
+        title=f"{name}, held out: {len(estimates)} trajectories, {frames} frames, {path_m:.1f} m: mean (median)"
     )
     for column in ("", *columns):
         table.add_column(column)
-    result: dict[str, Any] = {"trajectories": len(measured), "frames": frames, "path_m": driven}
-    for kind in measured[0][1]:
-        errors = [dataclasses.astuple(trajectory_error(poses[kind], track.poses_xyyaw)) for track, poses in measured]
+    result: dict[str, Any] = {"trajectories": len(estimates), "frames": frames, "path_m": path_m}
+    for kind in estimates[0][1]:
+        errors = [dataclasses.astuple(trajectory_error(poses[kind], track.poses_xyyaw)) for track, poses in estimates]
         values = np.array(errors)
         table.add_row(kind, *(f"{m:.3f} ({d:.3f})" for m, d in zip(values.mean(0), np.median(values, 0), strict=True)))
         result[kind] = {column: float(mean) for column, mean in zip(columns, values.mean(0), strict=True)}
@@ -121,9 +121,9 @@ def _table(name: str, measured: list[tuple[Track, Poses]]) -> dict[str, Any]:
     return result
 
 
-def draw(out: Path, run: Path, measured: list[tuple[Track, Poses]]) -> list[Path]:
+def draw(out: Path, run: Path, estimates: list[tuple[Track, Poses]]) -> list[Path]:
     """Write the plots: the longest trajectory, errors against frames, and the learning curves; returns their paths."""
-    track, poses = max(measured, key=lambda one: len(one[0]))
+    track, poses = max(estimates, key=lambda one: len(one[0]))
     paths = [out / "trajectory.png", out / "error.png"]
     truth = seen_from_first(track.poses_xyyaw)
     shown = {kind: poses[kind] for kind in ("odometry", "corrected")}

@@ -1,4 +1,4 @@
-"""The mazes of a table's trajectories, to draw them."""
+"""The mazes of a table's trajectories, for figures."""
 
 import numpy as np
 import torch

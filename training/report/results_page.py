@@ -1,4 +1,4 @@
-"""The page of a world's results in Markdown, made whole from the JSON."""
+"""The page of a world's results in Markdown, made from the JSON alone."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any

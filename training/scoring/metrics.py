@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth."""
+"""The error of an estimated trajectory against the truth."""
 
 from dataclasses import dataclass
 

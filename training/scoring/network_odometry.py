@@ -1,4 +1,4 @@
-"""The odometry of networks that rows of the results have for themselves, on the trajectories of a table."""
+"""The odometry of rows with a network of their own, on the trajectories of a table."""
 
 import json
 from collections.abc import Callable

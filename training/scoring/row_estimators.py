@@ -1,4 +1,4 @@
-"""What makes trajectories out of features, for every row of the tables of results."""
+"""The estimators of the rows of the tables: from features to trajectories."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The rows of the tables of results, and where what they need lies."""
+"""The rows of the tables of results, and the places of their networks, features and settings."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

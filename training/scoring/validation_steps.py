@@ -1,4 +1,4 @@
-"""Episodes in validation mazes, and what a local network makes of their steps."""
+"""Episodes in validation mazes, and the errors of local networks on their steps."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def odometry_error(steps: np.ndarray, true: np.ndarray) -> TrajectoryError:
     return trajectory_error(estimate, truth)
 
 
-def measured(
+def odometry_errors(
     network: LocalPoseNetwork, world: World, mazes: int, frames: int, rpe_steps: int | None = None
 ) -> dict[str, Any]:
     """Errors of a local network's odometry on validation mazes, with intervals over them.
