@@ -6,8 +6,8 @@
 
 `--world` drives through whole mazes of a split. It measures the odometry, the online estimate (each pose when it was
 first published) and the corrected path at the end. `--data` measures the networks of a robot on the recording that was
-held out, with plots in RUNS/NAME/results. `--estimate` compares TUM files by ATE, RPE and KITTI's segment errors, as evo
-does. The last line is the table as one JSON object.
+held out, with plots in RUNS/NAME/results. `--estimate` compares TUM files by ATE, RPE and KITTI's segment errors, with
+the definitions of evo. The last line is the table as one JSON object.
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ class Arguments:
     world: WorldName | None = None
     """World to measure in."""
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings that networks were trained on, and how: as given to the training."""
+    """Recordings of the training, with the same arguments."""
     split: Literal["validation", "test"] = "validation"
     """Mazes to measure on."""
     trajectories: int = 20
@@ -59,28 +59,28 @@ class Arguments:
     weights: Path = runs.WEIGHTS
     """Folder with NAME/*.safetensors."""
     online: bool = True
-    """Whether to measure the online estimate, too, which runs the optimizer at every eighth frame."""
+    """Whether to measure the online estimate also; it runs the optimizer at every eighth frame."""
     window_frames: int = 0
-    """Frames of the online estimate's window; 0 for all of them. With a window the path that it leaves at the end, with
-    key frames before it, is measured, too, as `bounded`."""
+    """Frames of the online estimate's window; 0 for all. With a window there is one more row: `bounded`, the path at
+    the end, with key frames before the window."""
     key_frames: int = 128
     """Key frames before that window."""
     estimate: tuple[Path, ...] = ()
-    """Estimated trajectories in the TUM format, to be compared with `--truth` instead of measuring in a world."""
+    """Estimated trajectories in the TUM format, to compare with `--truth`."""
     truth: Path | None = None
     """True trajectory in the TUM format."""
     files_tolerance_s: float = 0.01
-    """Files: how far apart in time an estimated and a true pose of one moment may be."""
+    """Files: largest time between an estimated pose and the true pose that it is compared with."""
     delta: float = 1.0
-    """Files: between poses how far apart the RPE is taken."""
+    """Files: distance between the two poses of the RPE."""
     delta_unit: Literal["frames", "metres"] = "frames"
-    """Files: what delta counts."""
+    """Files: unit of delta."""
     all_pairs: bool = False
-    """Files: whether the RPE is taken from every pose, or from the end of one pair to the next."""
+    """Files: whether pairs of the RPE start at every pose, or at the end of the pair before."""
     segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
     """Files: lengths of KITTI's segments."""
     runs: Path = runs.ROOT / "runs"
-    """Recordings: folder of what was read from them; gets NAME/results/."""
+    """Recordings: folder with NAME/data, which was read from them; gets NAME/results/."""
 
     def __post_init__(self) -> None:
         given = (self.world is not None) + bool(self.recordings.data) + bool(self.estimate)

@@ -26,7 +26,7 @@ from training.train_local import RPE_STEPS
 
 @dataclass(frozen=True)
 class Arguments:
-    """Which networks are measured, and where."""
+    """Settings of the measurement."""
 
     world: Literal["maze2d", "maze3d"]
     """World to drive in."""

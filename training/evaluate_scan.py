@@ -57,7 +57,7 @@ class Arguments:
     """Settings of the evaluation."""
 
     trajectories: int = 10
-    """Trajectories of each row, each in a maze of its own; the same mazes in every row but the last."""
+    """Trajectories of a row, each in a maze of its own; all rows but the last have the same mazes."""
     frames: int = 2000
     """Frames of a trajectory."""
     rows: tuple[str, ...] = ()

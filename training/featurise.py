@@ -45,8 +45,8 @@ class Arguments:
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
     """Recordings to train on instead."""
     trajectories: int = 960
-    """Trajectories for training, each in a maze of its own that the local network has not seen; a fifth as many more of
-    a driver that the optimizer alone learns from, where the world has one."""
+    """Training trajectories, each in a maze that the local network has not seen. Some worlds add a fifth of this
+    number, driven by another driver, for the optimizer alone."""
     validation_trajectories: int = 24
     """Trajectories of the validation split for each table of results."""
     test_trajectories: int = 0
@@ -56,16 +56,16 @@ class Arguments:
     out: Path = runs.ROOT / "runs"
     """Folder that gets NAME/features/."""
     part: int = 0
-    """This process makes the groups of mazes whose number leaves this rest ..."""
+    """Number of this process, from 0, where several share the work."""
     parts: int = 1
-    """... when divided by this: several processes can share the work."""
+    """Number of processes that share the work."""
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
 
 
 def planned_drives(arguments: Arguments, world: World) -> dict[str, Drives]:
-    """The trajectories of each store that is to be made."""
+    """The trajectories of each store."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
     found = {TRAIN_STORE: Drives(seeds, seeds, DRAWN, world.driver)}
     if world.optimizer_driver is not None:

@@ -27,7 +27,7 @@ from training.recordings.recording_report import REVISIT_AFTER_M, REVISIT_M, Rep
 
 @dataclass(frozen=True)
 class Arguments:
-    """What is looked at, and how it is shown."""
+    """Settings of a report."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
     """Files ending in .mcap or .db3, or folders of rosbag2; several count as one recording."""

@@ -24,14 +24,14 @@ _LOOK_S = 0.2
 
 @dataclass(frozen=True)
 class Arguments:
-    """What is recorded, and where to."""
+    """Settings of a recording."""
 
     out: Path
     """A new file ending in .mcap, or a new folder."""
     topics: tuple[str, ...] = ()
-    """Which topics; none: all that there are, also those that come later."""
+    """Topics to record; none: all of the graph, including later ones."""
     seconds: float = 0.0
-    """How long; 0: until Ctrl-C."""
+    """Duration; 0: until Ctrl-C."""
 
     def __post_init__(self) -> None:
         if self.seconds < 0.0:

@@ -38,13 +38,13 @@ class Arguments:
     world: Literal["maze2d", "maze3d"]
     """World to measure in."""
     split: Literal["validation", "test"] = "test"
-    """Mazes to measure on; designs are chosen on validation, and the test split is for the final tables alone."""
+    """Mazes to measure in. Designs are chosen on validation; the test split is for the final tables alone."""
     trajectories: int = 0
-    """Trajectories of each table, each in a maze of its own; 0 for as many as the world's tables have."""
+    """Trajectories of each table, each in a maze of its own; 0 for the world's number."""
     seeds: int = 3
     """Trainings of each optimizer, with the seeds 0, 1, ..."""
     prefixes: tuple[int, ...] = ()
-    """Numbers of steps after which errors are given, as if the robot had stopped there; by default the world's."""
+    """Numbers of steps after which errors are given, as if the robot had stopped there; none: the world's."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/*.safetensors of the local network and the place encoder."""
     out: Path = runs.ROOT / "training" / "results"
@@ -98,7 +98,7 @@ class TableData:
 
 
 def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "local") -> TableData:
-    """What a row sees of a table's trajectories; raises ``ValueError`` if there are too few, or too short ones."""
+    """The features that a row gets of a table; raises ``ValueError`` for too few or too short trajectories."""
     kind = ROWS[row]
     own = kind.own_networks or kind.odometry is not None
     sources = sources.of_row(row, 0) if own else sources
@@ -116,7 +116,7 @@ def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "l
 
 
 def evaluate_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Evaluation]]:
-    """What every row makes of a table's trajectories."""
+    """The evaluations of every row on a table's trajectories, one for each training seed."""
     shared = table_data(arguments, sources, table)
     cache = cache_folder(arguments, table)
     result: dict[str, list[Evaluation]] = {}
@@ -142,14 +142,14 @@ def evaluate_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
 
 
 def cache_folder(arguments: Arguments, table: str) -> Path:
-    """Folder of what rows make of a table's trajectories."""
+    """Folder of the evaluations of a table."""
     return arguments.runs / arguments.world / "results" / f"{arguments.split}_{table}"
 
 
 def limiting_rows(
     arguments: Arguments, sources: Sources, table: str, evaluations: dict[str, list[Evaluation]]
 ) -> dict[str, list[Evaluation]]:
-    """What limits the rows of a table, beside these rows: of optimizers the first training seed."""
+    """The evaluations of the rows that show the limits of a table; of optimizers those of the first training seed."""
     data, cache = table_data(arguments, sources, table), cache_folder(arguments, table)
     result = {row: evaluations[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
     for name in tqdm(LIMITS, desc=f"{sources.world.name} {table} limits", unit="row"):

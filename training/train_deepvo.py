@@ -3,8 +3,8 @@
     python -m training.train_deepvo --world maze3d
 
 DeepVO sees stretches of trajectories where the local network sees single pairs. Number of frame pairs, schedule, loss,
-mirror images and calibration are the same. As in the original it is not told the actions. Run it again to continue after
-a stop.
+mirror images and calibration are the same. As in the original it is not told the actions. Run it again to continue
+after a stop.
 """
 
 import dataclasses

@@ -11,14 +11,13 @@ a stop.
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import lightning
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
@@ -34,8 +33,8 @@ from training.data.data_module import StreamedData
 from training.data.data_source import Domain
 from training.data.episodes import images_of, simulate
 from training.data.streams import PairStream
-from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, told_to
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.recordings.recording_source import SourceArguments, open_recorded, told_to
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
@@ -44,25 +43,21 @@ CALIBRATION_MAZES = 64
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the local pose network."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     without_action: bool = False
-    """Whether the network of a world is to do without the actions, from the images alone."""
+    """Worlds: whether the network sees images alone, without the actions."""
     action_history: int | None = None
-    """How many of the latest actions a network is told, if any; none: the world's number, twelve of recordings."""
+    """Number of latest actions that the network is told; none: the world's number, or twelve for recordings."""
     error_windows: tuple[int, ...] | None = None
-    """Numbers of consecutive steps whose errors count added up; none: the world's."""
+    """Worlds: lengths of the windows of steps over which the loss sums errors; none: the world's."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8
     """Passes of new data."""
     datapoints: int = 200_000
-    """Frame pairs in an epoch, of all processes; of recordings at most each pair twice."""
+    """Frame pairs in an epoch, of all processes. Of recordings, each pair counts at most twice."""
     batch_size: int = 256
     """Frame pairs in a step of the optimiser, in each process; less on small recordings."""
     learning_rate: float = 2e-3
@@ -79,7 +74,7 @@ class Arguments(runs.TrainerArguments):
     """Folder of checkpoints and logs."""
 
     def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
+        super().__post_init__()
         if self.without_action and self.world is None:
             raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
         if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
@@ -92,7 +87,7 @@ class Arguments(runs.TrainerArguments):
 
 
 class LocalTraining(lightning.LightningModule):
-    """The losses of steps and of the windows of some consecutive ones, ``step_losses``."""
+    """The training of a local network by ``step_losses`` of single steps and of windows."""
 
     def __init__(self, arguments: Arguments, network: LocalPoseNetwork, error_windows: tuple[int, ...] = (1,)) -> None:
         super().__init__()
@@ -129,7 +124,7 @@ class LocalTraining(lightning.LightningModule):
 
 
 def simulated_world(arguments: Arguments) -> World:
-    """The world that the arguments name, as they ask for it."""
+    """The world that the arguments name, with their changes."""
     world = world_named(str(arguments.world))
     if arguments.action_history is not None:
         world = dataclasses.replace(world, action_history=arguments.action_history)
@@ -186,7 +181,7 @@ def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
 
 
 def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    """What a network makes of a batch of pairs, from what it is told of each step."""
+    """The network's estimate of a batch of pairs: mean, logarithm of the deviations, motion features."""
     estimate: tuple[Tensor, Tensor, Tensor] = network(
         batch["earlier"], batch["later"], batch.get("action"), batch.get("twist")
     )
@@ -194,10 +189,10 @@ def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, 
 
 
 def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """The losses of a network on a batch in which as many steps as the longest of ``windows`` has follow each other.
+    """The losses of a network on a batch of stretches, each with the steps of the longest of ``windows``.
 
-    Of what it makes of the frames alone ``step_losses`` of single steps; where it is told of earlier actions too, also
-    those of all windows of what it makes of both, which leave the first part of it alone.
+    The estimate from the frames alone has the ``step_losses`` of single steps. Where the network also takes earlier
+    actions, its fused estimate has those of all windows; their gradient does not reach the estimate from the frames.
     """
     estimates = network.estimates(batch["earlier"], batch["later"], batch.get("action"), batch.get("twist"))
     truth, std = batch["relative"], network.relative_std
@@ -214,7 +209,7 @@ def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, 
 def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig:
     """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares).
 
-    The deviations get a scale each that makes their mean square that of the errors.
+    Each deviation is scaled so that its mean square equals that of the errors.
     """
     network = network.eval()
     parts = [estimated(network, p) for p in pairs]
@@ -286,7 +281,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple[LocalPoseNetwork, dict[str, str]]:
-    """A fresh network, or that of the weights to begin with, and what is to be said of them in the JSON.
+    """A fresh network or that of ``--from-weights``, and the entry of the JSON that names these weights.
 
     Raises ``RecordingError`` where those weights take other images, or are told other things of a step.
     """

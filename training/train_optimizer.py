@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 
 import lightning
 import torch
-import tyro
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
@@ -50,8 +49,13 @@ from training.data.trajectories import (
     loops_of,
     rmse_figures,
 )
-from training.data.worlds import WorldName, world_named
-from training.recordings.recording_source import NO_LOOPS, RecordedArguments, RecordedData, check_source, open_recorded
+from training.data.worlds import world_named
+from training.recordings.recording_source import (
+    NO_LOOPS,
+    RecordedData,
+    SourceArguments,
+    open_recorded,
+)
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
@@ -60,28 +64,24 @@ _LEAST_GAIN = 0.1
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the optimizer."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     form: Literal["loops", "gauss_newton", "paper"] = "loops"
-    """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
+    """loops: attention, convolution and loop closures. gauss_newton: loop closures alone. paper: no loop closures."""
     iterations: int = 5
     """Attend-optimise iterations."""
     smoothing: bool | None = None
-    """Whether odometry is smoothed before loops are closed, as ``train_smoother`` learned to; by default as suits the
-    world, and not of recordings."""
+    """Whether the smoother of ``train_smoother`` smooths the odometry before loops are closed; none: the world's
+    default, and no smoothing for recordings."""
     width: int = 64
     """Channels of aggregation and optimizer."""
     loops_per_pose: int | None = None
-    """Loop candidates of a meta-pose; by default as suits the world."""
+    """Loop candidates of a meta-pose; none: the world's default."""
     max_loops: int | None = None
-    """Loop candidates of a trajectory; by default as suits the world."""
+    """Loop candidates of a trajectory; none: the world's default."""
     epochs: int | None = None
-    """Epochs; the learning rate falls to zero over all of them. By default as many as suit the world."""
+    """Epochs, over which the learning rate falls to zero; none: the world's default."""
     steps: int = 40
     """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
     batch_size: int = 8
@@ -91,16 +91,13 @@ class Arguments(runs.TrainerArguments):
     seed: int = 0
     """Seed of initial weights and of the order of the data."""
     precision: Precision = field(default="32-true", kw_only=True)
-    """Arithmetic of the network; what closes loops is in float64 always."""
+    """Arithmetic of the network; loops are always closed in float64."""
     weights: Path = runs.WEIGHTS
     """Folder with NAME's other networks."""
     out: Path = runs.WEIGHTS
     """Folder that gets NAME/neural_graph_optimizer.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
 
 
 def trajectory_loss(
@@ -191,7 +188,7 @@ class OptimizerTraining(lightning.LightningModule):
 
 
 class Choices(NamedTuple):
-    """The arguments that are the domain's unless they are given."""
+    """Arguments with a default of their own in each domain."""
 
     smoothing: bool
     loops_per_pose: int

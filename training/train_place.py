@@ -9,13 +9,12 @@ continue after a stop.
 """
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import lightning
 import torch
-import tyro
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import IterableDataset
@@ -29,12 +28,11 @@ from training.data.batches import Batch, Share
 from training.data.data_module import StreamedData
 from training.data.data_source import Domain
 from training.data.streams import PlaceStream
-from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
+from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 from training.recordings.recording_source import (
     NO_LOOPS,
-    RecordedArguments,
     RecordedData,
-    check_source,
+    SourceArguments,
     open_recorded,
     trained_local,
 )
@@ -42,13 +40,9 @@ from training.recordings.recording_streams import RecordedPlaces
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the place encoder."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 10
@@ -69,9 +63,6 @@ class Arguments(runs.TrainerArguments):
     """Folder that gets NAME/place_encoder.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of checkpoints and logs."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
 
 
 class PlaceTraining(lightning.LightningModule):

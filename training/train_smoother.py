@@ -13,7 +13,6 @@ from typing import Any
 
 import lightning
 import torch
-import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
@@ -29,8 +28,8 @@ from training.data.batches import Batch
 from training.data.data_source import TRAIN_STORE
 from training.data.feature_store import training_stores
 from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
-from training.data.worlds import WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, RecordedData, check_source, open_recorded
+from training.data.worlds import world_named
+from training.recordings.recording_source import RecordedData, SourceArguments, open_recorded
 
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
@@ -40,13 +39,9 @@ _BLOCK = PoseAggregationConfig(1).block
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the odometry smoother."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     epochs: int = 300
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
@@ -65,9 +60,6 @@ class Arguments(runs.TrainerArguments):
     """Folder that gets NAME/odometry_smoother.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
 
 
 class SmootherTraining(lightning.LightningModule):

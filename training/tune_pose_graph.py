@@ -81,7 +81,7 @@ class Arguments:
     form: Literal["loops", "registered", "smoothed"] = "loops"
     """Odometry of the graph: that of the local network, registered again, or as our optimizer smooths it."""
     passes: int = 2
-    """How often the search goes over all groups at most."""
+    """Largest number of passes over all groups."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
     out: Path = runs.ROOT / "training" / "results"
@@ -184,7 +184,7 @@ def tune(
 
 
 def _searching(change: dict[str, Any], **how: int) -> dict[str, Any]:
-    """The change, where it is one of the search, with what all searches have in common."""
+    """The change; if it changes the search, with these common settings."""
     return {name: replace(value, **how) if name == "search" else value for name, value in change.items()}
 
 

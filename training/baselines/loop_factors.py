@@ -1,7 +1,7 @@
 """Loops for the classical pose graph: found by place codes, or known from the truth.
 
-``found_loops`` gives the loops of our own optimizer. True revisits show the causes of the remaining error: retrieval, if
-they help when the pair head measures them; measurement, if they help only when they are known exactly.
+``found_loops`` gives the loops of our own optimizer. True revisits show the cause of the remaining error. It is
+retrieval if they help when the pair head measures them, and measurement if they help only when known exactly.
 """
 
 import math

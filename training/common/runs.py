@@ -22,21 +22,21 @@ WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
 
 
 class RunError(ValueError):
-    """What lies in the folder of a run, or was asked of it, does not fit: one line that says what to do."""
+    """The files of a run and its arguments do not fit together; the message is one line with the remedy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerArguments:
-    """Where and how a training computes: what the arguments of every training script begin with."""
+    """Device, processes and precision of a training."""
 
     accelerator: str = "auto"
-    """Kind of device by Lightning's name, as cpu or gpu; auto: a GPU where there is one."""
+    """Kind of device by Lightning's name, such as cpu or gpu; auto: a GPU where there is one."""
     devices: str = "auto"
     """Processes that train together, each on batches of its own; auto: one, or one a GPU."""
     strategy: str = "auto"
-    """How they do so by Lightning's name, as ddp or ddp_find_unused_parameters_true; auto: ddp if several."""
+    """How processes work together, by Lightning's name, such as ddp; auto: ddp if there are several."""
     precision: Precision = "auto"
-    """Arithmetic of the networks; auto: the faster one here, as a run says when it begins."""
+    """Arithmetic of the networks; auto: the faster one on this device, which the run prints when it begins."""
 
 
 def revision() -> str:

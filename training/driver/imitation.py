@@ -1,8 +1,8 @@
 """Imitation of a teacher along the pupil's own way (DAgger).
 
-Ross et al., "A reduction of imitation learning and structured prediction to no-regret online learning" (2011). The pupil
-drives a growing share of the way. The teacher says at every decision what it would do, and the pupil learns from all
-answers so far. The critic learns from the rewards of the pupil.
+Ross et al., "A reduction of imitation learning and structured prediction to no-regret online learning" (2011).
+The pupil drives a growing share of the way. The teacher says at every decision what it would do, and the pupil learns
+from all answers so far. The critic learns from the rewards of the pupil.
 """
 
 from __future__ import annotations

@@ -19,9 +19,10 @@ from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
-from training.common.runs import recorded_values
+from training.common.runs import TrainerArguments, recorded_values
 from training.data.batches import ACTION_HISTORY, relative_poses
 from training.data.data_source import MIRRORED_ACTIONS, Domain
+from training.data.worlds import WorldName
 from training.recordings.recording_store import StoredRecording, make_store
 from training.recordings.recording_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
 
@@ -35,26 +36,26 @@ _NARROW = math.radians(35.0)
 
 @dataclass(frozen=True)
 class RecordedArguments:
-    """Recordings instead of a simulated world, and what is made of them."""
+    """Recordings in place of a simulated world, and their use."""
 
     data: tuple[Path, ...] = ()
-    """Recordings with ground truth to learn from: .mcap files or rosbag2 folders, each one a recording."""
+    """Recordings with ground truth: .mcap files or rosbag2 folders."""
     name: str = "my_robot"
-    """Name of what is trained on recordings: of the folders of its weights and of its run."""
+    """Name of the robot: of the folders of its weights and of its run."""
     holdout: tuple[Path, ...] = ()
-    """Those of the recordings that nothing is learned from; not given: the last of several, the end of a single one."""
+    """Recordings that are kept for the evaluation; none: the last of several, or the end of a single one."""
     reduction: int | None = None
-    """How many times smaller pictures are made; not given: the least that leaves at most 96 columns."""
+    """Factor by which pictures are made smaller; none: the least that leaves at most 96 columns."""
     place_radius_m: float | None = None
-    """How far two frames of one place may be apart; not given: four fast steps, 0.3 to 1 m."""
+    """Largest distance between two frames of one place; none: four fast steps, 0.3 to 1 m."""
     heading_limit_deg: float | None = None
-    """How far they may be turned against each other; not given: 35, or 180 for scanners that look around."""
+    """Largest turn between two frames of one place; none: 35, or 180 for scanners that look around."""
     scan_yaw_deg: float = 0.0
-    """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead; to be given live, too."""
+    """Direction of a scanner's angle 0, counter-clockwise from straight ahead; give the same to the live estimator."""
     mirror: bool = True
-    """Whether to learn from the frames' mirror images, too; not for sensors that sit far to one side."""
+    """Whether to learn also from mirror images; not for sensors that sit far to one side."""
     from_weights: Path | None = None
-    """Folder of weights to begin with, of the same sensor; their sizes and search for loops stay."""
+    """Folder of weights of the same sensor to start from; their sizes and search for loops stay."""
     topics: Annotated[TopicArguments, tyro.conf.arg(name="")] = field(default_factory=TopicArguments)
 
     def __post_init__(self) -> None:
@@ -72,6 +73,19 @@ class RecordedArguments:
             raise ValueError(f"name is {self.name!r}; expected one that a folder can have")
 
 
+@dataclass(frozen=True)
+class SourceArguments(TrainerArguments):
+    """Arguments of a training on a simulated world or on recordings."""
+
+    world: WorldName | None = None
+    """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
+
+
 def check_source(world: str | None, recordings: RecordedArguments) -> None:
     """Raise ``ValueError`` unless the data come from one place, a simulated world or recordings."""
     if (world is None) == (not recordings.data):
@@ -80,7 +94,7 @@ def check_source(world: str | None, recordings: RecordedArguments) -> None:
 
 @dataclass(frozen=True)
 class RecordedData:
-    """What there is to learn from: the domain, and tracks by what they are for; ``sha256`` tells it from other data."""
+    """Recordings as training data: their domain, and tracks by part; ``sha256`` identifies the data."""
 
     domain: Domain
     recordings: list[StoredRecording]
