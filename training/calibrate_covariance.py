@@ -59,7 +59,7 @@ def main(arguments: Arguments) -> float:
     optimizer.config = dataclasses.replace(plain, covariance_scale=scale)
     details = {key: value for key, value in description.items() if key not in _OWN}
     save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, world.name, details)
-    print(f"{world.name}: squared errors are {scale:.2f} times what the covariance says; it is multiplied with that")
+    print(f"{world.name}: squared errors are {scale:.2f} times the covariance, which gets this factor")
     return scale
 
 

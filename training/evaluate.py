@@ -10,18 +10,14 @@ held out, with plots in RUNS/NAME/results. `--estimate` compares TUM files by AT
 the definitions of evo. The last line is the table as one JSON object.
 """
 
-import dataclasses
 import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 import tyro
-from rich.console import Console
-from rich.table import Table
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
@@ -34,6 +30,7 @@ from training.data.episodes import simulate
 from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
 from training.recordings.recording_source import RecordedArguments
+from training.report.error_table import print_errors
 from training.report.held_out import evaluate_recorded
 from training.scoring.file_errors import evaluate_files
 from training.scoring.metrics import TrajectoryError, trajectory_error
@@ -134,19 +131,11 @@ def main(arguments: Arguments) -> dict[str, object]:
         "trajectories": len(seeds),
         "frames": frames,
     }
-    table = Table(title=f"{world.name}, {len(seeds)} {arguments.split} mazes of {frames} frames: mean (median)")
-    columns = [field.name for field in dataclasses.fields(TrajectoryError)]
-    for column in ("", *columns):
-        table.add_column(column)
-    for name, found in errors.items():
-        values = np.array([dataclasses.astuple(error) for error in found])
-        table.add_row(name, *(f"{m:.3f} ({d:.3f})" for m, d in zip(values.mean(0), np.median(values, 0), strict=True)))
-        result[name] = {column: float(mean) for column, mean in zip(columns, values.mean(0), strict=True)}
+    result |= print_errors(f"{world.name}, {len(seeds)} {arguments.split} mazes of {frames} frames", errors)
     wins = sum(
         c.position_rmse_m < o.position_rmse_m for o, c in zip(errors["odometry"], errors["corrected"], strict=True)
     )
     result["corrected_better_in"] = wins
-    Console().print(table)
     print(json.dumps(result))
     return result
 

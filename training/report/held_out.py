@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,6 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
@@ -25,8 +22,9 @@ from training.data.features import OPTIMIZER_INPUTS, Networks
 from training.recordings.recording_features import features_of_track
 from training.recordings.recording_source import NO_LOOPS, RecordedArguments, open_recorded
 from training.recordings.recording_tracks import Track
+from training.report.error_table import print_errors
 from training.report.training_records import learning_curve
-from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
+from training.scoring.metrics import path_length_m, trajectory_error
 from training.scoring.online_estimate import online_poses, with_origin
 
 COLORS = {"odometry": "#2ca02c", "online": "#9467bd", "corrected": "#ff7f0e"}
@@ -103,22 +101,14 @@ def _actions(track: Track) -> Tensor:
 
 
 def _table(name: str, estimates: list[tuple[Track, Poses]]) -> dict[str, Any]:
-    columns = [field.name for field in dataclasses.fields(TrajectoryError)]
     frames = sum(len(track) for track, _ in estimates)
     path_m = sum(path_length_m(track.poses_xyyaw) for track, _ in estimates)
-    table = Table(
-        title=f"{name}, held out: {len(estimates)} trajectories, {frames} frames, {path_m:.1f} m: mean (median)"
-    )
-    for column in ("", *columns):
-        table.add_column(column)
-    result: dict[str, Any] = {"trajectories": len(estimates), "frames": frames, "path_m": path_m}
-    for kind in estimates[0][1]:
-        errors = [dataclasses.astuple(trajectory_error(poses[kind], track.poses_xyyaw)) for track, poses in estimates]
-        values = np.array(errors)
-        table.add_row(kind, *(f"{m:.3f} ({d:.3f})" for m, d in zip(values.mean(0), np.median(values, 0), strict=True)))
-        result[kind] = {column: float(mean) for column, mean in zip(columns, values.mean(0), strict=True)}
-    Console().print(table)
-    return result
+    errors = {
+        kind: [trajectory_error(poses[kind], track.poses_xyyaw) for track, poses in estimates]
+        for kind in estimates[0][1]
+    }
+    title = f"{name}, held out: {len(estimates)} trajectories, {frames} frames, {path_m:.1f} m"
+    return {"trajectories": len(estimates), "frames": frames, "path_m": path_m, **print_errors(title, errors)}
 
 
 def draw(out: Path, run: Path, estimates: list[tuple[Track, Poses]]) -> list[Path]:

@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import subprocess
 import warnings
 from collections.abc import Iterator
 
@@ -55,3 +56,24 @@ def test_the_framework_is_quiet_and_nothing_else_is() -> None:
     assert [str(one.message) for one in caught] == ["of weight"]
     assert not logging.getLogger("lightning.pytorch.utilities.rank_zero").isEnabledFor(logging.INFO)
     assert logging.getLogger("lightning.pytorch").isEnabledFor(logging.ERROR)
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="the files are no checkout of git")
+@pytest.mark.parametrize(
+    ("path", "ignored"),
+    [
+        ("drive_1.mcap", True),
+        ("drive_1.mcap.png", True),
+        ("truth.tum", True),
+        ("runs/my_robot/features/train/done.json", True),
+        ("results/metrics.json", True),
+        ("out/plot.png", True),
+        ("ros_ws/src/ngo_estimator/weights/my_robot/local_pose_network.json", True),
+        ("ros_ws/src/ngo_estimator/weights/maze2d/local_pose_network.json", False),
+        ("training/results/maze2d.json", False),
+        ("docs/images/demo_maze2d.png", False),
+    ],
+)
+def test_git_ignores_what_the_commands_of_the_docs_leave_behind(path: str, ignored: bool) -> None:
+    done = subprocess.run(["git", "check-ignore", "--no-index", "-q", path], cwd=ROOT, check=False)
+    assert (done.returncode == 0) == ignored
