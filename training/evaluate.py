@@ -86,7 +86,7 @@ class Arguments:
 
     @property
     def report_settings(self) -> ReportSettings:
-        """What is measured of files."""
+        """Settings of the comparison of files."""
         delta = RelativeDelta(self.delta, self.delta_unit, self.all_pairs)
         return ReportSettings(self.files_tolerance_s, delta, self.segment_lengths_m)
 

@@ -134,19 +134,19 @@ def simulated_world(arguments: Arguments) -> World:
 
 
 class Steps(Protocol):
-    """Where the pairs of frames come from."""
+    """A source of pairs of consecutive frames."""
 
     def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
-        """Those of an epoch, for one of the processes that train together."""
+        """The pairs of an epoch, for one of the processes that train together."""
 
     def validation(self) -> list[Batch]:
-        """Those that each epoch is measured on."""
+        """The validation pairs of each epoch."""
 
     def unseen(self) -> list[Batch]:
-        """Those that the network's output is calibrated with."""
+        """The pairs that calibrate the network's output."""
 
     def typical(self) -> Tensor:
-        """Relative poses ``(n, 3)`` like those of the training."""
+        """Typical relative poses ``(n, 3)`` of the training."""
 
 
 class SimulatedSteps:

@@ -197,7 +197,7 @@ class Choices(NamedTuple):
 
 
 def choices(arguments: Arguments, domain: Domain) -> Choices:
-    """What is trained for how long: the domain's choices, but for those that are given."""
+    """The given arguments, and the domain's defaults for all others."""
     given = arguments
     return Choices(
         domain.smoothing and given.form != "paper" if given.smoothing is None else given.smoothing,
@@ -213,7 +213,7 @@ def config_of(
     scale: tuple[float, float, float],
     smoother: SmootherConfig | None = None,
 ) -> NeuralGraphOptimizerConfig:
-    """What the optimizer is made of; ``scale`` is the typical error of the odometry over a meta-pose."""
+    """The optimizer's configuration; ``scale`` is the typical error of the odometry over a meta-pose."""
     local, _ = load_local(arguments.weights / domain.name, domain.name)
     aggregation = PoseAggregationConfig(
         motion_feature_size=local.config.feature_size, width=arguments.width, relative_std=local.config.relative_std

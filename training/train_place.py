@@ -155,13 +155,13 @@ class PlaceTraining(lightning.LightningModule):
 
 
 class Places(Protocol):
-    """Where the pairs of frames come from."""
+    """A source of pairs of frames of one place."""
 
     def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
-        """Those of an epoch, for one of the processes that train together."""
+        """The pairs of an epoch, for one of the processes that train together."""
 
     def validation(self) -> list[Batch]:
-        """Those that each epoch is measured on."""
+        """The validation pairs of each epoch."""
 
 
 class SimulatedPlaces:
@@ -230,7 +230,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 def settings_of(world: World) -> dict[str, Any]:
-    """What a training depends on beside its arguments."""
+    """Settings of the world that a training depends on, for its record."""
     settings = world.stream_settings
     if world.sees_ranges and world.registration is not None:
         settings["registration"] = dataclasses.asdict(world.registration)

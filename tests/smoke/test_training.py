@@ -102,7 +102,8 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     OnlineTrajectory.load(weights, world=world)
     for load, script in ((load_local, "train_local"), (load_place, "train_place"), (load_optimizer, "train_optimizer")):
         _, description = load(weights, world)
-        assert description["training"]["command"].startswith(f"python -m training.{script} --world {world} ")
+        command = description["training"]["command"]
+        assert command.startswith(f"python -m training.{script} ") and f" --world {world} " in command
         assert description["training"]["arguments"]["seed"] == 0
         assert min(description["training"][name] for name in ("seconds", "datapoints_per_s", "peak_memory_mb")) > 0
         assert description["metrics"]["validation"]

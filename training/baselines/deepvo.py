@@ -25,7 +25,7 @@ State = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class DeepVOConfig:
-    """What a DeepVO network is made of.
+    """Configuration of a DeepVO network.
 
     ``width`` scales the channels of the convolutions and the units of the LSTM layers. ``relative_mean`` and
     ``relative_std`` (m, m, rad) normalise the output, to which ``relative_bias`` is added. With ``symmetric`` the

@@ -49,7 +49,7 @@ class LoopFactors:
 
 @dataclass(frozen=True)
 class Seen:
-    """What loops are found in, arrays ``(trajectories, steps, ...)``.
+    """Inputs of the search for loops, arrays ``(trajectories, steps, ...)``.
 
     ``relative`` and ``log_std`` are the steps of the odometry and the logarithm of their deviations, ``codes`` the
     place codes ``(trajectories, steps, code_length)`` of the frame after each step, ``origin_code`` ``(trajectories, 1,
@@ -93,7 +93,7 @@ def smoothed_odometry(
 
 
 def found_loops(pair_head: PairHead, seen: Seen, search: LoopSearch, block: int = 8) -> list[LoopFactors]:
-    """What ``find_loops`` gives for each trajectory, with ``block`` steps in a meta-pose."""
+    """Loops of each trajectory by ``find_loops``, with ``block`` steps in a meta-pose."""
     found: list[LoopFactors] = []
     for part in _parts(seen):
         steps, _ = part.registered(pair_head, search, block)
@@ -112,7 +112,7 @@ MoreLoops = Callable[[np.ndarray], LoopFactors]
 def overlaps_of(
     pair_head: PairHead, codes: np.ndarray, relative: np.ndarray, search: LoopSearch, block: int = 8
 ) -> list[MoreLoops]:
-    """What ``find_overlaps`` gives for each trajectory, once there are poses.
+    """A search for overlaps of each trajectory by ``find_overlaps``, once there are poses.
 
     Args:
         codes: place codes ``(trajectories, steps, code_length)``; relative: steps of the odometry ``(trajectories,

@@ -58,7 +58,7 @@ def revision() -> str:
 
 
 def record(script: str, arguments: Any) -> dict[str, Any]:
-    """How this run was made: command, arguments and revision, for the JSON beside its weights.
+    """Command, arguments and revision of a run, for the JSON beside its weights.
 
     Folders are left out: they say where a network was made, not how; of recordings, the names are kept.
     """
@@ -213,7 +213,7 @@ class Run:
             self.best.restore(training)
 
     def validate(self, training: lightning.LightningModule, data: lightning.LightningDataModule) -> dict[str, float]:
-        """What the training logs of the validation data, as it is now."""
+        """The validation figures of the present weights, by their logged names."""
         (logged,) = self.trainer.validate(training, datamodule=data, verbose=False)
         return {name: float(value) for name, value in logged.items()}
 

@@ -15,7 +15,7 @@ LIKELIHOOD_WEIGHT = 0.1
 
 
 def windows_within(steps: int, windows: tuple[int, ...]) -> tuple[int, ...]:
-    """Those of the ``windows`` that so many steps which follow each other have room for."""
+    """The ``windows`` that are not longer than this number of steps."""
     return tuple(window for window in windows if window <= steps)
 
 
@@ -24,10 +24,10 @@ def step_losses(
 ) -> tuple[Tensor, Tensor]:
     """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says.
 
-    The first is the mean over ``windows``: of ``k`` steps that follow each other along the last axis but one, the
-    errors are added up and divided by the root of ``k``, so that windows weigh the same where errors are independent.
-    Where they last, as what a robot with momentum does beside its actions, the longer windows weigh more. The sum of
-    the steps' errors is the drift in heading, and nearly that in position while the robot turns little.
+    The first is the mean over ``windows``. A window of ``k`` steps along the last axis but one has the sum of their
+    errors, divided by the root of ``k``. So all windows weigh the same where errors are independent, and longer ones
+    weigh more where errors last, as with a robot that has momentum. The sum of the errors is the drift in heading, and
+    nearly the drift in position while the robot turns little.
     """
     error = (mean - truth) / std
     weight = error.new_tensor([1.0, 1.0, HEADING_WEIGHT])

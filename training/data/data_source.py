@@ -13,7 +13,7 @@ OTHER_TRAIN_STORE = "train_policy"
 """The one that the optimizer learns from as well, in worlds with an ``optimizer_driver``."""
 
 MIRRORED_ACTIONS = (0, 2, 1)
-"""What the actions of ngo_msgs/DiscreteAction become in a mirror: forward stays, left and right change places."""
+"""Mirror image of each action of ngo_msgs/DiscreteAction: forward stays, left and right change places."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Domain:
     actions: int = 3
     """Number of discrete actions; 0: networks see images alone."""
     mirrored_actions: tuple[int, ...] = MIRRORED_ACTIONS
-    """What each action becomes in a mirror."""
+    """Mirror image of each action."""
     action_history: int = 1
     """Number of latest actions that the local network is told."""
     twist: bool = False

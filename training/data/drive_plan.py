@@ -21,7 +21,7 @@ class Drives(NamedTuple):
     driver: str
 
     def episodes(self, world: World, group: slice) -> Iterator[Episode]:
-        """Those of a group of mazes of one size, of the world's number of steps."""
+        """Episodes of a group of mazes of one size, with the world's number of steps."""
         frames = world.episode_frames + 1
         return episodes_in(world, self.mazes[group], self.seeds[group], frames, self.size, self.driver)
 

@@ -26,7 +26,7 @@ _CHUNK = 64  # steps at once: their activations stay in a CPU's cache (a fifth f
 
 
 class Networks(NamedTuple):
-    """What makes features of frames."""
+    """The networks that turn frames into features."""
 
     local: LocalPoseNetwork
     place: PlaceNetworks
@@ -35,7 +35,7 @@ class Networks(NamedTuple):
 def features_of(
     world: World, episode: Episode, weights: Path, networks: tuple[LocalPoseNetwork, PlaceNetworks] | None = None
 ) -> dict[str, np.ndarray]:
-    """What the estimator makes of an episode in ``frames - 1`` steps, and the true poses after each of them."""
+    """Features of the ``frames - 1`` steps of an episode, and the true poses after each, as of ``step_features``."""
     local, place = networks or (load_local(weights, world.name)[0], load_place(weights, world.name)[0])
     images = images_of(world, episode)
     actions = {"action": action_histories(episode.actions)} if world.actions else {}

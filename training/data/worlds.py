@@ -96,7 +96,7 @@ class World(Domain):
 
     @property
     def stream_settings(self) -> dict[str, Any]:
-        """What a training on a stream depends on beside its arguments, for its record."""
+        """Settings of the world that a training on a stream depends on, for its record."""
         return {"training_drivers": list(self.stream_drivers)}
 
     @property

@@ -40,7 +40,7 @@ class Lessons:
 
 
 class Memory:
-    """What was seen, what the teacher said and what was earned from there on (nan: not known), decision by decision."""
+    """Pictures, answers of the teacher and later rewards (nan: not known) of each decision."""
 
     def __init__(self, capacity: int, look: Look) -> None:
         self.pictures = np.zeros((capacity, *look["pictures"].shape), np.uint8)

@@ -11,7 +11,7 @@ from training.recordings.recording_tracks import Track
 
 
 def features_of_track(domain: Domain, track: Track, networks: Networks, mirror: bool = False) -> dict[str, np.ndarray]:
-    """The same of a track of a recording, or of what its mirror image would have given."""
+    """Features of a track of a recording or of its mirror image, as of ``step_features``."""
     side = known_side_information(domain, side_information(track, slice(None)))
     poses = track.poses_xyyaw
     if mirror:

@@ -81,7 +81,7 @@ class Report:
     samples: tuple[np.ndarray, ...] = field(repr=False)
 
     def numbers(self) -> dict[str, Any]:
-        """What fits into JSON."""
+        """The numbers as JSON takes them."""
         plain = {
             name: getattr(self, name)
             for name in ("files", "topics", "uses", "frames", "image", "with_pose", "with_action", "with_twist")
@@ -146,7 +146,7 @@ def topic_row(recording: Recording, name: str) -> dict[str, Any]:
 
 
 def topic_uses(recording: Recording, topics: RecordingTopics) -> dict[str, str]:
-    """What each topic (or file) is used for."""
+    """The use of each topic or file."""
     uses: dict[str, str] = {}
 
     def use(name: str | None, what: str) -> None:
@@ -268,7 +268,7 @@ def _spread(values: np.ndarray) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Findings:
-    """What a person should know before training on the recording, each in one line with its remedy."""
+    """The faults of a recording, each in one line with its remedy."""
 
     recording: Recording
     topics: RecordingTopics

@@ -120,7 +120,7 @@ class RecordedData:
 
     @property
     def residual(self) -> dict[str, float]:
-        """What the projection of the true poses to the plane leaves out: range of heights, and the largest tilt."""
+        """Loss by the projection of the true poses to the plane: range of heights, and the largest tilt."""
         residuals = np.concatenate([recording.residuals for recording in self.recordings])
         known = np.isfinite(residuals).all(axis=1)
         heights = [r.residuals[np.isfinite(r.residuals[:, 0]), 0] for r in self.recordings]
@@ -194,7 +194,7 @@ def check_same_data(data: RecordedData, local: TrainedLocal) -> None:
 
 
 def told_to(network: Domain | LocalPoseConfig) -> str:
-    """What a network is told of each step beside its two frames."""
+    """The side information that a network takes of each step beside its two frames, in words."""
     return "actions" if network.actions else "velocities" if network.twist else "images alone"
 
 

@@ -102,7 +102,7 @@ def _identity(
     reduction: int | None,
     scan_yaw_rad: float,
 ) -> Any:
-    """What the content of a store depends on, as JSON gives it back."""
+    """Everything that the content of a store depends on, as JSON gives it back."""
     settings = [dataclasses.asdict(given), image and dataclasses.asdict(image), reduction, scan_yaw_rad]
     found: list[Any] = [_VERSION, *settings]
     for path in files:

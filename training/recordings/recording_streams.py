@@ -99,7 +99,7 @@ def track_pairs(domain: Domain, track: Track) -> list[Batch]:
 
 
 class RecordedSteps:
-    """What the local pose network learns from."""
+    """The data of the local pose network."""
 
     def __init__(self, data: RecordedData, datapoints: int, batch_size: int) -> None:
         self.data, self.domain, self.datapoints, self.batch_size = data, data.domain, datapoints, batch_size
@@ -220,7 +220,7 @@ def _places(tracks: Sequence[Track], pairs: np.ndarray) -> Batch:
 
 
 class RecordedPlaces:
-    """What the place encoder learns from."""
+    """The data of the place encoder."""
 
     def __init__(self, data: RecordedData, batches: int, batch_size: int, validation_batches: int) -> None:
         self.domain, self.batch_size, self.validation_batches = data.domain, batch_size, validation_batches

@@ -13,7 +13,7 @@ from training.scoring.scores import METRICS
 from training.scoring.statistics import compare, mean_interval
 
 Table = Mapping[str, Sequence[Evaluation]]
-"""What was measured for each row, one for each training seed."""
+"""The evaluations of each row, one for each training seed."""
 
 PAIRS = (
     ("local", "local_calibrated"),

@@ -21,7 +21,7 @@ _MADE_BY = ("baselines", "data", "scoring")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What one estimator makes of the trajectories of a table.
+    """Poses and scores of one estimator on the trajectories of a table.
 
     ``poses`` ``(trajectories, steps, 3)``, float32, of whole trajectories; ``scores``: for each number of steps the
     metrics ``(trajectories,)`` by their key, the estimator having seen these steps alone, as in use.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
 
 ARRAYS = ("relative", "truth")
-"""What a store of odometry holds: steps, and true poses after each of them, ``(trajectories, steps, 3)``."""
+"""Arrays of a store of odometry: steps, and true poses after each of them, ``(trajectories, steps, 3)``."""
 
 _MADE_WITH = "networks.json"
 _TOGETHER = 256  # pairs of frames that go through a network at once
@@ -56,7 +56,7 @@ def make_odometry(row: str, sources: Sources, split: str, table: str, count: int
 
 
 def _network(kind: str, folder: Path, world: str) -> tuple[Callable[[Tensor], Tensor], str]:
-    """What makes steps ``(steps, 3)`` of images ``(steps + 1, height, width, channels)``, and the weights' hash."""
+    """A function from images ``(steps + 1, height, width, channels)`` to steps ``(steps, 3)``, and the hash."""
     if kind == DEEPVO:
         deepvo, description = load_deepvo(folder, world)
         return lambda images: trajectory_steps(deepvo, images), description["sha256"]

@@ -86,7 +86,7 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
 
 
 def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
-    """What there was after so many steps; the first frame's place code stays."""
+    """The arrays after this number of steps; the first frame's place code stays."""
     return {name: array[:, :steps] for name, array in arrays.items()}
 
 
@@ -110,7 +110,7 @@ def smoothed(smoother: OdometrySmoother, arrays: Arrays) -> np.ndarray:
 
 
 def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
-    """What loops are found in, with the odometry of the arrays, or another one."""
+    """Inputs of the search for loops, with the odometry of the arrays or another one."""
     steps = arrays["relative"] if relative is None else relative
     return Seen(steps, arrays["log_std"], arrays["codes"], arrays["origin_code"])
 
@@ -151,7 +151,7 @@ def optimized_by(
     prepared: Prepared | None = None,
     known: Callable[[Loops, Tensor, int], Loops] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """What ``optimize_offline`` does, for many trajectories at once.
+    """``optimize_offline`` for many trajectories at once.
 
     ``prepared`` is of the same trajectories and the same pair head.
     ``known`` makes other loops of those that are found, the true poses and the steps in a meta-pose.
