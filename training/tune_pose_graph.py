@@ -2,8 +2,8 @@
 
     python -m training.tune_pose_graph --world maze2d
 
-From the default settings on, one group of settings after the other takes the value of its grid with the smallest mean
-position RMSE, over and over until nothing gets better. Nothing is drawn at random.
+A coordinate search: each group of settings in turn takes the value of its grid with the smallest mean position RMSE,
+until nothing gets better. Nothing is random.
 """
 
 import dataclasses
@@ -16,16 +16,14 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_place, load_smoother
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.optimizer.compass_closure import CompassFixes
 from ngo_estimator.optimizer.loop_closure import LoopSearch
-from training.baselines.compass_factors import found_fixes
+from training.baselines.graph_settings import REGISTRATIONS, fit_calibration
 from training.baselines.loop_factors import (
     LoopFactors,
     MoreLoops,
@@ -37,8 +35,9 @@ from training.baselines.loop_factors import (
 )
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.common import runs
+from training.common.command_line import run_command
+from training.data.feature_store import open_store
 from training.data.worlds import world_named
-from training.featurise import open_store
 from training.scoring.metrics import trajectory_error
 
 GRID: tuple[tuple[dict[str, Any], ...], ...] = (
@@ -66,25 +65,8 @@ GRID: tuple[tuple[dict[str, Any], ...], ...] = (
 )
 """The values of each group of settings, in the order in which they are tried."""
 
-COMPASS_GRID: tuple[tuple[dict[str, Any], ...], ...] = (
-    tuple({"compass_kernel_width": value} for value in (2.0, 10.0, 50.0)),
-    tuple({"compass_position_scale": value} for value in (0.7, 1.0, 2.0, 4.0)),
-    tuple({"compass_heading_scale": value} for value in (0.7, 1.0, 2.0, 4.0)),
-    tuple({"odometry_position_scale": value} for value in (1.0, 2.0, 4.0)),
-    tuple({"odometry_heading_scale": value} for value in (1.0, 2.0, 4.0)),
-    tuple({"loop_position_scale": value} for value in (0.7, 1.0, 2.0, 4.0)),
-    tuple({"loop_heading_scale": value} for value in (0.5, 1.0, 2.0, 4.0)),
-)
-"""The same for the pose graph with a compass, which begins with what is best without."""
-
 _ARRAYS = ("relative", "log_std", "codes", "origin_code", "truth")
-_COMPASS = ("compass", "compass_log_scale")
-_OF_FORM = {"smoothed": ("motion",), "compass": _COMPASS}
-"""What is read of a feature store for a form beside these."""
-FORMS = ("loops", "registered", "smoothed", "compass")
-REGISTRATIONS = 5
-"""Steps of each registration for the pose graph, where ranges are registered: as many as for our optimizer."""
-
+FORMS = ("loops", "registered", "smoothed")
 _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was there first stays
 
 
@@ -96,11 +78,10 @@ class Arguments:
     """World to tune for."""
     trajectories: int = 0
     """Validation trajectories of each table of results; 0 for all."""
-    form: Literal["loops", "registered", "smoothed", "compass"] = "loops"
-    """The graph of odometry and loops; that on odometry that was registered again, or as our optimizer smooths it; or
-    the first with a compass, from the settings that are best without."""
+    form: Literal["loops", "registered", "smoothed"] = "loops"
+    """Odometry of the graph: that of the local network, registered again, or as our optimizer smooths it."""
     passes: int = 2
-    """How often the search goes over all groups at most."""
+    """Largest number of passes over all groups."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
     out: Path = runs.ROOT / "training" / "results"
@@ -115,7 +96,6 @@ class Objective:
     Args:
         arrays: ``relative``, ``log_std``, ``codes``, ``origin_code`` and ``truth`` of a feature store, and ``motion``
             for a smoother.
-        compass: readings for each trajectory.
         registered: whether the graph's odometry is registered again.
         smoother: what smooths it, if anything.
     """
@@ -124,13 +104,11 @@ class Objective:
         self,
         arrays: dict[str, np.ndarray],
         pair_head: PairHead,
-        compass: list[CompassFixes] | None = None,
         registered: bool = False,
         smoother: OdometrySmoother | None = None,
     ) -> None:
         self.arrays, self._pair_head, self._registered, self._smoother = arrays, pair_head, registered, smoother
         self._odometry: tuple[np.ndarray, np.ndarray] | None = None
-        self._compass: Sequence[CompassFixes | None] = compass or [None] * len(arrays["relative"])
         self._loops: dict[object, list[LoopFactors]] = {}
 
     def loops(self, settings: PoseGraphSettings) -> list[LoopFactors]:
@@ -157,15 +135,12 @@ class Objective:
 
     def __call__(self, settings: PoseGraphSettings) -> float:
         odometry, search = self._steps(settings), settings.search
-        more: Sequence[MoreLoops | None] = [None] * len(self._compass)
+        more: Sequence[MoreLoops | None] = [None] * len(self.arrays["relative"])
         if search.overlaps:
             steps = settings.calibrated(odometry[0])
             more = overlaps_of(self._pair_head, self.arrays["codes"], steps, search, settings.block)
-        added = zip(self.loops(settings), self._compass, more, strict=True)
-        return self.error(
-            optimize(*one, loops, settings, compass, overlaps)
-            for one, (loops, compass, overlaps) in zip(zip(*odometry, strict=True), added, strict=True)
-        )
+        graphs = zip(*odometry, self.loops(settings), more, strict=True)
+        return self.error(optimize(steps, std, loops, settings, more) for steps, std, loops, more in graphs)
 
     def error(self, poses: Iterable[np.ndarray]) -> float:
         """Mean position RMSE (m) of trajectories ``(steps, 3)``."""
@@ -180,22 +155,6 @@ class Objective:
         )
 
 
-def fit_calibration(relative: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Gain and bias of each component of a step that fit the true steps best, by least squares.
-
-    Args:
-        relative: steps ``(trajectories, steps, 3)``; truth: true poses after each of them.
-    """
-    true_steps = se2.g2r(torch.from_numpy(np.array(truth))).numpy()
-    fits = []
-    for k in range(3):
-        steps = np.ravel(relative[..., k]).astype(np.float64)
-        design = np.column_stack((steps, np.ones_like(steps)))
-        fits.append(np.linalg.lstsq(design, np.ravel(true_steps[..., k]))[0].tolist())
-    gain, bias = zip(*fits, strict=True)
-    return {"odometry_gain": gain, "odometry_bias": bias}
-
-
 def tune(
     objective: Callable[[PoseGraphSettings], float],
     start: PoseGraphSettings,
@@ -204,19 +163,19 @@ def tune(
 ) -> tuple[PoseGraphSettings, float]:
     """Coordinate search for the settings with the smallest ``objective``, from ``start``; returns both."""
     groups = [list(group) for group in grid]
-    known: dict[PoseGraphSettings, float] = {}
+    tried: dict[PoseGraphSettings, float] = {}
     best, least = start, objective(start)
-    known[best] = least
+    tried[best] = least
     with tqdm(total=passes * sum(map(len, groups)), desc="tune", unit="setting") as bar:
         for _ in range(passes):
             before = best
             for group in groups:
                 for change in group:
                     candidate = replace(best, **change)
-                    if candidate not in known:
-                        known[candidate] = objective(candidate)
-                    if known[candidate] < least * (1.0 - _SMALLEST_GAIN):
-                        best, least = candidate, known[candidate]
+                    if candidate not in tried:
+                        tried[candidate] = objective(candidate)
+                    if tried[candidate] < least * (1.0 - _SMALLEST_GAIN):
+                        best, least = candidate, tried[candidate]
                     bar.update()
                     bar.set_postfix(least=f"{least:.4f}")
             if best == before:
@@ -225,30 +184,19 @@ def tune(
 
 
 def _searching(change: dict[str, Any], **how: int) -> dict[str, Any]:
-    """The change, where it is one of the search, with what all searches have in common."""
+    """The change; if it changes the search, with these common settings."""
     return {name: replace(value, **how) if name == "search" else value for name, value in change.items()}
-
-
-def load_settings(path: Path) -> PoseGraphSettings:
-    """The settings in a file that this script wrote; raises ``ValueError`` naming what is wrong with it."""
-    try:
-        values = dict(json.loads(path.read_text())["settings"])
-        search = LoopSearch(**values.pop("search"))
-        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
-        return PoseGraphSettings(**{**values, **lists, "search": search})
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}; expected what `python -m training.tune_pose_graph` writes") from error
 
 
 def main(arguments: Arguments) -> PoseGraphSettings:
     """Search, print the best settings and write them."""
     torch.set_num_threads(1)
     world = world_named(arguments.world)
-    features, with_compass = arguments.runs / world.name / "features", arguments.form == "compass"
-    stores = [open_store(features / f"validation_{table}", with_compass) for table in world.unseen_tables]
+    features = arguments.runs / world.name / "features"
+    stores = [open_store(features / f"validation_{table}") for table in world.unseen_tables]
     arrays = {
         name: np.concatenate([store[name][: arguments.trajectories or None] for store in stores])
-        for name in (*_ARRAYS, *_OF_FORM.get(arguments.form, ()))
+        for name in (*_ARRAYS, *(("motion",) if arguments.form == "smoothed" else ()))
     }
     path = arguments.out / f"{world.name}.gtsam.json"
     place, described = load_place(arguments.weights / world.name, world.name)
@@ -272,14 +220,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
             tuned_for["odometry_smoother_sha256"] = smooths["sha256"]
     else:
         grid.append([fit_calibration(arrays["relative"], arrays["truth"])])
-    compass: list[CompassFixes] | None = None
-    if with_compass:
-        start, grid = load_settings(path), [list(group) for group in COMPASS_GRID]
-        path = arguments.out / f"{world.name}.gtsam_compass.json"
-        relative = start.calibrated(arrays["relative"])
-        readings, log_scale = (arrays[name] for name in _COMPASS)
-        compass = found_fixes(readings, log_scale, relative, arrays["log_std"], start.block, world.block_m)
-    objective = Objective(arrays, pair_head, compass, arguments.form == "registered", smoother)
+    objective = Objective(arrays, pair_head, arguments.form == "registered", smoother)
     started = time.monotonic()
     best, least = tune(objective, start, grid, arguments.passes)
     odometry = objective.error(se2.r2g(torch.from_numpy(arrays["relative"]).double()).numpy())
@@ -301,4 +242,4 @@ def main(arguments: Arguments) -> PoseGraphSettings:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

@@ -14,16 +14,15 @@ from training import (
     featurise,
     results,
     throughput,
-    train_compass,
     train_end_to_end,
     train_local,
     train_optimizer,
     train_place,
     tune_pose_graph,
 )
-from training.data import streams, worlds
+from training.data import worlds
+from training.data.feature_store import open_store
 from training.data.worlds import MazeSize, Table, world_named
-from training.featurise import open_store
 from training.scoring.metrics import trajectory_error
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
@@ -40,11 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("results")
     with pytest.MonkeyPatch.context() as patch:
         toy.shrink(patch, STEPS + 1, 300)
-        simulate = streams.simulate
-        patch.setattr(train_compass, "simulate", lambda world, seeds, _: simulate(world, seeds, 50))
-        patch.setattr(train_compass.CompassStream, "FRAMES", 97)
-        for grid in ("GRID", "COMPASS_GRID"):  # one group each, as the unit tests try the rest
-            patch.setattr(tune_pose_graph, grid, getattr(tune_pose_graph, grid)[3:4])
+        patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
         tables = {"perfect": Table(MazeSize(2, 0)), "cycles": Table(MazeSize(2, 1), stretch=1)}
         world = dataclasses.replace(worlds.WORLDS["maze2d"], tables=tables)
         patch.setitem(worlds.WORLDS, "maze2d", world)
@@ -112,7 +107,7 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
-    networks = (train_compass, train_end_to_end, train_local, train_optimizer, train_place)
+    networks = (train_end_to_end, train_local, train_optimizer, train_place)
     toy.refuse(monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.scoring.error_cache.scores")
     assert results.main(arguments(folder), toy.scripts("maze2d", folder)) == result
 
@@ -127,7 +122,7 @@ def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, di
     try:
         for path in new.iterdir():
             (old / path.name).write_bytes(path.read_bytes())
-        found = results.measured_rows(arguments(folder), sources, "cycles")["ngo_5"]
+        found = results.evaluate_rows(arguments(folder), sources, "cycles")["ngo_5"]
     finally:
         for name, content in kept.items():
             (old / name).write_bytes(content)

@@ -11,9 +11,9 @@ import pytest
 from training import (
     evaluate,
     featurise,
+    prerequisites,
     results,
     throughput,
-    train_compass,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -22,17 +22,15 @@ from training import (
     train_smoother,
     tune_pose_graph,
 )
-from training.data import streams, worlds
-from training.report import prerequisites
+from training.data import episodes, streams, worlds
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:
     """Episodes of ``frames`` frames (``place_frames`` where places must be seen again), two mazes at a time."""
-    simulate = streams.simulate
+    simulate = episodes.simulate
     for script in (train_local, train_deepvo):
         monkeypatch.setattr(script, "simulate", lambda world, seeds, _: simulate(world, seeds[:2], frames))
-    monkeypatch.setattr(streams, "_GROUP", 2)
-    monkeypatch.setattr(featurise, "_GROUP", 2)
+    monkeypatch.setattr(episodes, "GROUP", 2)
     monkeypatch.setattr(streams.PairStream, "FRAMES", frames)
     monkeypatch.setattr(streams.PlaceStream, "FRAMES", place_frames)
     for name, world in worlds.WORLDS.items():
@@ -161,9 +159,6 @@ def scripts(world: Any, folder: Path) -> prerequisites.Scripts:
     return prerequisites.Scripts(
         local=local(world, folder),
         place=place(world, folder),
-        compass=train_compass.Arguments(
-            world="maze2d", width=4, epochs=1, datapoints=1, batch_size=32, validation_mazes=2, workers=0
-        ),
         features=features(world, folder),
         smoother=smoother(world, folder),
         optimizer=optimizer(world, folder),

@@ -1,8 +1,7 @@
 """The classical baseline: a pose graph of the same odometry and loops as ours, optimised with GTSAM.
 
 Nodes are the ends of the meta-steps. Odometry factors are composed meta-steps with the network's own deviations, loop
-factors are what ``find_loops`` gives. A few numbers say how far either is to be believed: ``training.tune_pose_graph``
-chooses them on validation mazes.
+factors come from ``find_loops``. ``training.tune_pose_graph`` chooses the scales of both on validation mazes.
 """
 
 import math
@@ -15,9 +14,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.lattice import snapped
 from ngo_estimator.networks.pose_aggregation import block_variances, frame_poses, poses_in_blocks
-from ngo_estimator.optimizer.compass_closure import CompassFixes
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from training.baselines.loop_factors import LoopFactors, MoreLoops, exact_revisits
 
@@ -31,12 +28,11 @@ _KERNELS: dict[str, Callable[[float], Any]] = {
 _HUBER_WIDTH = 1.0
 _DRIFT_LEFT = (*(0.25**stage for stage in range(6)), 0.0)
 _DRIFT_RAD_A_M = 0.2
-_UNKNOWN = 1e4  # scale of a deviation that is not to matter
 
 
 @dataclass(frozen=True)
 class PoseGraphSettings:
-    """What can be tuned in the pose graph. A scale multiplies the deviation that a network states."""
+    """Settings of the pose graph. A scale multiplies the deviation that a network states."""
 
     block: int = 8
     """Steps in a meta-pose."""
@@ -47,7 +43,7 @@ class PoseGraphSettings:
     odometry_gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of a step's x, y and turn: a constant calibration of the odometry."""
     odometry_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What is then added to each step (m, m, rad)."""
+    """Bias that is then added to each step (m, m, rad)."""
     search: LoopSearch = field(default_factory=lambda: LoopSearch(per_pose=4, most=500, views=1))
     """Which pairs of frames become loop candidates."""
     min_logit: float = 2.0
@@ -57,21 +53,13 @@ class PoseGraphSettings:
     loop_heading_scale: float = 0.5
     """Scale of the loops' deviations in heading."""
     kernel: Kernel = "geman_mcclure"
-    """Robust kernel over loops and compass readings."""
+    """Robust kernel over loops."""
     kernel_width: float = 2.0
     """Parameter of the kernel over loops, in deviations."""
     drift_m: float = 1.0
-    """What the graph allows the odometry to have drifted at first: so much, and a fifth of it in rad, is added (in
-    squares) to each loop's deviation, then a quarter of that, and so on, in the end nothing (as in graduated
-    non-convexity). With 0 it begins with a convex kernel instead."""
-    compass_position_scale: float = 2.0
-    """Scale of the compass readings' deviations in position."""
-    compass_heading_scale: float = 2.0
-    """Scale of the compass readings' deviations in heading."""
-    compass_kernel_width: float = 10.0
-    """Parameter of the kernel over compass readings, in deviations."""
-    compass_rounds: int = 4
-    """How often compass readings are snapped to the lattice at most."""
+    """Drift of the odometry that the graph allows at first. It is added in squares to each loop's deviation, a fifth of
+    it in rad to that of the heading. Each stage has a quarter of it, the last one none (graduated non-convexity). With
+    0 the graph starts with a convex kernel instead."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -85,9 +73,8 @@ class PoseGraphSettings:
             raise ValueError(f"drift_m is {self.drift_m}; expected 0 or more")
         if math.isnan(self.min_logit):
             raise ValueError("min_logit is nan; expected a number")
-        for name in ("block", "compass_rounds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected at least 1")
+        if self.block < 1:
+            raise ValueError(f"block is {self.block}; expected at least 1")
 
     def calibrated(self, relative: np.ndarray) -> np.ndarray:
         """Steps ``(..., 3)`` of the odometry after the constant calibration, float64."""
@@ -99,7 +86,6 @@ def optimize(
     log_std: np.ndarray,
     loops: LoopFactors,
     settings: PoseGraphSettings,
-    compass: CompassFixes | None = None,
     more: MoreLoops | None = None,
 ) -> np.ndarray:
     """Poses ``(steps, 3)`` after each step, seen from the first frame, float64.
@@ -108,7 +94,6 @@ def optimize(
         relative: steps ``(steps, 3)`` of the odometry (m, m, rad), a whole number of blocks.
         log_std: logarithm of their standard deviations ``(steps, 3)``.
         loops: loop candidates, from ``found_loops`` of the calibrated odometry.
-        compass: readings of this trajectory alone, a batch of one.
         more: gives further loops, of the meta-poses ``(blocks + 1, 3)`` that the graph comes to without them.
     """
     steps = torch.from_numpy(settings.calibrated(relative)).unsqueeze(0)
@@ -118,7 +103,7 @@ def optimize(
     graph = _Graph(*odometry, loops, settings)
     if more is not None:
         graph = _Graph(*odometry, loops.and_also(more(graph.solve())), settings)
-    poses = torch.from_numpy(graph.solve() if compass is None else graph.solve_with(compass))
+    poses = torch.from_numpy(graph.solve())
     meta_relative = se2.between(poses[:-1], poses[1:])
     return frame_poses(in_blocks, meta_relative.unsqueeze(0))[0].numpy()
 
@@ -126,13 +111,13 @@ def optimize(
 def optimize_exact(
     relative: np.ndarray, log_std: np.ndarray, truth: np.ndarray, settings: PoseGraphSettings
 ) -> np.ndarray:
-    """What perfect loops would give: as ``optimize``, with true revisits and their true relative poses."""
+    """The poses with perfect loops: as ``optimize``, with true revisits and their true relative poses."""
     exact = replace(settings, kernel="none", drift_m=0.0, loop_position_scale=1.0, loop_heading_scale=1.0)
     return optimize(relative, log_std, exact_revisits(truth, settings.search, settings.block), exact)
 
 
 class _Graph:
-    """A trajectory's factors. Node ``k`` is the pose before meta-step ``k``; the one after the last is the lattice."""
+    """A trajectory's factors. Node ``k`` is the pose before meta-step ``k``."""
 
     def __init__(
         self, meta_relative: torch.Tensor, meta_std: np.ndarray, loops: LoopFactors, settings: PoseGraphSettings
@@ -163,23 +148,6 @@ class _Graph:
         """Poses ``(blocks + 1, 3)`` from odometry and loops."""
         return _xyyaw(self._loop_closed())
 
-    def solve_with(self, compass: CompassFixes) -> np.ndarray:
-        """Poses ``(blocks + 1, 3)`` from odometry, loops and compass.
-
-        Headings first: they are ambiguous only by quarter turns, and with them the positions hardly drift.
-        """
-        values, node = self._loop_closed(), len(self._odometry)
-        values.insert(node, gtsam.Pose2(*compass.lattice[0].double().numpy()))
-        measured = _snapped(compass, _xyyaw(values))
-        values = _minimum(self._with_compass(compass, measured, convex=True, headings_only=True), values)
-        before: np.ndarray | None = None
-        for _ in range(self._settings.compass_rounds):
-            measured = _snapped(compass, _xyyaw(values))
-            if before is not None and np.array_equal(measured, before):
-                break
-            values, before = _minimum(self._with_compass(compass, measured, convex=True), values), measured
-        return _xyyaw(_minimum(self._with_compass(compass, measured), values))[:-1]
-
     def _loop_closed(self) -> gtsam.Values:
         values = gtsam.Values()
         for node, pose in enumerate(self._odometry):
@@ -202,31 +170,10 @@ class _Graph:
             graph.add(gtsam.BetweenFactorPose2(start, end, measured, _robust(noise, kernel, width)))
         return graph
 
-    def _with_compass(
-        self, compass: CompassFixes, measured: np.ndarray, convex: bool = False, headings_only: bool = False
-    ) -> gtsam.NonlinearFactorGraph:
-        settings, lattice = self._settings, len(self._odometry)
-        kernel, width = self._convex if convex else (settings.kernel, settings.compass_kernel_width)
-        graph = self._with_loops(settings.kernel, settings.kernel_width)
-        scale = compass.log_scale[0].double().exp().numpy()[:, [0, 0, 1]]
-        position_scale = _UNKNOWN if headings_only else settings.compass_position_scale
-        noises = _noises(scale, position_scale, settings.compass_heading_scale)
-        for node, pose, noise in zip(compass.node[0].tolist(), measured, noises, strict=True):
-            robust = _robust(noise, kernel, width)
-            graph.add(gtsam.BetweenFactorPose2(lattice, node, gtsam.Pose2(*pose), robust))
-        return graph
-
     @property
     def _convex(self) -> tuple[Kernel, float]:
         """The kernel far from the minimum, where most others pull at nothing."""
         return ("none", self._settings.kernel_width) if self._settings.kernel == "none" else ("huber", _HUBER_WIDTH)
-
-
-def _snapped(compass: CompassFixes, poses: np.ndarray) -> np.ndarray:
-    """What the readings say ``(fixes, 3)``, in the frame of the lattice, which is the last of the ``poses``."""
-    nodes = torch.from_numpy(poses)
-    in_lattice = se2.between(nodes[-1], nodes[compass.node[0]])
-    return snapped(compass.readings[0].double(), in_lattice, compass.block_m).numpy()
 
 
 def _noises(deviation: np.ndarray, position_scale: float, heading_scale: float) -> list[Any]:

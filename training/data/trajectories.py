@@ -1,4 +1,4 @@
-"""What the optimizer trains on: stretches of the stored trajectories, with their loop candidates."""
+"""Stretches of stored trajectories with their loop candidates, for smoother and optimizer."""
 
 import contextlib
 import dataclasses
@@ -15,18 +15,16 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.compass_closure import CompassFixes, compass_fixes, frames_to_read
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.registered_odometry import registered_steps
-from training.data.streams import ALL, Batch, Share
-from training.featurise import open_store
+from training.data.batches import ALL, Batch, Share
+from training.data.feature_store import open_store
 
 _LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
 _TOGETHER = 8  # trajectories that are searched for loops, or measured, at once
 _FEWEST_BATCHES = 8  # of an epoch
 _STEPWISE = ("relative", "log_std", "motion", "truth")
 _REGISTERED = ("relative", "log_std")
-_COMPASS = ("compass", "compass_log_scale")
 _RANGES = "ranges"
 
 
@@ -36,25 +34,17 @@ class StoredTrajectories:
     The candidates do not depend on what is trained: they are found once, and kept in ``STORE/loops/``.
     """
 
-    def __init__(
-        self,
-        stores: list[Path],
-        search: LoopSearch | None,
-        pair_head: PairHead,
-        block: int,
-        with_compass: bool = False,
-    ) -> None:
+    def __init__(self, stores: list[Path], search: LoopSearch | None, pair_head: PairHead, block: int) -> None:
         self.parts = []
         for store in stores:
-            arrays = open_store(store, with_compass)
+            arrays = open_store(store)
             found = {} if search is None else found_loops(store, arrays, search, pair_head, block)
             odometry = {"odometry": arrays["relative"]}
             arrays = {**arrays, **{name: found.pop(name) for name in _REGISTERED if name in found}}
-            compass = {name: arrays[name] for name in _COMPASS} if with_compass else {}
             codes = {"codes": arrays["codes"]} if search is not None and search.overlaps else {}
-            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **odometry, **compass, **codes})
+            self.parts.append({**{name: arrays[name] for name in _STEPWISE}, **found, **odometry, **codes})
         self._code_size = pair_head.config.code_size
-        self.block, self.with_compass = block, with_compass
+        self.block = block
         self.steps = min(part["relative"].shape[1] for part in self.parts) // block * block
         self.index = [(p, row) for p, part in enumerate(self.parts) for row in range(len(part["relative"]))]
 
@@ -86,11 +76,6 @@ class StoredTrajectories:
         if "codes" in arrays:
             ranges = arrays["codes"][row, start : start + length, self._code_size :]
             frames[_RANGES] = torch.from_numpy(ranges.astype(np.float32))
-        if _COMPASS[0] in arrays:
-            if start:
-                raise ValueError(f"a stretch begins at step {start}; expected 0, where a compass reads")
-            count = len(frames_to_read(length, self.block))
-            frames |= {name: torch.from_numpy(arrays[name][row, :count].copy()) for name in _COMPASS}
         return {**values, **frames, **_cropped(loops, start // self.block, length // self.block, self.block)}
 
 
@@ -99,14 +84,6 @@ def loops_of(batch: Batch, registration: RegistrationConfig | None = None) -> Lo
     fields = {name.removeprefix(_LOOP): value for name, value in batch.items() if name.startswith(_LOOP)}
     scans = None if registration is None or _RANGES not in batch else Scans(batch[_RANGES], registration)
     return Loops(**{**fields, "scans": scans}) if fields else None  # type: ignore[arg-type]
-
-
-def fixes_of(batch: Batch, block: int, block_m: float) -> CompassFixes | None:
-    """The compass readings in a batch, None without."""
-    if "compass" not in batch:
-        return None
-    readings = batch["compass"], batch["compass_log_scale"]
-    return compass_fixes(*readings, batch["relative"], batch["log_std"], block, block_m)
 
 
 def found_loops(
@@ -190,7 +167,6 @@ class RandomStretches(IterableDataset[Batch]):
             length = length // data.block * data.block
             chosen = np.sort(rng.choice(len(data), self.batch_size, replace=False))
             start = int(rng.integers(0, (data.steps - length) // data.block + 1)) * data.block
-            start = 0 if data.with_compass else start
             yield data.batch(chosen.tolist(), start, length)
 
 

@@ -1,29 +1,25 @@
-"""The simulated worlds as training data: which mazes, which seeds, which driver.
+"""The simulated worlds as training data: their mazes, seeds and drivers.
 
-The simulators are loaded where an environment is made: training on recordings does without them.
+The simulators are imported where an environment is made: training on recordings works without them.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
-from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
-from training.data.looks import TRAINING_LOOKS, Looks, LooksName, check_looks
 
 if TYPE_CHECKING:
     import gymnasium
 
 WorldName = Literal["maze2d", "maze3d", "scan"]
 
-# A maze is a function of its seed and size: these ranges never meet (tests/unit/training/test_worlds.py).
+# A maze is a function of its seed and size: these ranges never meet (tests/unit/training/data/test_worlds.py).
 TEST_SEEDS = range(0, 1_000)
 VALIDATION_SEEDS = range(1_000, 2_000)
 DEMO_SEEDS = range(2_000, 3_000)
@@ -70,35 +66,28 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class World(Domain):
-    """A simulated world.
-
-    ``driver`` drives wherever no other is named, ``training_drivers`` take turns in the streams of training data, from
-    which all but smoother and optimizer learn (none: ``driver``). These two learn from trajectories of ``driver``, and
-    the optimizer from one more of ``optimizer_driver`` (None: nobody) for every five of them. ``block_m`` is the
-    corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and ``extra_openings`` the
-    ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of trajectories that
-    results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how many steps their
-    errors are given. ``simulator`` holds its settings that are not its own defaults. ``looks`` is what ``make_random``
-    draws beside a size, None: nothing, the simulator's own looks. ``error_windows`` says over how many consecutive
-    steps errors of odometry are added up in training: beside those of single steps, these drift. No driver here drives
-    backwards, whether the world ``reverses`` or not.
-    """
+    """A simulated world. No driver here drives backwards, whether the world ``reverses`` or not."""
 
     driver: str
+    """Name of the driver wherever no other is named; smoother and optimizer learn from its trajectories."""
     training_drivers: tuple[str, ...] = ()
+    """Drivers that take turns in the streams, from which all other networks learn; none: ``driver``."""
     optimizer_driver: str | None = None
+    """Driver of one more trajectory for every five of ``driver``, for the optimizer alone; None: nobody."""
     episode_frames: int
+    """Length of the paper's trajectories."""
     rows: tuple[int, int]
+    """Range of the rows of training mazes, both ends included."""
     extra_openings: tuple[int, int]
+    """Range of the extra openings of training mazes, both ends included."""
     tables: dict[str, Table]
+    """The tables of results."""
     table_trajectories: int = 64
+    """Trajectories of a table."""
     prefixes: tuple[int, ...] = (250, 500, 750, 1000)
-    looks: Looks | None = None
+    """Numbers of steps after which a table gives errors."""
     error_windows: tuple[int, ...] = (1,)
-    simulator: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_looks(self.name, self.looks)
+    """Lengths of the windows of steps over which losses sum errors: errors that last make the sum drift."""
 
     @property
     def stream_drivers(self) -> tuple[str, ...]:
@@ -107,7 +96,7 @@ class World(Domain):
 
     @property
     def stream_settings(self) -> dict[str, Any]:
-        """What a training on a stream depends on beside its arguments, for its record."""
+        """Settings of the world that a training on a stream depends on, for its record."""
         return {"training_drivers": list(self.stream_drivers)}
 
     @property
@@ -123,11 +112,9 @@ class World(Domain):
     def validation_stores(self) -> tuple[str, ...]:
         return tuple(f"validation_{table}" for table in self.unseen_tables)
 
-    def make(
-        self, rows: int | None = None, extra_openings: int | None = None, look: Mapping[str, Any] | None = None
-    ) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of this size and look (``Looks.draw``), by default the simulator's own."""
-        changes: dict[str, Any] = {**self.simulator, **(look or {})}
+    def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
+        """An environment with mazes of this size, by default the simulator's own."""
+        changes: dict[str, Any] = {}
         if rows is not None:
             changes.update(rows=rows, cols=rows)
         if extra_openings is not None:
@@ -143,34 +130,6 @@ class World(Domain):
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
         return Maze3D(Maze3DConfig(**changes))
-
-    def with_corridors(self, block_m: float) -> World:
-        """The world with corridors of this width, m."""
-        return dataclasses.replace(self, block_m=block_m, simulator={**self.simulator, "block_m": block_m})
-
-    def with_pictures(self, height: int) -> World:
-        """The 3D world in pictures of another height: larger ones are simulated, smaller ones means of its own pixels.
-
-        Raises ``ValueError`` in another world, or for a height that is no whole part of the world's own; the simulator
-        refuses larger ones that it cannot make.
-        """
-        own = self.image
-        if self.name != "maze3d":
-            raise ValueError(f"pictures of height {height} are asked of {self.name}; expected maze3d")
-        if height > own.height:
-            width = height * own.width // own.height
-            larger = ImageFormat(height, width, own.channels, own.dtype)
-            return dataclasses.replace(
-                self, image=larger, simulator={**self.simulator, "width": width, "height": height}
-            )
-        if height < 1 or own.height % height or own.width % (own.height // height):
-            raise ValueError(
-                f"height of pictures is {height}; expected a whole part of {own.height} that leaves one of the width of"
-                f" {own.width}, or more than that"
-            )
-        factor = own.height // height
-        smaller = ImageFormat(height, own.width // factor, own.channels, own.dtype, reduction=factor)
-        return dataclasses.replace(self, image=smaller)
 
     def table_seeds(self, table: str, split: str) -> range:
         """Seeds of a table's episodes in the ``validation`` or ``test`` split."""
@@ -199,16 +158,12 @@ class World(Domain):
         return self.tables[table].driver or self.driver
 
     def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of ``size``, a random size and number of openings where that has None.
-
-        Where the world has ``looks``, one of these is drawn after the size.
-        """
+        """An environment with mazes of ``size``; a random size and number of openings where that has None."""
         rows = int(rng.integers(self.rows[0], self.rows[1] + 1))
         openings = int(rng.integers(self.extra_openings[0], self.extra_openings[1] + 1))
         return self.make(
             rows if size.rows is None else size.rows,
             openings if size.extra_openings is None else size.extra_openings,
-            None if self.looks is None else self.looks.draw(rng),
         )
 
 
@@ -297,9 +252,3 @@ def world_named(name: str) -> World:
     if name not in WORLDS:
         raise ValueError(f"world is {name!r}; expected one of {', '.join(WORLDS)}")
     return WORLDS[name]
-
-
-def world_looking(name: str, looks: LooksName | None) -> World:
-    """The world called ``name``, with the looks of a training that have this name; None: its own."""
-    world = world_named(name)
-    return world if looks is None else dataclasses.replace(world, looks=TRAINING_LOOKS[looks])

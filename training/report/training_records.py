@@ -1,4 +1,4 @@
-"""What is known of the trainings behind the results: from the JSON beside the weights, and from the learning curves."""
+"""Records and learning curves of the trainings behind the results."""
 
 import csv
 from pathlib import Path
@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER, load_description
-from ngo_estimator.networks.compass import COMPASS
 from training.baselines.deepvo import DEEPVO
 from training.scoring.table_rows import ROWS, Sources, rows_of, trainings_of
 
@@ -20,9 +19,6 @@ def trainings_json(sources: Sources, seeds: int) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for kind in (LOCAL, PLACE, *((SMOOTHER,) if sources.world.smoothing else ())):
         result[kind] = _kept(load_description(sources.networks / f"{kind}.safetensors", kind, name))
-    if sources.has_compass:
-        path = sources.compass_weights / name / f"{COMPASS}.safetensors"
-        result[COMPASS] = _kept(load_description(path, COMPASS, name))
     for row in rows_of(sources.world):
         for seed in range(trainings_of(row, seeds)):
             network = ROWS[row].odometry or OPTIMIZER
@@ -44,7 +40,7 @@ def run_folder(sources: Sources, row: str, seed: int) -> Path:
         return folder / f"{row}-seed{seed}"
     if kind.odometry is not None:
         return folder / (DEEPVO if kind.odometry == DEEPVO else "local-no_action")
-    return folder / f"optimizer-{kind.form}{'-compass' if kind.compass else ''}-{kind.iterations}-seed{seed}"
+    return folder / f"optimizer-{kind.form}-{kind.iterations}-seed{seed}"
 
 
 def learning_curve(run: Path) -> dict[str, np.ndarray]:

@@ -16,11 +16,11 @@ from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from training.baselines.graph_settings import load_settings
 from training.baselines.loop_factors import LoopFactors, smoothed_odometry
 from training.baselines.pose_graph import PoseGraphSettings
 from training.scoring.row_estimators import Arrays, Estimator, estimators, optimized_by, pose_graph
 from training.scoring.table_rows import Sources
-from training.tune_pose_graph import load_settings
 
 LIMITED_WORLDS = ("maze3d",)
 """Worlds whose results say what limits them."""
@@ -64,7 +64,7 @@ def limit_estimator(name: str, sources: Sources) -> Estimator:
     """The estimator of a row of ``LIMITS``; of optimizers that of the first training seed."""
     limit = LIMITS[name]
     (base, *_) = estimators(limit.row, 1, sources)
-    pair_head, block_m = load_place(sources.networks, sources.world.name)[0].pair_head, sources.world.block_m
+    pair_head = load_place(sources.networks, sources.world.name)[0].pair_head
     if limit.row == "gtsam":
         settings = _untouched(load_settings(sources.settings_file()), limit)
         block = settings.block
@@ -74,13 +74,13 @@ def limit_estimator(name: str, sources: Sources) -> Estimator:
 
         if limit.exact_loops or limit.right_loops:
             settings = replace(settings, kernel="none")
-            poses = pose_graph("gtsam", settings, pair_head, block_m, known)
+            poses = pose_graph("gtsam", settings, pair_head, known)
         else:
-            poses = pose_graph("gtsam", settings, pair_head, block_m)
+            poses = pose_graph("gtsam", settings, pair_head)
     else:
         trained, _ = load_optimizer(sources.row_folder(limit.row, 0), sources.world.name)
         optimizer, smooth = apart(trained)
-        corrected = optimized_by(optimizer, pair_head, block_m, known=exact_loops if limit.exact_loops else None)
+        corrected = optimized_by(optimizer, pair_head, known=exact_loops if limit.exact_loops else None)
         # What is true stays so: it is told after the odometry was smoothed.
         return Estimator(lambda arrays: corrected(told(smooth(arrays), limit)), f"{name} {base.identity}")
     return Estimator(lambda arrays: poses(told(arrays, limit)), f"{name} {base.identity}")

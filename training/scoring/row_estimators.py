@@ -1,4 +1,4 @@
-"""What makes trajectories out of features, for every row of the tables of results."""
+"""The estimators of the rows of the tables: from features to trajectories."""
 
 import dataclasses
 import json
@@ -17,23 +17,20 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.compass_closure import CompassFixes, compass_fixes, frames_to_read
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines import loop_factors
-from training.baselines.compass_factors import found_fixes
+from training.baselines.graph_settings import REGISTRATIONS, fit_calibration, load_settings
 from training.baselines.loop_factors import LoopFactors, MoreLoops, Seen
 from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
-from training.featurise import open_store
+from training.data.feature_store import open_store
 from training.scoring.table_rows import ROWS, Sources
-from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
 
 Arrays = dict[str, np.ndarray]
-"""Arrays of a feature store ``(trajectories, steps, ...)``; readings of a compass are of ``frames_to_read``."""
+"""Arrays of a feature store ``(trajectories, steps, ...)``."""
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
-COMPASS_ARRAYS = ("compass", "compass_log_scale")
 _BLOCK = PoseAggregationConfig(1).block
 _TOGETHER = 8  # trajectories that are optimised at once
 
@@ -82,16 +79,15 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
         identity += f" {smooths['sha256']}"
         if row == "smoothed":
             return [Estimator(partial(smoothed, smoother), identity)]
-    form = "compass" if kind.compass else "registered" if kind.registered else "smoothed" if kind.smoothed else "loops"
+    form = "registered" if kind.registered else "smoothed" if kind.smoothed else "loops"
     settings = load_settings(sources.settings_file(form))
-    poses = pose_graph(row, settings, place.pair_head, sources.world.block_m, smoother=smoother)
+    poses = pose_graph(row, settings, place.pair_head, smoother=smoother)
     return [Estimator(poses, f"{identity} {json.dumps(dataclasses.asdict(settings))}")]
 
 
 def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
-    """What there was after so many steps; the first frame's place code stays."""
-    read = len(frames_to_read(steps, _BLOCK))
-    return {name: array[:, : read if name in COMPASS_ARRAYS else steps] for name, array in arrays.items()}
+    """The arrays after this number of steps; the first frame's place code stays."""
+    return {name: array[:, :steps] for name, array in arrays.items()}
 
 
 def local(arrays: Arrays) -> np.ndarray:
@@ -114,7 +110,7 @@ def smoothed(smoother: OdometrySmoother, arrays: Arrays) -> np.ndarray:
 
 
 def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
-    """What loops are found in, with the odometry of the arrays, or another one."""
+    """Inputs of the search for loops, with the odometry of the arrays or another one."""
     steps = arrays["relative"] if relative is None else relative
     return Seen(steps, arrays["log_std"], arrays["codes"], arrays["origin_code"])
 
@@ -146,19 +142,18 @@ def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None
             f"{optimizer_folder} has another smoother than the one in {sources.networks}; remove it to make it anew"
         )
     identity = f"{trained['sha256']} {description['sha256']} {place.config.registration}"
-    return Estimator(optimized_by(optimizer, place.pair_head, sources.world.block_m, prepared), identity)
+    return Estimator(optimized_by(optimizer, place.pair_head, prepared), identity)
 
 
 def optimized_by(
     optimizer: NeuralGraphOptimizer,
     pair_head: PairHead,
-    block_m: float,
     prepared: Prepared | None = None,
     known: Callable[[Loops, Tensor, int], Loops] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """What ``optimize_offline`` does, for many trajectories at once.
+    """``optimize_offline`` for many trajectories at once.
 
-    ``block_m`` is the side of a compass's lattice. ``prepared`` is of the same trajectories and the same pair head.
+    ``prepared`` is of the same trajectories and the same pair head.
     ``known`` makes other loops of those that are found, the true poses and the steps in a meta-pose.
     """
 
@@ -184,11 +179,7 @@ def optimized_by(
             odometry, loops = odometry_and_loops(first, whole)
             if loops is not None and known is not None:
                 loops = known(loops, whole["truth"], optimizer.block)
-            fixes = None
-            if optimizer.config.compass:
-                reading, scale = (whole[name] for name in COMPASS_ARRAYS)
-                fixes = compass_fixes(reading, scale, *odometry, optimizer.block, block_m)
-            result = optimizer(*odometry, whole["motion"], loops, fixes)
+            result = optimizer(*odometry, whole["motion"], loops)
             parts.append(_with_tail(result.poses.double(), some["relative"].double()))
         return torch.cat(parts).numpy()
 
@@ -199,11 +190,10 @@ def pose_graph(
     row: str,
     settings: PoseGraphSettings,
     pair_head: PairHead,
-    block_m: float,
     known: Callable[[LoopFactors, np.ndarray], LoopFactors] | None = None,
     smoother: OdometrySmoother | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """The classical rows: GTSAM with the loops that are found (and a compass), or with those that are known.
+    """The classical rows: GTSAM with the loops that are found, or with those that are known.
 
     ``known`` makes other loops of those of a trajectory and its true poses, ``smoother`` the odometry of a row that
     takes it smoothed.
@@ -231,18 +221,14 @@ def pose_graph(
                 loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
             if known is not None:
                 loops = [known(found, true) for found, true in zip(loops, truth, strict=True)]
-            fixes: Sequence[CompassFixes | None] = [None] * len(truth)
-            if ROWS[row].compass:
-                reading, scale = (whole[name] for name in COMPASS_ARRAYS)
-                fixes = found_fixes(reading, scale, seen.relative, whole["log_std"], settings.block, block_m)
             more: Sequence[MoreLoops | None] = [None] * len(truth)
             if settings.search.overlaps and row != "true_pairs":
                 moved = settings.calibrated(steps[0])
                 more = loop_factors.overlaps_of(pair_head, whole["codes"], moved, settings.search, settings.block)
             if known is not None:
                 more = [of and _known(of, known, true) for of, true in zip(more, truth, strict=True)]
-            added = zip(odometry, loops, fixes, more, strict=True)
-            solved = [optimize(*one, found, settings, fix, of) for one, found, fix, of in added]
+            added = zip(odometry, loops, more, strict=True)
+            solved = [optimize(*one, found, settings, of) for one, found, of in added]
         left = torch.from_numpy(settings.calibrated(arrays["relative"]))
         return _with_tail(torch.from_numpy(np.stack(solved)), left).numpy()
 

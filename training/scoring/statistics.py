@@ -18,11 +18,6 @@ class Interval:
     low: float
     high: float
 
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the whole interval lies on one side of zero."""
-        return self.low > 0.0 or self.high < 0.0
-
     def as_json(self) -> dict[str, object]:
         """``{mean, ci95: [low, high]}``."""
         return {"mean": self.mean, "ci95": [self.low, self.high]}

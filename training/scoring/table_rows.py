@@ -1,11 +1,10 @@
-"""The rows of the tables of results, and where what they need lies."""
+"""The rows of the tables of results, and the places of their networks, features and settings."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from ngo_estimator.checkpoint import LOCAL
-from ngo_estimator.networks.compass import COMPASS
 from training.baselines.deepvo import DEEPVO
 from training.data.worlds import World
 
@@ -14,28 +13,21 @@ from training.data.worlds import World
 class Row:
     """A row of a table: what it is in words, and how it comes about.
 
-    ``form``, ``iterations`` and ``learning_rate`` (None: the script's own) are what is trained for it, with several
-    seeds. With ``compass`` it takes the readings of a compass. With ``own_networks`` all its networks are its own, and
-    so are its features. ``registered`` is what takes the odometry that was registered again, without our optimizer, and
-    ``smoothed`` what takes the odometry as our optimizer smooths it.
-    ``odometry`` is the kind of a network of its own whose relative poses are all there is to it. ``worlds`` have the
-    row; none: all of them.
+    ``form`` and ``iterations`` describe the optimizer that is trained for the row, with several seeds. With
+    ``own_networks`` the row has networks and features of its own. ``registered`` rows take the odometry after its
+    steps were registered again, ``smoothed`` rows take it as our optimizer smooths it; neither uses our optimizer.
+    ``odometry`` is the kind of network of a row that is odometry alone. ``worlds`` have the row; none: all of them.
     """
 
     title: str
     form: Literal["loops", "gauss_newton", "paper"] | None = None
     iterations: int = 0
-    compass: bool = False
-    learning_rate: float | None = None
     own_networks: bool = False
     registered: bool = False
     smoothed: bool = False
     odometry: str | None = None
     worlds: tuple[str, ...] = ()
 
-
-COMPASS_WORLDS = ("maze2d",)
-"""Worlds with a lattice, in which a compass can be trained."""
 
 ROWS = {
     "local": Row("odometry of the local network"),
@@ -57,9 +49,6 @@ ROWS = {
     "gtsam_smoothed": Row("`gtsam` on the odometry of `smoothed`, with settings of its own", smoothed=True),
     "true_pairs": Row("GTSAM with true revisits, measured by our pair head"),
     "oracle": Row("GTSAM with true revisits, measured exactly"),
-    "ngo_1_compass": Row("`ngo_1` with a compass", "loops", 1, compass=True, learning_rate=1e-4, worlds=COMPASS_WORLDS),
-    "ngo_5_compass": Row("`ngo_5` with a compass", "loops", 5, compass=True, learning_rate=1e-4, worlds=COMPASS_WORLDS),
-    "gtsam_compass": Row("`gtsam` with a compass, tuned on validation", compass=True, worlds=COMPASS_WORLDS),
 }
 
 
@@ -85,25 +74,17 @@ class Sources:
     """Where networks, features and settings lie.
 
     ``weights`` holds ``WORLD/*.safetensors`` of the local network and the place encoder, ``runs`` holds
-    ``WORLD/features/`` and ``WORLD/rows/ROW-seedN/``, ``results`` holds ``WORLD.gtsam.json``. With ``has_compass`` the
-    features hold the readings of a compass.
+    ``WORLD/features/`` and ``WORLD/rows/ROW-seedN/``, ``results`` holds ``WORLD.gtsam.json``.
     """
 
     world: World
     weights: Path
     runs: Path
     results: Path
-    has_compass: bool = False
 
     @property
     def networks(self) -> Path:
         return self.weights / self.world.name
-
-    @property
-    def compass_weights(self) -> Path:
-        """The folder with ``WORLD/compass.safetensors``: no part of what the estimator's package ships."""
-        shipped = self.networks / f"{COMPASS}.safetensors"
-        return self.weights if shipped.exists() else self.runs / COMPASS
 
     def row_folder(self, row: str, seed: int) -> Path:
         """Folder of the weights that are trained for a row."""
@@ -123,6 +104,6 @@ class Sources:
         return self.runs / self.world.name / "results" / "throughput.json"
 
     def of_row(self, row: str, seed: int) -> "Sources":
-        """The same for a row that has networks and features of its own, and no compass."""
+        """The sources of a row with networks and features of its own."""
         folder = self.row_folder(row, seed)
-        return replace(self, weights=folder, runs=folder, has_compass=False)
+        return replace(self, weights=folder, runs=folder)

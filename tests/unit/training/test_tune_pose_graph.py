@@ -14,25 +14,15 @@ import torch
 from ngo_estimator.checkpoint import SMOOTHER, load_local, save_checkpoint
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.optimizer.compass_closure import frames_to_read
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.samples import small_pair_head
-from training.baselines.compass_factors import found_fixes
+from training.baselines.graph_settings import fit_calibration, load_settings
 from training.baselines.pose_graph import PoseGraphSettings
 from training.common.runs import WEIGHTS
 from training.data.worlds import world_named
-from training.report.prerequisites import is_tuned
+from training.prerequisites import is_tuned
 from training.scoring.table_rows import Sources
-from training.tune_pose_graph import (
-    COMPASS_GRID,
-    GRID,
-    Arguments,
-    Objective,
-    fit_calibration,
-    load_settings,
-    main,
-    tune,
-)
+from training.tune_pose_graph import GRID, Arguments, Objective, main, tune
 
 START = PoseGraphSettings(odometry_position_scale=1.0, loop_position_scale=1.0, kernel="dcs")
 
@@ -72,7 +62,7 @@ def test_what_is_no_gain_changes_nothing() -> None:
 
 
 def test_every_value_of_the_grids_makes_settings() -> None:
-    for group in (*GRID, *COMPASS_GRID):
+    for group in GRID:
         candidates = [replace(PoseGraphSettings(), **change) for change in group]
         assert len(set(candidates)) == len(group) > 1
 
@@ -108,37 +98,19 @@ def test_the_objective_is_the_mean_error_of_the_pose_graph() -> None:
     assert objective(calibrated) < 0.01 < objective(unbelieved)
 
 
-def test_the_objective_sees_the_compass() -> None:
-    arrays = drive(steps=40)  # in more of them the odometry turns an eighth of a circle too far
-    one = {name: array[:1] for name, array in arrays.items()}
-    frames = frames_to_read(40, 8)
-    readings = np.concatenate((np.zeros((1, 1, 3)), one["truth"]), axis=1)[:, frames]  # of a lattice at the origin
-    exact = found_fixes(readings, np.full((1, len(frames), 2), -6.0), one["relative"], one["log_std"], 8, 1.0)
-    unbelieved = replace(START, min_logit=1e9)
-    without, with_compass = Objective(one, small_pair_head()), Objective(one, small_pair_head(), exact)
-    assert with_compass(unbelieved) < 0.5 * without(unbelieved)
-
-
-def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_script_tunes_every_form_on_all_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("training.tune_pose_graph.GRID", GRID[3:4])
-    monkeypatch.setattr("training.tune_pose_graph.COMPASS_GRID", COMPASS_GRID[:1])
     steps = 64
-    frames = frames_to_read(steps, 8)
     for seed, table in enumerate(world_named("maze2d").tables):
         arrays = drive(steps=steps)
         arrays["codes"] = np.zeros((2, steps, 128 + 241), np.float16)  # scans in which nothing came back
         arrays["codes"][..., :128] = np.random.default_rng(seed).normal(0.0, 1.0, (2, steps, 128))
         arrays["origin_code"] = arrays["codes"][:, :1]
-        arrays["compass"] = np.concatenate((np.zeros((2, 1, 3)), arrays["truth"]), axis=1)[:, frames]
-        arrays["compass_log_scale"] = np.full((2, len(frames), 2), -6.0)
         store = tmp_path / "maze2d" / "features" / f"validation_{table}"
         store.mkdir(parents=True)
         for name, array in {**arrays, "motion": np.zeros((2, steps, 1))}.items():
             np.save(store / f"{name}.npy", array)
-        for name in ("done", "compass_done"):
-            (store / f"{name}.0of1.json").write_text("[0]")
+        (store / "done.0of1.json").write_text("[0]")
     arguments = Arguments("maze2d", passes=1, runs=tmp_path, out=tmp_path)
     best = main(arguments)
     written = json.loads((tmp_path / "maze2d.gtsam.json").read_text())
@@ -147,9 +119,6 @@ def test_the_script_tunes_on_all_tables_without_and_with_a_compass(
     assert written["validation"]["position_rmse_m"] < 0.1 * written["validation"]["odometry_position_rmse_m"]
     assert best.odometry_bias[2] == pytest.approx(-0.01, abs=1e-3)
     assert written["tuning"]["command"] == "python -m training.tune_pose_graph --world maze2d --passes 1"
-    with_compass = main(replace(arguments, form="compass"))
-    assert load_settings(tmp_path / "maze2d.gtsam_compass.json") == with_compass
-    assert with_compass.odometry_bias == best.odometry_bias
     registered = main(replace(arguments, form="registered"))
     assert load_settings(tmp_path / "maze2d.gtsam_registered.json") == registered
     assert registered.search.registrations == best.search.registrations > 0

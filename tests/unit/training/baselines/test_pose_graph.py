@@ -8,10 +8,7 @@ import pytest
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.lattice import reading_of
-from ngo_estimator.optimizer.compass_closure import CompassFixes, frames_to_read
 from ngo_estimator.optimizer.loop_closure import LoopSearch
-from training.baselines.compass_factors import found_fixes
 from training.baselines.loop_factors import LoopFactors, exact_revisits
 from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
 
@@ -150,41 +147,16 @@ def test_the_same_input_gives_the_same_output() -> None:
     np.testing.assert_array_equal(*results)
 
 
-def fixes_of(truth: np.ndarray, odometry: np.ndarray, lattice: list[float], block_m: float) -> CompassFixes:
-    """What a compass reads in a lattice of this pose: good to 1 cm and 0.6 degrees, or (a tenth) anything at all."""
-    rng = np.random.default_rng(3)
-    poses = torch.from_numpy(np.concatenate((np.zeros((1, 3)), truth)))[frames_to_read(len(truth), 8)]
-    exact = reading_of(se2.between(torch.tensor(lattice, dtype=torch.float64), poses), block_m).numpy()
-    wrong = rng.random(len(exact)) < 0.1
-    error = rng.laplace(0.0, 0.01, exact.shape)
-    error[wrong] = rng.uniform(-0.5, 0.5, (wrong.sum(), 3)) * [block_m, block_m, np.pi / 2.0]
-    log_scale = np.full((1, len(exact), 2), np.log(0.01))
-    return found_fixes((exact + error)[None], log_scale, odometry[None], stds(odometry, 0.01)[None], 8, block_m)[0]
-
-
-@pytest.mark.parametrize("lattice", [[0.0, 0.0, 0.0], [0.3, -0.2, 0.6], [0.1, 0.4, 2.2]])
-@pytest.mark.parametrize("block_m", [1.0, 1.5])
-def test_a_compass_takes_the_drift_away(lattice: list[float], block_m: float) -> None:
-    steps = laps(4)
-    truth = driven(steps)
-    odometry, log_std = noisy(steps, 0.01), stds(steps, 0.01)
-    compass = fixes_of(truth, odometry, lattice, block_m)
-    assert rmse(driven(odometry), truth) > 0.5
-    assert rmse(optimize(odometry, log_std, NO_LOOPS, replace(PLAIN, kernel="dcs"), compass), truth) < 0.06
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"odometry_position_scale": 0.0}, r"odometry_position_scale is 0\.0; expected a positive number"),
         ({"loop_heading_scale": -1.0}, "loop_heading_scale is -1"),
         ({"kernel_width": float("inf")}, "kernel_width is inf"),
-        ({"compass_kernel_width": float("nan")}, "compass_kernel_width is nan"),
         ({"kernel": "l2"}, "kernel is 'l2'; expected none or one of huber, cauchy, geman_mcclure, dcs"),
         ({"min_logit": float("nan")}, "min_logit is nan"),
         ({"odometry_gain": (1.0, 1.0)}, "odometry_gain is .* expected three finite numbers"),
         ({"odometry_bias": (0.0, 0.0, float("nan"))}, "odometry_bias is .* expected three finite numbers"),
-        ({"compass_rounds": 0}, "compass_rounds is 0; expected at least 1"),
         ({"block": 0}, "block is 0; expected at least 1"),
     ],
 )

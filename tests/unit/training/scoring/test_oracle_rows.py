@@ -59,7 +59,7 @@ def test_what_is_told_is_not_smoothed_any_more(pair_head: PairHead) -> None:
     bare, smooth = apart(optimizer)
     assert bare.config.smoother is None
     # In meta-poses the two are what the optimizer is; within these it spreads over the steps what smoothing changed.
-    whole, parts = optimized_by(optimizer, pair_head, 1.0)(some), optimized_by(bare, pair_head, 1.0)(smooth(some))
+    whole, parts = optimized_by(optimizer, pair_head)(some), optimized_by(bare, pair_head)(smooth(some))
     np.testing.assert_allclose(parts[:, BLOCK - 1 :: BLOCK], whole[:, BLOCK - 1 :: BLOCK], atol=0.05)
     true = told(smooth(some), Limit("", "ngo_5", headings=True, positions=True))
     steps = bare.aggregate(*(torch.from_numpy(true[name]).float() for name in ("relative", "log_std", "motion")))
@@ -80,8 +80,8 @@ def test_exact_loops_agree_with_the_true_poses(pair_head: PairHead) -> None:
     for k in range(3):
         expected = se2.between(nodes[k, found.start[k]], nodes[k, found.end[k] + 1])
         torch.testing.assert_close(exact.measured[k], expected.float(), atol=1e-5, rtol=1e-5)
-    poses = optimized_by(optimizer, pair_head, 1.0)(some)
-    informed = optimized_by(optimizer, pair_head, 1.0, known=exact_loops)(some)
+    poses = optimized_by(optimizer, pair_head)(some)
+    informed = optimized_by(optimizer, pair_head, known=exact_loops)(some)
     assert informed.shape == poses.shape and not np.allclose(informed, poses, atol=1e-4)
 
 
@@ -116,8 +116,8 @@ def test_wrong_loops_are_left_out() -> None:
 
 def test_the_classical_graph_takes_what_is_known(pair_head: PairHead) -> None:
     some, settings = arrays(), PoseGraphSettings(min_logit=-100.0, kernel="none")
-    exact = pose_graph("gtsam", settings, pair_head, 1.0, lambda found, true: exact_factors(found, true, BLOCK))(some)
-    plain = pose_graph("gtsam", settings, pair_head, 1.0)(some)
+    exact = pose_graph("gtsam", settings, pair_head, lambda found, true: exact_factors(found, true, BLOCK))(some)
+    plain = pose_graph("gtsam", settings, pair_head)(some)
     assert found_loops(pair_head, seen_in(some), settings.search)[0].start.size
 
     def error(poses: np.ndarray) -> float:

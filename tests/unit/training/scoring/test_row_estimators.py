@@ -12,7 +12,6 @@ from ngo_estimator.checkpoint import PLACE, SMOOTHER, PlaceNetworks, load_local,
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.online_trajectory import optimize_offline
-from ngo_estimator.optimizer.compass_closure import frames_to_read
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import (
     camera_pair_head,
@@ -59,10 +58,10 @@ def test_many_trajectories_come_out_as_single_ones(form: str, steps: int, pair_h
     optimizer = small_optimizer(form, trained=True)
     some = prefix(arrays(), steps)
     prepared: Prepared = {}
-    poses = optimized_by(optimizer, pair_head, 1.0, prepared)(some)
+    poses = optimized_by(optimizer, pair_head, prepared)(some)
     assert poses.shape == (3, steps, 3) and poses.dtype == np.float64
     assert len(prepared) == (form != "paper")
-    np.testing.assert_array_equal(optimized_by(optimizer, pair_head, 1.0, prepared)(some), poses)
+    np.testing.assert_array_equal(optimized_by(optimizer, pair_head, prepared)(some), poses)
     moved = np.abs(poses - local(some)).max()
     assert moved > 5e-3
     for k in range(3):
@@ -76,7 +75,7 @@ def test_many_trajectories_come_out_as_single_ones(form: str, steps: int, pair_h
 def test_the_classical_rows_keep_the_odometry_behind_the_last_whole_block(pair_head: PairHead) -> None:
     some = arrays()
     for row in ("gtsam", "true_pairs", "oracle"):
-        poses = pose_graph(row, PoseGraphSettings(), pair_head, 1.0)(some)
+        poses = pose_graph(row, PoseGraphSettings(), pair_head)(some)
         assert poses.shape == (3, STEPS, 3)
         steps = np.diff(poses[:, 95:, :2], axis=1)
         expected = np.diff(local(some)[:, 95:, :2], axis=1)
@@ -97,18 +96,16 @@ def test_a_calibration_is_a_gain_and_a_bias() -> None:
 
 
 def test_a_prefix_has_its_first_frame_and_nothing_that_follows() -> None:
-    frames = frames_to_read(100, 8).numpy()[None]
-    some = {"relative": np.arange(1, 101)[None], "compass": frames, "compass_log_scale": frames}
+    some = {"relative": np.arange(1, 101)[None], "origin_code": np.zeros((1, 1, 12))}
     for steps in (4, 30, 50, 100):
         seen = prefix(some, steps)
         assert seen["relative"].tolist() == [list(range(1, steps + 1))]
-        for name in ("compass", "compass_log_scale"):
-            assert seen[name].tolist() == [frames[frames <= steps].tolist()]
+        assert seen["origin_code"].shape == (1, 1, 12)
 
 
 def test_less_than_a_meta_pose_is_refused(pair_head: PairHead) -> None:
     with pytest.raises(ValueError, match="7 steps make no meta-pose; expected at least 8"):
-        optimized_by(small_optimizer("loops"), pair_head, 1.0)(prefix(arrays(), 7))
+        optimized_by(small_optimizer("loops"), pair_head)(prefix(arrays(), 7))
 
 
 def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
@@ -116,9 +113,7 @@ def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
         estimators("ngo_9", 1, Sources(world_named("maze2d"), tmp_path, tmp_path, tmp_path))
 
 
-def test_rows_with_a_compass_say_so() -> None:
-    for name, row in ROWS.items():
-        assert row.compass == ("compass" in name)
+def test_every_world_has_the_rows_that_are_no_worlds_own() -> None:
     for world in WORLDS.values():
         everywhere = {name for name, row in ROWS.items() if not (row.worlds or row.registered or row.smoothed)}
         assert everywhere <= set(rows_of(world))
@@ -133,7 +128,7 @@ def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
 def test_worlds_have_the_rows_that_are_theirs() -> None:
     in_2d, in_3d = (set(rows_of(WORLDS[name])) for name in ("maze2d", "maze3d"))
     assert in_3d - in_2d == {"local_no_action", "deepvo", "smoothed", "gtsam_smoothed"}
-    assert in_2d - in_3d == {name for name, row in ROWS.items() if row.compass or row.registered}
+    assert in_2d - in_3d == {name for name, row in ROWS.items() if row.registered}
 
 
 def test_what_is_smoothed_is_what_our_optimizer_takes(tmp_path: Path) -> None:
@@ -179,7 +174,7 @@ def test_what_is_registered_is_what_our_optimizer_takes() -> None:
     errors = [np.linalg.norm((p - truth)[0, :steps, :2], axis=1).max() for p in (poses, local(some))]
     assert errors[0] < 0.2 * errors[1]
     graphs = [
-        pose_graph(row, PoseGraphSettings(search=optimizer.config.search), head, 1.0)
+        pose_graph(row, PoseGraphSettings(search=optimizer.config.search), head)
         for row in ("gtsam", "gtsam_registered")
     ]
     without, with_registered = (np.linalg.norm((g(some) - truth)[0, :steps, :2], axis=1).max() for g in graphs)
@@ -205,9 +200,9 @@ def test_frames_that_share_walls_help_our_optimizer_and_the_classical_graph() ->
         )
         ours = small_optimizer("gauss_newton", iterations=5, search=search)
         for name, poses in (
-            ("ours", optimized_by(ours, head, 1.0)),
-            ("gtsam", pose_graph("gtsam", settings, head, 1.0)),
-            ("gtsam known", pose_graph("gtsam", dataclasses.replace(settings, kernel="none"), head, 1.0, exact)),
+            ("ours", optimized_by(ours, head)),
+            ("gtsam", pose_graph("gtsam", settings, head)),
+            ("gtsam known", pose_graph("gtsam", dataclasses.replace(settings, kernel="none"), head, exact)),
         ):
             errors[name, overlaps] = float(np.linalg.norm((poses(some) - truth)[..., :2], axis=-1).mean())
     for name in ("ours", "gtsam"):

@@ -1,6 +1,6 @@
-"""Everything that the tables of results need and that is missing: networks, features, settings and rows' weights.
+"""Make what the tables of results need and what is missing: networks, features, settings and weights of rows.
 
-What is there is left alone, and every script goes on where it was stopped, so this can be run again at any time.
+Existing files are left alone, and every command continues after a stop, so this can run again at any time.
 """
 
 import json
@@ -14,11 +14,9 @@ from typing import Any, NamedTuple
 import torch
 
 from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER, load_description
-from ngo_estimator.networks.compass import COMPASS
 from training import (
     featurise,
     throughput,
-    train_compass,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -28,10 +26,10 @@ from training import (
     tune_pose_graph,
 )
 from training.baselines.deepvo import DEEPVO
-from training.baselines.network_odometry import make_odometry, open_odometry
 from training.common.curves import write_at_once
 from training.data.data_source import TRAIN_STORE
-from training.featurise import open_store
+from training.data.feature_store import open_store
+from training.scoring.network_odometry import make_odometry, open_odometry
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
 
@@ -41,7 +39,6 @@ class Scripts:
 
     local: train_local.Arguments = field(default_factory=lambda: train_local.Arguments(world="maze2d"))
     place: train_place.Arguments = field(default_factory=lambda: train_place.Arguments(world="maze2d"))
-    compass: train_compass.Arguments = field(default_factory=lambda: train_compass.Arguments(world="maze2d"))
     features: featurise.Arguments = field(default_factory=lambda: featurise.Arguments(world="maze2d"))
     optimizer: train_optimizer.Arguments = field(default_factory=lambda: train_optimizer.Arguments(world="maze2d"))
     smoother: train_smoother.Arguments = field(default_factory=lambda: train_smoother.Arguments(world="maze3d"))
@@ -93,17 +90,6 @@ def _networks(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     place = replace(scripts.place, out=sources.weights, **common)
     yield Step("the local network", _exists(sources, LOCAL), lambda: train_local.main(local))
     yield Step("the place encoder", _exists(sources, PLACE), lambda: train_place.main(place))
-    if sources.has_compass:
-        weights = sources.compass_weights / sources.world.name / f"{COMPASS}.safetensors"
-        compass = replace(scripts.compass, **common)
-        yield Step("the compass", weights.exists, lambda: _compass(compass, weights.parent))
-
-
-def _compass(arguments: train_compass.Arguments, folder: Path) -> None:
-    train_compass.main(arguments)
-    folder.mkdir(parents=True, exist_ok=True)
-    for suffix in (".json", ".safetensors"):  # the description first: what is complete has both
-        shutil.copy(arguments.runs / arguments.world / COMPASS / f"{COMPASS}{suffix}", folder)
 
 
 _VALIDATION = "validation"
@@ -119,8 +105,7 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
             count = len(open_store(_store_folder(sources, TRAIN_STORE))["relative"])
         changes: dict[str, Any] = {name: count if name == _COUNTS[split] else 0 for name in _COUNTS.values()}
         changes["world"] = sources.world.name
-        compass = sources.compass_weights if sources.has_compass else None
-        arguments = replace(scripts.features, weights=sources.weights, out=sources.runs, compass=compass, **changes)
+        arguments = replace(scripts.features, weights=sources.weights, out=sources.runs, **changes)
         tables = [f"{split}_{table}" for table in sources.world.tables]
         for store in sources.world.optimizer_stores if split == TRAIN_STORE else tables:
             yield Step(f"the feature store {store}", _whole(sources, store), _call(featurise.main, arguments))
@@ -135,13 +120,12 @@ def _smoother(sources: Sources, scripts: Scripts) -> Iterator[Step]:
 
 def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-    known = {
+    needed = {
         "loops": True,
         "registered": sources.world.registers_odometry,
         "smoothed": sources.world.smoothing,
-        "compass": sources.has_compass,
     }
-    for form in (form for form in tune_pose_graph.FORMS if known[form]):
+    for form in (form for form in tune_pose_graph.FORMS if needed[form]):
         changes = {**common, "form": form}
         arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
         what = "tuning of the pose graph" + ("" if form == "loops" else f", {form}")
@@ -166,9 +150,7 @@ def _optimizers(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[
         row = ROWS[name]
         for seed in range(wanted.seeds if row.form is not None else 0):
             folder = sources.row_folder(name, seed)
-            changes: dict[str, Any] = {"world": sources.world.name, "form": row.form, "compass": row.compass}
-            if row.learning_rate is not None:
-                changes["learning_rate"] = row.learning_rate
+            changes: dict[str, Any] = {"world": sources.world.name, "form": row.form}
             arguments = replace(
                 scripts.optimizer,
                 iterations=row.iterations,
@@ -230,8 +212,8 @@ def _own_odometry(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterato
 
 def _speed(sources: Sources, scripts: Scripts) -> None:
     world: Any = sources.world.name
-    measured = throughput.main(replace(scripts.speed, world=world))
-    write_at_once(sources.speed_file, json.dumps(measured) + "\n")
+    speed = throughput.main(replace(scripts.speed, world=world))
+    write_at_once(sources.speed_file, json.dumps(speed) + "\n")
 
 
 def _call(main: Callable[[Any], object], arguments: Any) -> Callable[[], object]:
@@ -243,7 +225,7 @@ def _exists(sources: Sources, kind: str) -> Callable[[], bool]:
 
 
 def _whole(sources: Sources, store: str) -> Callable[[], bool]:
-    return _is_whole(partial(open_store, _store_folder(sources, store), sources.has_compass))
+    return _is_whole(partial(open_store, _store_folder(sources, store)))
 
 
 def _store_folder(sources: Sources, store: str) -> Path:
