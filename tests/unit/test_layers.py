@@ -21,7 +21,23 @@ ROS = ("rclpy", "builtin_interfaces", "ament_index_python", "rosidl_runtime_py",
 
 # A module may import, directly or through others, none of a later layer. A name is a folder or a module of the package.
 LAYERS = {
-    "ngo_recordings": [{"errors"}, {"definitions", "images", "poses"}, {"recording", "writer"}, {"topics"}, {"frames"}],
+    "ngo_recordings": [
+        {"errors"},
+        {
+            "bounds",
+            "carmen_lines",
+            "carmen_poses",
+            "carmen_stamps",
+            "definition_cost",
+            "definitions",
+            "images",
+            "poses",
+        },
+        {"recording", "writer"},
+        {"topics"},
+        {"frames", "mounting", "scan_stream"},
+        {"lidar_description"},
+    ],
     "ngo_sim": [{"mazes"}, {"drivers", "maze2d", "maze3d"}, {"driver_choice"}, {"episodes"}],
     "ngo_estimator": [
         {"geometry", "data"},

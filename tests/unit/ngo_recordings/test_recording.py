@@ -267,7 +267,8 @@ def test_a_folder_whose_recorder_was_killed_needs_no_metadata(tmp_path: Path) ->
         ("text.mcap", b"not a recording", "cannot be read as MCAP"),
         ("empty.mcap", b"", "cannot be read as MCAP"),
         ("text.db3", b"not a recording, but longer than a head of sqlite" * 9, "cannot be read as a rosbag2 recording"),
-        ("drive.bag", b"#ROSBAG V2.0", "is no recording: expected a .mcap or .db3 file"),
+        ("drive.bag", b"#ROSBAG V2.0", "cannot be read as a ROS 1 bag"),
+        ("drive.txt", b"#ROSBAG V2.0", "is no recording: expected a .mcap, .db3 or .bag file"),
     ],
 )
 def test_what_is_no_recording_is_refused_in_one_line(

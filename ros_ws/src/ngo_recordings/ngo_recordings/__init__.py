@@ -1,1 +1,1 @@
-"""Recordings of a robot: written as MCAP, read from MCAP and rosbag2. Nothing here needs ROS."""
+"""Recordings of a robot: MCAP is written; MCAP, rosbag2, ROS 1 bags and CARMEN logs are read, without ROS."""

@@ -7,6 +7,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from ngo_recordings.errors import RecordingError
 from ngo_recordings.poses import Pose, PoseTrack, TransformTree, make_pose
 from ngo_recordings.recording import Message
 
@@ -15,6 +16,8 @@ RESTART_NS = 1_000_000_000
 
 KEEP_NS = 5_000_000_000
 """How long side information is kept for images that are recorded later than it."""
+
+_END_OF_TIME_S = 2**32
 
 Value = TypeVar("Value")
 
@@ -278,9 +281,12 @@ class TrueTransforms:
 
 
 def header_stamp_ns(value: Any) -> int:
-    """Stamp of a message's header, ns."""
+    """Stamp of a message's header, ns. Raises RecordingError where it is before 1970 or no stamp at all."""
     stamp = value.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    sec, nanosec = int(stamp.sec), int(stamp.nanosec)
+    if not (0 <= sec < _END_OF_TIME_S and 0 <= nanosec < 2**32):
+        raise RecordingError(f"a stamp is {sec} s and {nanosec} ns; expected at least 0 s, and at most 32 bits of each")
+    return sec * 1_000_000_000 + nanosec
 
 
 def ros_pose(position: Any, orientation: Any) -> Pose | None:

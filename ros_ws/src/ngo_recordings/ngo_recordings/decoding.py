@@ -10,11 +10,15 @@ from typing import Any
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
+from ngo_recordings.carmen_log import ENCODING as OBJECTS
+from ngo_recordings.definition_cost import DefinitionCost
 from ngo_recordings.definitions import message_definition
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import Stored
+from ngo_recordings.ros1_bag import ENCODING as ROS1
 
 _SEPARATOR = "=" * 80 + "\n"
+_MAX_REASON = 300
 _BROKEN = (
     SerdeError,
     TypesysError,
@@ -23,6 +27,8 @@ _BROKEN = (
     AttributeError,
     LookupError,
     MemoryError,
+    RecursionError,
+    SyntaxError,
     TypeError,
     ValueError,
 )
@@ -37,25 +43,33 @@ class Decoder:
     def __init__(self, path: Path, topics: Mapping[str, Stored]) -> None:
         self._path = path
         self._topics = topics
-        self._typestores: dict[str, Any] = {}
+        self._typestores: dict[str, tuple[Any, DefinitionCost]] = {}
 
-    def decode(self, topic: str, log_time_ns: int, cdr: bytes) -> Any:
-        """The message as an object. Raises RecordingError where it is not what its definition says."""
-        type_name = self._topics[topic].type_name
+    def decode(self, topic: str, log_time_ns: int, data: Any) -> Any:
+        """The message as an object; data are its bytes, or the object where the file gives objects.
+
+        Raises RecordingError where it is not what its definition says.
+        """
+        type_name, encoding = self._topics[topic].type_name, self._topics[topic].encoding
+        if encoding == OBJECTS:
+            return data
         if type_name not in self._typestores:
             self._typestores[type_name] = self._typestore(self._topics[topic])
+        typestore, cost = self._typestores[type_name]
         try:
-            return self._typestores[type_name].deserialize_cdr(cdr, type_name)
+            cost.check(len(data))
+            read = typestore.deserialize_ros1 if encoding == ROS1 else typestore.deserialize_cdr
+            return read(data, type_name)
         except _BROKEN as error:
             raise RecordingError(
-                f"{self._path}: the message of {topic} at {log_time_ns / 1e9:.9f} s ({len(cdr)} bytes) cannot be read "
-                f"as {type_name} ({' '.join(str(error).split())}): leave out the topic, or record it again"
+                f"{self._path}: the message of {topic} at {log_time_ns / 1e9:.9f} s ({len(data)} bytes) cannot be read "
+                f"as {type_name} ({_reason(error)}): leave out the topic, or record it again"
             ) from None
 
-    def _typestore(self, stored: Stored) -> Any:
+    def _typestore(self, stored: Stored) -> tuple[Any, DefinitionCost]:
         """A store of its own for every type: another type may hold another version of what it is made of."""
         try:
-            if stored.encoding == "ros2msg":
+            if stored.encoding in ("ros2msg", ROS1):
                 types = get_types_from_msg(stored.definition, stored.type_name)
             elif stored.encoding in ("ros2idl", "omgidl"):
                 types = {}
@@ -66,7 +80,7 @@ class Decoder:
             elif stored.encoding == "":
                 jazzy = get_typestore(Stores.ROS2_JAZZY)
                 if stored.type_name in jazzy.fielddefs:
-                    return jazzy
+                    return jazzy, DefinitionCost(jazzy.fielddefs, stored.type_name)
                 types = get_types_from_msg(message_definition(stored.type_name), stored.type_name)
             else:
                 raise RecordingError(
@@ -74,11 +88,19 @@ class Decoder:
                     "or ros2idl"
                 )
             typestore = get_typestore(Stores.EMPTY)
+            # Before classes and code are made of it: a hostile definition makes too much of them.
+            cost = DefinitionCost({**typestore.fielddefs, **types}, stored.type_name)
             typestore.register(types)
         except RecordingError:
             raise
         except _BROKEN as error:
             raise RecordingError(
-                f"{self._path}: the definition of {stored.type_name} cannot be read ({' '.join(str(error).split())})"
+                f"{self._path}: the definition of {stored.type_name} cannot be read ({_reason(error)})"
             ) from None
-        return typestore
+        return typestore, cost
+
+
+def _reason(error: BaseException) -> str:
+    """One short line: the library quotes whole definitions."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= _MAX_REASON else f"{text[:_MAX_REASON]} ..."

@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ngo_recordings.bounds import check_regular
 from ngo_recordings.errors import RecordingError
 
 # Stamps that went through a text file come back rounded; so close they are the same.
 _SAME_NS = 1_000_000
+# Nanoseconds of a later stamp do not fit into 64 bits.
+_END_OF_TIME_S = 9.2e9
 
 
 @dataclass(frozen=True)
@@ -197,6 +200,7 @@ def read_tum(path: Path, gap_ns: int) -> PoseTrack:
 
     Raises RecordingError where it is not.
     """
+    check_regular(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty file is told below
@@ -205,6 +209,10 @@ def read_tum(path: Path, gap_ns: int) -> PoseTrack:
         raise RecordingError(f"{path} cannot be read as a TUM file: {' '.join(str(error).split())}") from None
     if not len(rows) or rows.shape[1] != 8:
         raise RecordingError(f"{path} has {len(rows)} rows of {rows.shape[1]} numbers; expected 8: t x y z qx qy qz qw")
+    stamps = rows[:, 0]
+    if not ((stamps >= 0.0) & (stamps < _END_OF_TIME_S)).all():  # NaN compares false
+        wrong = stamps[~((stamps >= 0.0) & (stamps < _END_OF_TIME_S))][0]
+        raise RecordingError(f"{path} has the stamp {wrong:g} s; expected seconds from 0 to {_END_OF_TIME_S:g}")
     track = PoseTrack(gap_ns)
     for stamp_s, *values in rows.tolist():
         pose = make_pose((values[0], values[1], values[2]), (values[3], values[4], values[5], values[6]))

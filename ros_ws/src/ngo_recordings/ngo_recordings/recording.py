@@ -1,4 +1,4 @@
-"""Reads recordings: MCAP files, finished or not, and rosbag2 folders, one or several as one stream of messages."""
+"""Reads recordings: MCAP files, rosbag2 folders, ROS 1 bags and CARMEN logs, one or several as one stream."""
 
 from __future__ import annotations
 
@@ -12,10 +12,18 @@ from typing import Any
 
 import yaml
 
+from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular
+from ngo_recordings.carmen_log import CarmenLog
 from ngo_recordings.decoding import Decoder
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import McapFile
+from ngo_recordings.ros1_bag import Ros1Bag
 from ngo_recordings.rosbag_folder import RosbagFolder
+
+Source = McapFile | RosbagFolder | Ros1Bag | CarmenLog
+
+_CARMEN = (".log", ".clf", ".log.gz", ".clf.gz")
+_KINDS = "a .mcap, .db3 or .bag file, a CARMEN log (.log, .clf, either with .gz), or the folder of a rosbag2"
 
 
 @dataclass(frozen=True)
@@ -41,13 +49,16 @@ class Recording:
     """One or several recordings as one, messages in order of log time. A context manager; made by open_recording.
 
     topics: what is in it, by name. unfinished: the files that have no end (their writer was killed), which are read to
-    their last whole chunk.
+    their last whole chunk or line. stamps_made: the files whose stamps were made from the order of their messages, for
+    they have none. notes: what a person should know about the files, one sentence each with the file's name.
     """
 
-    def __init__(self, sources: Sequence[McapFile | RosbagFolder]) -> None:
+    def __init__(self, sources: Sequence[Source]) -> None:
         self._sources = [(source, Decoder(source.path, source.topics)) for source in sources]
         self.paths = tuple(source.path for source in sources)
         self.unfinished = tuple(source.path for source in sources if source.unfinished)
+        self.stamps_made = tuple(source.path for source in sources if source.stamps_made)
+        self.notes = tuple(note for source in sources for note in source.notes)
         self.topics: dict[str, TopicInfo] = {}
         for name in sorted({name for source in sources for name in source.topics}):
             stored = [source.topics[name] for source in sources if name in source.topics]
@@ -94,18 +105,24 @@ class Recording:
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
 
-def open_recording(paths: Sequence[Path]) -> Recording:
-    """Open .mcap files and rosbag2 folders (mcap or sqlite3), several as one in order of log time.
+def open_recording(paths: Sequence[Path], max_chunk_bytes: int = MAX_CHUNK_BYTES) -> Recording:
+    """Open recordings, several as one in order of log time.
+
+    Taken are .mcap files, rosbag2 folders (mcap or sqlite3), ROS 1 bags (.bag) and CARMEN logs (.log, .clf, .log.gz,
+    .clf.gz).
+
+    Args:
+        max_chunk_bytes: largest chunk of MCAP files and ROS 1 bags that is unpacked; memory is up to six times this.
 
     Raises:
         RecordingError: there is no such file, or it is no recording.
     """
     if not paths:
-        raise RecordingError("no recording was given: name .mcap files or rosbag2 folders")
+        raise RecordingError(f"no recording was given: name {_KINDS}")
     with ExitStack() as opened:
-        sources: list[McapFile | RosbagFolder] = []
+        sources: list[Source] = []
         for path in paths:
-            for source in _open_sources(Path(path)):
+            for source in _open_sources(Path(path), max_chunk_bytes):
                 opened.callback(source.close)
                 sources.append(source)
         recording = Recording(sources)
@@ -113,20 +130,24 @@ def open_recording(paths: Sequence[Path]) -> Recording:
     return recording
 
 
-def _open_sources(path: Path) -> Iterator[McapFile | RosbagFolder]:
+def _open_sources(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
     if path.is_dir():
-        yield from _open_folder(path)
-    elif not path.exists():
-        raise RecordingError(f"there is no file {path}")
-    elif path.suffix == ".mcap":
-        yield McapFile(path)
+        yield from _open_folder(path, max_chunk_bytes)
+        return
+    check_regular(path)
+    if path.suffix == ".mcap":
+        yield McapFile(path, max_chunk_bytes)
     elif path.suffix == ".db3":
         yield RosbagFolder(path)
+    elif path.suffix == ".bag":
+        yield Ros1Bag(path, max_chunk_bytes)
+    elif path.name.lower().endswith(_CARMEN):
+        yield CarmenLog(path)
     else:
-        raise RecordingError(f"{path} is no recording: expected a .mcap or .db3 file, or the folder of a rosbag2")
+        raise RecordingError(f"{path} is no recording: expected {_KINDS}")
 
 
-def _open_folder(path: Path) -> Iterator[McapFile | RosbagFolder]:
+def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
     """A folder whose recorder was killed has no metadata.yaml, and then its files are taken as they are."""
     metadata = path / "metadata.yaml"
     if not metadata.exists():
@@ -134,26 +155,31 @@ def _open_folder(path: Path) -> Iterator[McapFile | RosbagFolder]:
         if not files:
             raise RecordingError(f"{path} is no recording: it has neither metadata.yaml nor .mcap or .db3 files")
         for file in files:
-            yield McapFile(file) if file.suffix == ".mcap" else RosbagFolder(file)
+            check_regular(file)
+            yield McapFile(file, max_chunk_bytes) if file.suffix == ".mcap" else RosbagFolder(file)
         return
+    check_regular(metadata)
     try:
         facts = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
         plain_mcap = facts["storage_identifier"] == "mcap" and not facts.get("compression_format")
         names = [Path(name).name for name in facts["relative_file_paths"]]
-    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, OSError):
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError):
         raise RecordingError(
             f"{metadata} is not what rosbag2 writes: make it anew with `ros2 bag reindex {path}`"
         ) from None
     if not plain_mcap:
+        for name in names:
+            if (path / name).exists():  # what is missing is told by the library
+                check_regular(path / name)
         yield RosbagFolder(path)
         return
     for name in names:
         if not (path / name).exists():
             raise RecordingError(f"{path} lacks {name}, which its metadata.yaml names: copy it, too")
-        yield McapFile(path / name)
+        yield McapFile(path / name, max_chunk_bytes)
 
 
-def _decoded(source: McapFile | RosbagFolder, decoder: Decoder, names: set[str]) -> Iterator[Message]:
+def _decoded(source: Source, decoder: Decoder, names: set[str]) -> Iterator[Message]:
     for topic, log_time_ns, data in source.messages(names & source.topics.keys()):
         yield Message(topic, log_time_ns, decoder.decode(topic, log_time_ns, data))
 

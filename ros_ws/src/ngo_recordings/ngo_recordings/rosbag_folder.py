@@ -27,6 +27,8 @@ class RosbagFolder:
     """
 
     unfinished = False
+    stamps_made = False
+    notes: tuple[str, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -19,6 +19,12 @@ POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 _NONE = "none"
+_BASE_FRAMES = ("base_link", "base_footprint", "base")
+_ODOMETRY_FRAME = "odom"
+_GLOBAL_FRAMES = ("map", "world", "earth")
+_WHEEL_NAMES = re.compile(r"wheel|(^|/)odom$", re.IGNORECASE)
+# How much of the transforms is looked through for odom -> base_link.
+_LOOK_NS = 10_000_000_000
 _TRUTH_NAMES = re.compile(r"ground_?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
 
 
@@ -45,10 +51,7 @@ class GroundTruth:
         Raises RecordingError for a tf: of another form.
         """
         if text.startswith("tf:"):
-            frames = [name.strip("/") for name in text.split(":")[1:]]
-            if len(frames) != 2 or not all(frames):
-                raise RecordingError(f"ground truth is {text!r}; expected tf:PARENT:CHILD, as in tf:map:base_link")
-            return cls(tf=(frames[0], frames[1]))
+            return cls(tf=_frames(text, "ground truth", "tf:map:base_link"))
         if text.endswith((".tum", ".txt")):
             return cls(tum=Path(text))
         return cls(topic=text)
@@ -57,6 +60,32 @@ class GroundTruth:
         if self.tf is not None:
             return f"tf:{self.tf[0]}:{self.tf[1]}"
         return str(self.topic if self.tum is None else self.tum)
+
+
+@dataclass(frozen=True)
+class WheelSource:
+    """Where the wheel odometry comes from: a topic of nav_msgs/Odometry, or the parent and child frame of a transform.
+
+    Exactly one of topic and tf is given. A pair of frames is looked up through the tree.
+    """
+
+    topic: str | None = None
+    tf: tuple[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.topic is None) == (self.tf is None):
+            raise RecordingError("wheel odometry is exactly one of a topic and two TF frames")
+
+    @classmethod
+    def parse(cls, text: str) -> WheelSource:
+        """From the command line: `tf:PARENT:CHILD`, or else a topic.
+
+        Raises RecordingError for a tf: of another form.
+        """
+        return cls(tf=_frames(text, "wheel odometry", "tf:odom:base_link")) if text.startswith("tf:") else cls(text)
+
+    def __str__(self) -> str:
+        return str(self.topic) if self.tf is None else f"tf:{self.tf[0]}:{self.tf[1]}"
 
 
 @dataclass(frozen=True)
@@ -79,6 +108,8 @@ class TopicArguments:
     """True poses are interpolated between two that are at most this far apart, s."""
     twist_tolerance_s: float = 0.5
     """How old a velocity may be that is used for a step during which none came, s."""
+    wheels: str | None = None
+    """Wheel odometry: a topic of Odometry, or tf:PARENT:CHILD; chosen for scans alone."""
 
     def __post_init__(self) -> None:
         _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
@@ -89,7 +120,7 @@ class RecordingTopics:
     """What is used for what; None: nothing. `choose_topics` makes one that fits the recording.
 
     image: Image, CompressedImage or LaserScan. depth: Image of depth, one more channel. action: DiscreteAction. twist:
-    Twist, TwistStamped or Odometry. The times are those of TopicArguments.
+    Twist, TwistStamped or Odometry. wheels: wheel odometry, for `scan_stream`. The times are those of TopicArguments.
     """
 
     image: str
@@ -100,6 +131,7 @@ class RecordingTopics:
     tolerance_s: float = 0.05
     interpolation_s: float = 0.25
     twist_tolerance_s: float = 0.5
+    wheels: WheelSource | None = None
 
     def __post_init__(self) -> None:
         _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
@@ -110,7 +142,9 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
 
     Not given, the image is the only colour or grey Image, else the only CompressedImage, else the only LaserScan; the
     action is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped;
-    the ground truth an Odometry or pose topic whose name says so. Nothing else is guessed.
+    the ground truth an Odometry or pose topic whose name says so. Where the image is a LaserScan, the wheels are the
+    only Odometry that is neither ground truth nor in a global frame (map, world); of several, the only one that is
+    called odom or wheel; and where there is none, the transform odom -> base_link. Nothing else is guessed.
 
     Raises:
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
@@ -123,15 +157,17 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
     twist = _given(recording, "twist", given.twist, TWIST_TYPES)
     if given.twist is None and action is None:
         twist = _only(_filled(recording, TWIST_TYPES[:2]))
+    truth = _choose_truth(recording, given.ground_truth)
     return RecordingTopics(
         image=image,
         depth=_given(recording, "depth", given.depth, (IMAGE_TYPE,)),
         action=action,
         twist=twist,
-        ground_truth=_choose_truth(recording, given.ground_truth),
+        ground_truth=truth,
         tolerance_s=given.tolerance_s,
         interpolation_s=given.interpolation_s,
         twist_tolerance_s=given.twist_tolerance_s,
+        wheels=_choose_wheels(recording, given.wheels, image, truth),
     )
 
 
@@ -183,6 +219,61 @@ def _choose_truth(recording: Recording, given: str | None) -> GroundTruth | None
     if truth.tum is not None and not truth.tum.is_file():
         raise RecordingError(f"there is no file {truth.tum} for the ground truth")
     return truth
+
+
+def _choose_wheels(
+    recording: Recording, given: str | None, image: str, truth: GroundTruth | None
+) -> WheelSource | None:
+    if given == _NONE:
+        return None
+    if given is not None:
+        wheels = WheelSource.parse(given)
+        if wheels.topic is not None:
+            wheels = WheelSource(_given(recording, "wheels", wheels.topic, (ODOMETRY_TYPE,)))
+        elif not _filled(recording, (TF_TYPE,)):
+            raise RecordingError(f"wheel odometry is {wheels}, and no topic holds transforms ({TF_TYPE})")
+        if truth is not None and str(wheels) == str(truth):
+            raise RecordingError(f"wheel odometry and ground truth are both {wheels}: name another, or {_NONE}")
+        return wheels
+    if recording.topics[image].type_name != SCAN_TYPE:
+        return None
+    named = [
+        name
+        for name in _filled(recording, (ODOMETRY_TYPE,))
+        if not _TRUTH_NAMES.search(name) and (truth is None or name != truth.topic)
+    ]
+    local = [name for name in named if _odometry_frame(recording, name) not in _GLOBAL_FRAMES]
+    if local:
+        found = _only(local) or _only(name for name in local if _WHEEL_NAMES.search(name))
+        return None if found is None else WheelSource(found)
+    return _choose_transform(recording, truth)
+
+
+def _odometry_frame(recording: Recording, name: str) -> str:
+    first = next(iter(recording.messages([name])))
+    return str(getattr(getattr(first.value, "header", None), "frame_id", "")).strip("/")
+
+
+def _choose_transform(recording: Recording, truth: GroundTruth | None) -> WheelSource | None:
+    """The transform odom -> base_link, if it comes within the first seconds."""
+    start_ns: int | None = None
+    for message in recording.messages([name for name in _filled(recording, (TF_TYPE,)) if not name.endswith("static")]):
+        start_ns = message.log_time_ns if start_ns is None else start_ns
+        if message.log_time_ns > start_ns + _LOOK_NS:
+            break
+        for each in getattr(message.value, "transforms", ()):
+            frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+            if frames[0] == _ODOMETRY_FRAME and frames[1] in _BASE_FRAMES:
+                return None if truth is not None and truth.tf == frames else WheelSource(tf=frames)
+    return None
+
+
+def _frames(text: str, use: str, example: str) -> tuple[str, str]:
+    """Parent and child of tf:PARENT:CHILD."""
+    frames = [name.strip("/") for name in text.split(":")[1:]]
+    if len(frames) != 2 or not all(frames):
+        raise RecordingError(f"{use} is {text!r}; expected tf:PARENT:CHILD, as in {example}")
+    return frames[0], frames[1]
 
 
 def _filled(recording: Recording, types: Collection[str]) -> list[str]:

@@ -117,9 +117,14 @@ class RecordingWriter:
         self._topics[topic] = _Topic(channel_id, type_name, qos)
 
     def write(self, topic: str, cdr: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> None:
-        """Write one serialised message of a topic that was announced; publish_time_ns: None is log_time_ns."""
+        """Write one serialised message of a topic that was announced; publish_time_ns: None is log_time_ns.
+
+        Raises RecordingError where a time is negative or does not fit into the file's 64 bits.
+        """
         entry = self._topics[topic]
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        if not (0 <= log_time_ns < 2**63 and 0 <= published_ns < 2**63):
+            raise RecordingError(f"a message of {topic} has the time {log_time_ns} ns; expected 0 to 2^63 ns")
         self._writer.add_message(entry.channel_id, log_time_ns, cdr, published_ns, sequence=entry.count)
         entry.count += 1
         self._first_ns, self._last_ns = min(self._first_ns, log_time_ns), max(self._last_ns, log_time_ns)

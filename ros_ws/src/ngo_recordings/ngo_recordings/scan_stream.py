@@ -1,0 +1,266 @@
+"""A recording as scans and wheel poses in order of time, for estimators that use both."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ngo_recordings.association import RESTART_NS, header_stamp_ns, ros_pose
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.images import SCAN_TYPE
+from ngo_recordings.poses import TransformTree
+from ngo_recordings.recording import Message, Recording
+from ngo_recordings.topics import TF_TYPE, RecordingTopics, WheelSource
+
+BAD_SCAN = "damaged scan"
+BAD_WHEELS = "wheel pose that is no number"
+
+# How late a message may be recorded after one with a later stamp, and still come in order.
+_WAIT_NS = 1_000_000_000
+# Between two moving transforms of a chain.
+_TF_GAP_NS = 500_000_000
+_FULL_TURN = 2.0 * math.pi
+# Rad; scanners have 50 times this, and a message with a finer one could cost its reader without bound.
+_LEAST_INCREMENT = 1e-5
+# Rays by which the ends of a scan may contradict its increment: some drivers count one ray more or less.
+_SLACK_RAYS = 1.5
+
+
+@dataclass(frozen=True)
+class LidarScan:
+    """A scan in the scanner's frame.
+
+    angle_min, angle_increment: of the rays in the message's order, counter-clockwise about the frame's z; the increment
+    is negative where rays run clockwise. ranges ``(rays,)``: float32, m, as recorded, so holes, NaN and values out of
+    range_min and range_max (m) are there. time_increment: from ray to ray, s, 0 where unknown.
+    """
+
+    stamp_ns: int
+    angle_min: float
+    angle_increment: float
+    ranges: np.ndarray
+    range_min: float
+    range_max: float
+    time_increment: float
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class WheelPose:
+    """Pose of the wheel odometry in its own frame, ``pose_xyyaw`` ``(3,)``: m, m, rad."""
+
+    stamp_ns: int
+    pose_xyyaw: np.ndarray
+
+
+@dataclass(frozen=True)
+class ScanAngles:
+    """The angles of a scan's rays, and a note where the message contradicts itself or is likely wrong.
+
+    likely_increment: what the increment probably is where the message's is doubtful, else None; it is not used unless
+    a caller gives it to `scan_stream`.
+    """
+
+    angle_min: float
+    angle_increment: float
+    note: str | None = None
+    likely_increment: float | None = None
+
+
+def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
+    """The angles of a LaserScan, by this rule.
+
+    The message's increment counts while ``angle_min + (n - 1) * increment`` is within 1.5 rays of angle_max. Otherwise,
+    and where it is 0 or no number, ``(angle_max - angle_min) / (n - 1)`` counts, if that is an increment. An increment
+    that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg)
+    contradicts nothing; it counts and is noted.
+
+    Raises:
+        RecordingError: neither gives angles within a full turn.
+    """
+    count = len(message.ranges)
+    low, high, increment = float(message.angle_min), float(message.angle_max), float(message.angle_increment)
+    if not count or not math.isfinite(low) or abs(low) > 2.0 * _FULL_TURN:
+        raise RecordingError(f"a scan of {topic} has {count} rays from {low:g} rad on; expected rays, and an angle")
+    implied = (high - low) / (count - 1) if count > 1 and math.isfinite(high) else 0.0
+    if not _spans(increment, count):
+        if not _spans(implied, count):
+            raise RecordingError(
+                f"a scan of {topic} has {count} rays {increment:g} rad apart from {low:g} to {high:g} rad; expected "
+                "angles within a full turn"
+            )
+        note = f"the increment of {topic} is {increment:g} rad: its ends count, {math.degrees(implied):.4f} deg"
+        return ScanAngles(low, implied, note)
+    apart = abs(low + (count - 1) * increment - high)
+    given_deg, implied_deg = math.degrees(increment), math.degrees(implied)
+    if count > 1 and apart > _SLACK_RAYS * abs(increment) and _spans(implied, count):
+        note = f"the increment of {topic} is {given_deg:.4f} deg and contradicts its ends: {implied_deg:.4f} deg counts"
+        return ScanAngles(low, implied, note)
+    if not math.isfinite(high) or (count > 1 and apart > 0.5 * abs(increment)):
+        note = f"angle_max of {topic} is {math.degrees(high):.2f} deg, not that of its last ray: the increment counts"
+        return ScanAngles(low, increment, note)
+    likely = math.copysign(abs(high - low) / count, increment)
+    if count > 1 and _is_round(likely) and not _is_round(increment):
+        note = (
+            f"{topic} has {count} rays over {math.degrees(abs(high - low)):.2f} deg, {given_deg:.4f} deg apart: likely "
+            f"are {math.degrees(likely):.4f} deg, and its field of view one ray less"
+        )
+        return ScanAngles(low, increment, note, likely)
+    return ScanAngles(low, increment)
+
+
+def scan_stream(
+    recording: Recording,
+    topics: RecordingTopics,
+    angle_increment: float | None = None,
+    skipped: Counter[str] | None = None,
+) -> Iterator[LidarScan | WheelPose]:
+    """Scans of topics.image and poses of topics.wheels in order of their stamps; at equal stamps wheels come first.
+
+    A message that was recorded up to 1 s after one with a later stamp comes at its place. Stamps that jump back by 1 s
+    begin anew, as a source that restarted does.
+
+    Args:
+        angle_increment: rad, instead of that of the messages; None: see `scan_angles`.
+        skipped: counts what gave no record, by the reason (BAD_SCAN, BAD_WHEELS). None: a damaged scan is an error, and
+            poses that are no numbers are left out.
+
+    Raises:
+        RecordingError: topics.image is no LaserScan, scans have no stamps, or one is damaged.
+    """
+    type_name = recording.topics[topics.image].type_name
+    if type_name != SCAN_TYPE:
+        raise RecordingError(f"topic {topics.image} is {type_name}; expected {SCAN_TYPE}")
+    if angle_increment is not None and not _spans(angle_increment, 1):
+        raise RecordingError(f"the increment is {angle_increment:g} rad; expected at least {_LEAST_INCREMENT:g} rad")
+    wheels = None if topics.wheels is None else _Wheels(recording, topics.wheels)
+    names = {topics.image, *(wheels.names if wheels is not None else ())}
+    lost: Counter[str] = Counter() if skipped is None else skipped
+    waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose]] = []
+    newest: dict[bool, int] = {}
+    for order, message in enumerate(recording.messages(names)):
+        is_scan = message.topic == topics.image
+        try:
+            found: list[LidarScan | WheelPose] = (
+                [_scan(message, angle_increment)] if is_scan else list(wheels.read(message, lost) if wheels else ())
+            )
+        except AttributeError as error:
+            raise RecordingError(f"a message of {message.topic} is not what its type should be ({error})") from None
+        except RecordingError:
+            if skipped is None:
+                raise
+            lost[BAD_SCAN if is_scan else BAD_WHEELS] += 1
+            continue
+        for record in found:
+            before = newest.get(is_scan)
+            if is_scan and record.stamp_ns == 0 and before == 0:
+                raise RecordingError(f"scans of {topics.image} have no stamps (all are 0): the driver must stamp them")
+            if before is not None and record.stamp_ns <= before - RESTART_NS:
+                while waiting:
+                    yield heapq.heappop(waiting)[-1]
+                newest.clear()
+            newest[is_scan] = max(record.stamp_ns, newest.get(is_scan, 0))
+            heapq.heappush(waiting, (record.stamp_ns, is_scan, order, message.log_time_ns, record))
+        while waiting and message.log_time_ns - waiting[0][3] > _WAIT_NS:
+            yield heapq.heappop(waiting)[-1]
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
+
+
+class _Wheels:
+    """Wheel poses of messages."""
+
+    def __init__(self, recording: Recording, source: WheelSource) -> None:
+        self._tf = source.tf
+        self._tree = TransformTree(_TF_GAP_NS)
+        self._last_ns = -1
+        self.names = (
+            (str(source.topic),)
+            if source.tf is None
+            else tuple(name for name, info in recording.topics.items() if info.type_name == TF_TYPE and info.count)
+        )
+
+    def read(self, message: Message, lost: Counter[str]) -> Iterator[WheelPose]:
+        if self._tf is None:
+            value = message.value
+            pose = _planar(value.pose.pose.position, value.pose.pose.orientation)
+            if pose is None:
+                lost[BAD_WHEELS] += 1
+            else:
+                yield WheelPose(header_stamp_ns(value), pose)
+            return
+        for each in message.value.transforms:
+            yield from self._transform(each, self._tf, message.topic.endswith("static"), lost)
+
+    def _transform(self, each: Any, tf: tuple[str, str], static: bool, lost: Counter[str]) -> Iterator[WheelPose]:
+        frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+        stamp_ns = header_stamp_ns(each)
+        if frames == tf:  # the usual case, without a tree
+            pose = _planar(each.transform.translation, each.transform.rotation)
+            if pose is None:
+                lost[BAD_WHEELS] += 1
+            elif not static:
+                yield WheelPose(stamp_ns, pose)
+            return
+        step = ros_pose(each.transform.translation, each.transform.rotation)
+        if step is None:
+            return
+        self._tree.add(*frames, stamp_ns, step, static)
+        if static:
+            return
+        self._tree.forget_before(stamp_ns - 10 * _TF_GAP_NS, frames[1])
+        # The chain is known up to the transform that lags most: one pose for each of its stamps.
+        known_ns = self._tree.known_until_ns(*tf)
+        if known_ns is None or not 0 <= known_ns < 2**63 - 1:
+            return
+        if known_ns <= self._last_ns - RESTART_NS:
+            self._tree.clear()
+            self._last_ns = -1
+            return
+        if known_ns > self._last_ns and (found := self._tree.lookup(*tf, known_ns)) is not None:
+            self._last_ns = known_ns
+            yield WheelPose(known_ns, found.planar()[0])
+
+
+def _scan(message: Message, angle_increment: float | None) -> LidarScan:
+    value = message.value
+    angles = scan_angles(value, message.topic)
+    time_increment = float(value.time_increment)
+    return LidarScan(
+        header_stamp_ns(value),
+        angles.angle_min,
+        angles.angle_increment if angle_increment is None else angle_increment,
+        np.asarray(value.ranges, np.float32),
+        float(value.range_min),
+        float(value.range_max),
+        time_increment if math.isfinite(time_increment) else 0.0,
+        str(value.header.frame_id).strip("/"),
+    )
+
+
+def _planar(position: Any, rotation: Any) -> np.ndarray | None:
+    """Position and the direction of x from above; None where they are no numbers."""
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    size = x * x + y * y + z * z + w * w
+    if not (math.isfinite(position.x) and math.isfinite(position.y) and 1e-12 < size < math.inf):
+        return None
+    yaw = math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return np.array([position.x, position.y, yaw])
+
+
+def _spans(increment: float, count: int) -> bool:
+    """Whether rays so far apart are an increment, within a full turn."""
+    return abs(increment) >= _LEAST_INCREMENT and abs(increment) * (count - 1) <= 1.01 * _FULL_TURN  # not NaN
+
+
+def _is_round(increment: float) -> bool:
+    """Whether an increment divides a degree, or is a multiple of a quarter of one, as scanners' are."""
+    degrees = abs(math.degrees(increment))
+    quarters, parts = degrees * 4.0, 1.0 / degrees
+    return any(value > 0.5 and abs(value - round(value)) < 1e-3 * value for value in (quarters, parts))

@@ -1,0 +1,298 @@
+"""Scans and wheel poses come in order; wheels, mounting and angles are found or doubted by the rules."""
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.lidar_description import describe_lidar
+from ngo_recordings.mounting import find_mounting
+from ngo_recordings.recording import open_recording
+from ngo_recordings.scan_stream import BAD_SCAN, BAD_WHEELS, LidarScan, WheelPose, scan_angles, scan_stream
+from ngo_recordings.topics import GroundTruth, RecordingTopics, TopicArguments, WheelSource, choose_topics
+
+from . import messages as m
+
+S = 10**9
+STILL = m.twist(0.0, 0.0, 0.0)
+WITH_WHEELS = RecordingTopics("/scan", wheels=WheelSource("/odom"))
+
+
+def stamp(k: float) -> int:
+    return 10 * S + round(k * S / 10)
+
+
+def scan(stamp_ns: int, frame: str = "laser", rays: int = 20, increment: float = 0.1) -> Any:
+    made = m.scan(stamp_ns, np.arange(1.0, 1.0 + rays), increment=increment)
+    made.header.frame_id = frame
+    return made
+
+
+def odometry(stamp_ns: int, x: float, y: float, yaw: float, frame: str = "odom") -> Any:
+    made = m.odometry(stamp_ns, m.pose(x, y, yaw), STILL)
+    made.header.frame_id = frame
+    return made
+
+
+def drive(count: int = 20, lag_ns: int = 0) -> list[m.Entry]:
+    """Odometry at every stamp and scans between, odometry recorded late by lag_ns."""
+    entries: list[m.Entry] = []
+    for k in range(count):
+        entries.append(("/odom", stamp(k) + lag_ns, odometry(stamp(k), 0.1 * k, -0.2, 0.01 * k)))
+        entries.append(("/scan", stamp(k + 0.5), scan(stamp(k + 0.5))))
+    return sorted(entries, key=lambda entry: entry[1])
+
+
+def static(parent: str, child: str, *pose: float, **turn: float) -> Any:
+    return m.transform(0, parent, child, m.pose(*pose, **turn))
+
+
+@pytest.mark.parametrize("lag_ns", [0, S // 5, 9 * S // 10])
+def test_records_come_in_order_of_their_stamps_however_late_they_were_recorded(tmp_path: Path, lag_ns: int) -> None:
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", drive(lag_ns=lag_ns))]) as recording:
+        found = list(scan_stream(recording, WITH_WHEELS))
+    assert [each.stamp_ns for each in found] == [stamp(k / 2) for k in range(40)]
+    wheels = [each.pose_xyyaw for each in found if isinstance(each, WheelPose)]
+    np.testing.assert_allclose(wheels, [[0.1 * k, -0.2, 0.01 * k] for k in range(20)], atol=1e-12)
+    scans = [each for each in found if isinstance(each, LidarScan)]
+    assert scans[0].frame_id == "laser" and scans[0].ranges.dtype == np.float32
+    assert (scans[0].angle_min, scans[0].angle_increment) == pytest.approx((-1.0, 0.1))
+    np.testing.assert_array_equal(scans[0].ranges, np.arange(1.0, 21.0))
+
+
+def test_wheels_come_before_a_scan_of_the_same_stamp(tmp_path: Path) -> None:
+    entries = [("/scan", stamp(1), scan(stamp(1))), ("/odom", stamp(1), odometry(stamp(1), 0, 0, 0))]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        assert [type(each) for each in scan_stream(recording, WITH_WHEELS)] == [WheelPose, LidarScan]
+
+
+def test_a_source_that_restarts_begins_anew(tmp_path: Path) -> None:
+    entries = drive(20)
+    again = [(topic, time_ns + 100 * S, message) for topic, time_ns, message in drive(20)]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", [*entries, *again])]) as recording:
+        found = [each.stamp_ns for each in scan_stream(recording, WITH_WHEELS)]
+    assert found == 2 * [stamp(k / 2) for k in range(40)]
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_wheels_of_transforms(tmp_path: Path, chained: bool) -> None:
+    child = "base_footprint" if chained else "base_link"
+    entries: list[m.Entry] = [("/tf_static", stamp(0), m.transforms(static("base_footprint", "base_link", 0.5, 0, 0)))]
+    for k in range(20):
+        moved = m.transform(stamp(k), "odom", child, m.pose(0.1 * k, 0.0, math.pi / 2))
+        other = m.transform(stamp(k), "map", "odom", m.pose(9.0, 9.0, 1.0))
+        entries += [("/tf", stamp(k), m.transforms(other, moved)), ("/scan", stamp(k), scan(stamp(k)))]
+    path = m.write_mcap(tmp_path / "a.mcap", entries)
+    topics = RecordingTopics("/scan", wheels=WheelSource.parse("tf:odom:base_link"))
+    with open_recording([path]) as recording:
+        poses = [each.pose_xyyaw for each in scan_stream(recording, topics) if isinstance(each, WheelPose)]
+        assert choose_topics(recording).wheels == WheelSource(tf=("odom", child))
+    expected = [[0.1 * k, 0.5 if chained else 0.0, math.pi / 2] for k in range(20)]
+    np.testing.assert_allclose(poses, expected, atol=1e-9)
+
+
+def test_what_is_damaged_is_counted_or_named(tmp_path: Path) -> None:
+    entries = drive(3)
+    entries.append(("/odom", stamp(4), odometry(stamp(4), math.nan, 0, 0)))
+    entries.append(("/scan", stamp(5), scan(stamp(5), increment=0.0)))
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        skipped: Counter[str] = Counter()
+        assert len(list(scan_stream(recording, WITH_WHEELS, skipped=skipped))) == 6
+        assert skipped == {BAD_SCAN: 1, BAD_WHEELS: 1}
+        with pytest.raises(RecordingError, match=r"a scan of /scan has 20 rays 0 rad apart"):
+            list(scan_stream(recording, WITH_WHEELS))
+        with pytest.raises(RecordingError, match=r"topic /odom is nav_msgs/msg/Odometry; expected sensor_msgs"):
+            list(scan_stream(recording, RecordingTopics("/odom")))
+
+
+def test_scans_without_stamps_are_refused(tmp_path: Path) -> None:
+    with (
+        open_recording([m.write_mcap(tmp_path / "a.mcap", [("/scan", k, scan(0)) for k in range(3)])]) as recording,
+        pytest.raises(RecordingError, match="have no stamps"),
+    ):
+        list(scan_stream(recording, RecordingTopics("/scan")))
+
+
+def geometry(low: float, high: float, increment: float, rays: int) -> Any:
+    made = scan(stamp(0), rays=rays)
+    made.angle_min, made.angle_max, made.angle_increment = (math.radians(value) for value in (low, high, increment))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "increment", "rays", "counts", "likely", "note"),
+    [
+        (-90, 90, 1.0, 181, 1.0, None, None),
+        (-90, 90, 180 / 179, 180, 180 / 179, 1.0, "likely are 1.0000 deg"),
+        (-90, 90, 0.5, 361, 0.5, None, None),
+        (-90, 90, 1.0, 180, 1.0, None, "angle_max"),
+        (-90, 90, 0.5, 181, 1.0, None, "contradicts its ends"),
+        (90, -90, -1.0, 181, -1.0, None, None),
+        (90, -90, 1.0, 181, -1.0, None, "contradicts its ends"),
+        (-90, 90, 0.0, 181, 1.0, None, "its ends count"),
+        (-90, 90, math.nan, 181, 1.0, None, "its ends count"),
+        (-90, 0.0, 1e-9, 181, 0.5, None, "its ends count"),
+        (-180, 180, 0.25, 1441, 0.25, None, None),
+        (-90, math.nan, 1.0, 181, 1.0, None, "angle_max"),
+    ],
+)
+def test_angles_follow_the_rule(
+    low: float, high: float, increment: float, rays: int, counts: float, likely: float | None, note: str | None
+) -> None:
+    angles = scan_angles(geometry(low, high, increment, rays))
+    assert math.degrees(angles.angle_increment) == pytest.approx(counts)
+    assert math.degrees(angles.angle_min) == pytest.approx(low)
+    found = None if angles.likely_increment is None else math.degrees(angles.likely_increment)
+    assert found == (None if likely is None else pytest.approx(likely))
+    assert (note is None) == (angles.note is None) and (note or "") in (angles.note or "")
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [(-90, math.nan, math.nan, 1), (0, 0, 0, 10), (0, 5000, 500, 11), (math.inf, 0, 1, 3), (0, 1, 1, 0)],
+)
+def test_angles_that_are_none_are_refused(bad: tuple[float, float, float, int]) -> None:
+    with pytest.raises(RecordingError, match="a scan of the scan has"):
+        scan_angles(geometry(*bad))
+
+
+@given(low=st.floats(), high=st.floats(), increment=st.floats(), rays=st.integers(0, 5))
+def test_angles_are_within_a_turn_or_refused(low: float, high: float, increment: float, rays: int) -> None:
+    message = scan(stamp(0), rays=rays)
+    message.angle_min, message.angle_max, message.angle_increment = low, high, increment
+    try:
+        angles = scan_angles(message)
+    except RecordingError:
+        return
+    assert 0.0 < abs(angles.angle_increment) * max(rays - 1, 1) < math.inf and math.isfinite(angles.angle_min)
+    assert abs(angles.angle_increment) * (rays - 1) < 6.4
+
+
+def test_a_caller_may_override_the_increment(tmp_path: Path) -> None:
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", drive(2))]) as recording:
+        found = list(scan_stream(recording, RecordingTopics("/scan"), angle_increment=0.25))
+        assert [each.angle_increment for each in found if isinstance(each, LidarScan)] == [0.25, 0.25]
+        for increment in (0.0, 1e-9, math.nan):
+            with pytest.raises(RecordingError, match="the increment is"):
+                list(scan_stream(recording, RecordingTopics("/scan"), angle_increment=increment))
+
+
+def mounted(path: Path, *entries: m.Entry, frame: str = "laser") -> Any:
+    scans = [("/scan", stamp(k), scan(stamp(k), frame)) for k in range(3)]
+    odometries = [("/odom", stamp(k), odometry(stamp(k), 0, 0, 0)) for k in range(3)]
+    with open_recording([m.write_mcap(path, [*entries, *odometries, *scans])]) as recording:
+        return find_mounting(recording, choose_topics(recording))
+
+
+def test_a_chain_of_static_transforms_is_composed(tmp_path: Path) -> None:
+    parts = (static("base_link", "plate", 0.3, 0.1, math.pi / 2, z=0.2), static("plate", "laser", 0.1, 0.0, 0.5, z=0.1))
+    for name, entries in {
+        "one": [("/tf_static", 1, m.transforms(*parts))],
+        "two": [("/tf_static", 1, m.transforms(parts[1])), ("/tf_static", 2, m.transforms(parts[0]))],
+    }.items():
+        found = mounted(tmp_path / f"{name}.mcap", *entries)
+        np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.3, 0.2, math.pi / 2 + 0.5], atol=1e-12)
+        assert (found.source, found.upside_down, found.base_frame) == ("/tf_static", False, "base_link")
+        assert found.height_m == pytest.approx(0.3) and found.tilt_rad == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -3.0])
+def test_a_scanner_that_hangs_upside_down_is_seen(tmp_path: Path, yaw: float) -> None:
+    found = mounted(
+        tmp_path / "a.mcap", ("/tf_static", 1, m.transforms(static("base_link", "laser", 0.2, 0, yaw, 0, math.pi)))
+    )
+    assert found.upside_down and "upside down" in str(found)
+    np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.2, 0.0, yaw], atol=1e-9)
+
+
+def test_a_tilt_is_stated(tmp_path: Path) -> None:
+    found = mounted(
+        tmp_path / "a.mcap", ("/tf_static", 1, m.transforms(static("base_link", "laser", 0, 0, 0, pitch=0.3)))
+    )
+    assert found.tilt_rad == pytest.approx(0.3) and "tilted by 17.2 deg" in str(found)
+
+
+def test_transforms_that_are_sent_again_and_again_serve_but_not_those_that_move_the_robot(tmp_path: Path) -> None:
+    moving = m.transform(stamp(0), "odom", "base_link", m.pose(5.0, 5.0, 1.0))
+    sent = m.transform(stamp(0), "base_link", "laser", m.pose(0.1, 0.0, 0.2))
+    found = mounted(tmp_path / "a.mcap", ("/tf", stamp(0), m.transforms(moving)), ("/tf", stamp(1), m.transforms(sent)))
+    assert found.source == "/tf"
+    np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.1, 0.0, 0.2], atol=1e-12)
+    outside = m.transform(stamp(0), "odom", "laser", m.pose(0.1, 0.0, 0.2))
+    assert mounted(tmp_path / "b.mcap", ("/tf", stamp(0), m.transforms(moving, outside))) is None
+
+
+def test_without_transforms_the_mounting_is_not_known_unless_frames_are_the_same(tmp_path: Path) -> None:
+    assert mounted(tmp_path / "a.mcap") is None
+    found = mounted(tmp_path / "b.mcap", frame="base_link")
+    assert found.source == "the scan's own frame" and not found.base_from_scan_xyyaw.any()
+    cyclic = m.transforms(static("a", "laser", 1, 0, 0), static("laser", "a", 1, 0, 0))
+    assert mounted(tmp_path / "c.mcap", ("/tf_static", 1, cyclic)) is None
+
+
+def chosen(path: Path, odometries: dict[str, str], given: TopicArguments | None = None) -> RecordingTopics:
+    entries = [(name, stamp(0), odometry(stamp(0), 0, 0, 0, frame)) for name, frame in odometries.items()]
+    with open_recording([m.write_mcap(path, [*entries, ("/scan", stamp(0), scan(stamp(0)))])]) as recording:
+        return choose_topics(recording, given)
+
+
+@pytest.mark.parametrize(
+    ("odometries", "wheels"),
+    [
+        ({}, None),
+        ({"/odom": "odom"}, "/odom"),
+        ({"/whatever": "odom"}, "/whatever"),
+        ({"/ground_truth": "odom"}, None),
+        ({"/odom": "map"}, None),
+        ({"/odom": "odom", "/ground_truth": "map"}, "/odom"),
+        ({"/odom": "odom", "/odometry/filtered": "odom"}, "/odom"),
+        ({"/wheel_odometry": "odom", "/odometry/filtered": "odom"}, "/wheel_odometry"),
+        ({"/a": "odom", "/b": "odom"}, None),
+    ],
+)
+def test_wheels_are_chosen_where_they_are_clear_and_are_never_the_truth(
+    tmp_path: Path, odometries: dict[str, str], wheels: str | None
+) -> None:
+    found = chosen(tmp_path / "a.mcap", odometries).wheels
+    assert found == (None if wheels is None else WheelSource(wheels))
+
+
+def test_wheels_are_named_or_left_out(tmp_path: Path) -> None:
+    both = {"/odom": "odom", "/b": "odom"}
+    assert chosen(tmp_path / "a.mcap", both, TopicArguments(wheels="none")).wheels is None
+    assert chosen(tmp_path / "b.mcap", both, TopicArguments(wheels="b")).wheels == WheelSource("/b")
+    truth = chosen(tmp_path / "c.mcap", both, TopicArguments(ground_truth="/odom"))
+    assert (truth.ground_truth, truth.wheels) == (GroundTruth(topic="/odom"), WheelSource("/b"))
+    for arguments, complaint in (
+        (TopicArguments(wheels="/odom", ground_truth="/odom"), "wheel odometry and ground truth are both /odom"),
+        (TopicArguments(wheels="tf:odom"), "expected tf:PARENT:CHILD, as in tf:odom:base_link"),
+        (TopicArguments(wheels="tf:odom:base_link"), "no topic holds transforms"),
+        (TopicArguments(wheels="/scan"), "topic /scan for the wheels is sensor_msgs/msg/LaserScan"),
+        (TopicArguments(wheels="/gone"), "there is no topic /gone for the wheels"),
+    ):
+        with pytest.raises(RecordingError, match=complaint):
+            chosen(tmp_path / "d.mcap", both, arguments)
+    with pytest.raises(RecordingError, match="exactly one of"):
+        WheelSource()
+
+
+def test_a_lidar_is_described(tmp_path: Path) -> None:
+    entries = [("/tf_static", 1, m.transforms(static("base_link", "laser", 0.1, 0, 0))), *drive()]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        found = describe_lidar(recording, choose_topics(recording))
+        assert (found.scan_topic, found.scans, found.rays, found.stamps) == ("/scan", 20, 20, "recorded")
+        assert found.rate_hz == pytest.approx(10.0) and found.field_of_view == pytest.approx(1.9)
+        assert (found.wheels, found.wheel_poses, found.notes) == (WheelSource("/odom"), 20, ())
+        lines = found.lines()
+        assert lines[1] == "mounting: laser in base_link at x 0.100 m, y 0.000 m, yaw 0.0 deg (from /tf_static)"
+        assert lines[2] == "wheels: /odom, 20 poses" and lines[3] == "stamps: recorded"
+    with open_recording([m.write_mcap(tmp_path / "b.mcap", [("/scan", k, scan(0)) for k in range(3)])]) as recording:
+        found = describe_lidar(recording, RecordingTopics("/scan"))
+        assert (found.stamps, found.rate_hz, found.mounting) == ("none", None, None)
+        assert "mounting: not in the recording" in found.lines() and "wheels: none" in found.lines()
