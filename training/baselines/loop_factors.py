@@ -1,7 +1,7 @@
-"""The loops that the classical pose graph gets: found by place codes, or known from the truth.
+"""Loops for the classical pose graph: found by place codes, or known from the truth.
 
-What ``found_loops`` gives is what our own optimizer gets. True revisits, measured by the pair head or known exactly,
-tell how much of the error that remains lies in retrieval, and how much in measuring.
+``found_loops`` gives the loops of our own optimizer. True revisits show the cause of the remaining error. It is
+retrieval if they help when the pair head measures them, and measurement if they help only when known exactly.
 """
 
 import math
@@ -49,7 +49,7 @@ class LoopFactors:
 
 @dataclass(frozen=True)
 class Seen:
-    """What loops are found in, arrays ``(trajectories, steps, ...)``.
+    """Inputs of the search for loops, arrays ``(trajectories, steps, ...)``.
 
     ``relative`` and ``log_std`` are the steps of the odometry and the logarithm of their deviations, ``codes`` the
     place codes ``(trajectories, steps, code_length)`` of the frame after each step, ``origin_code`` ``(trajectories, 1,
@@ -93,7 +93,7 @@ def smoothed_odometry(
 
 
 def found_loops(pair_head: PairHead, seen: Seen, search: LoopSearch, block: int = 8) -> list[LoopFactors]:
-    """What ``find_loops`` gives for each trajectory, with ``block`` steps in a meta-pose."""
+    """Loops of each trajectory by ``find_loops``, with ``block`` steps in a meta-pose."""
     found: list[LoopFactors] = []
     for part in _parts(seen):
         steps, _ = part.registered(pair_head, search, block)
@@ -112,7 +112,7 @@ MoreLoops = Callable[[np.ndarray], LoopFactors]
 def overlaps_of(
     pair_head: PairHead, codes: np.ndarray, relative: np.ndarray, search: LoopSearch, block: int = 8
 ) -> list[MoreLoops]:
-    """What ``find_overlaps`` gives for each trajectory, once there are poses.
+    """A search for overlaps of each trajectory by ``find_overlaps``, once there are poses.
 
     Args:
         codes: place codes ``(trajectories, steps, code_length)``; relative: steps of the odometry ``(trajectories,

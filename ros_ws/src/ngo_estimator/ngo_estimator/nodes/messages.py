@@ -212,7 +212,7 @@ def _doubles(values: np.ndarray) -> "array[float]":
 
 
 def loop_markers(trajectory: "WholeTrajectory", frame: str) -> MarkerArray:
-    """One line for each loop edge, opaque as its weight; if there is none, what deletes those shown."""
+    """One line for each loop edge, opaque as its weight; without edges, markers that delete those shown."""
     header = Header(stamp=to_time(int(trajectory.stamps_ns[-1])), frame_id=frame)
     marker = Marker(header=header, ns="loops", type=Marker.LINE_LIST, action=Marker.ADD)
     if len(trajectory.loops) == 0:

@@ -54,7 +54,7 @@ class NgoNode(LifecycleNode):
         super().__init__(NAME)
         self._live = LiveSettings(self, NgoNodeSettings)
         self._live.on_change(self._on_settings)
-        self._built, self._listening = ExitStack(), ExitStack()  # what cleanup and deactivate undo
+        self._built, self._listening = ExitStack(), ExitStack()  # undone by cleanup and deactivate
         self._failure: Exception | None = None
         self._starting = False
         self._inputs: list[Input] = []
@@ -68,7 +68,7 @@ class NgoNode(LifecycleNode):
         return self._live.values
 
     def start(self) -> "NgoNode":
-        """Configure and activate, where ``autostart`` says so; raises what keeps the node from starting."""
+        """Configure and activate if ``autostart`` is set; raises the error that keeps the node from starting."""
         if self._settings.autostart:
             self._starting = True
             for transition in (self.trigger_configure, self.trigger_activate):
@@ -87,12 +87,12 @@ class NgoNode(LifecycleNode):
         return self._attempt(self._listen, self._listening)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no more; what comes meanwhile is a gap that the odometry bridges."""
+        """Stop taking relative poses. The odometry bridges the gap after the next activation."""
         self._listening.close()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the trajectory and the networks."""
+        """Drop the trajectory and the networks."""
         self._built.close()
         return super().on_cleanup(state)
 
@@ -109,7 +109,7 @@ class NgoNode(LifecycleNode):
         except Exception as error:  # rclpy itself would say nothing about it
             undo.close()
             self._failure = error
-            if not self._starting:  # whoever starts the node says it
+            if not self._starting:  # the caller of start() reports it
                 self.get_logger().error(" ".join(str(error).split()) or repr(error))
             return _FAILURE
         return _SUCCESS
@@ -201,7 +201,7 @@ class NgoNode(LifecycleNode):
         self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
     def _begin_anew(self) -> None:
-        """What belongs to one trajectory."""
+        """Reset the state that belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
         self._covariance = np.zeros((3, 3))
         self._last_correction_m = 0.0
@@ -291,7 +291,7 @@ class NgoNode(LifecycleNode):
     async def _on_save(
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
-        """Have a thread write the file: relative poses go on meanwhile."""
+        """Write the file in a thread, so that relative poses are processed meanwhile."""
         path, trajectory = Path(request.path).expanduser().absolute(), self._trajectory()
         done, executor = Future(), self.executor
 
@@ -356,13 +356,13 @@ class NgoNode(LifecycleNode):
 
 
 def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
-    """Write a file; returns whether that went well, and what to say."""
+    """Write a file; returns whether it succeeded, and a message for the user."""
     try:
         if trajectory is None:
             raise ValueError("the trajectory is empty; nothing was written")
         edges = edges_of(trajectory) if path.suffix == ".g2o" else ()
         write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw, edges)
-    except Exception as error:  # whatever it is, whoever called must get an answer
+    except Exception as error:  # the caller of the service gets an answer in any case
         return False, " ".join(str(error).split()) or repr(error)
     return True, f"wrote {len(trajectory.stamps_ns)} poses to {path}"
 

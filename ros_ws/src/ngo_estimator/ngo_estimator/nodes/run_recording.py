@@ -47,7 +47,7 @@ LIDAR_WORLD = "scan"
 
 @dataclass(frozen=True)
 class Arguments:
-    """What is run, on what, and where the results go."""
+    """The recordings, the weights, and the folder of the results."""
 
     recordings: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """.mcap files or rosbag2 folders, several as one recording in order of time."""
@@ -58,7 +58,7 @@ class Arguments:
     weights: Path | None = None
     """Folder of weights of your own, instead of those of a world."""
     topics: tyro.conf.OmitArgPrefixes[TopicArguments] = field(default_factory=TopicArguments)
-    """What is used of the recording."""
+    """The topics to use."""
     window_frames: int = 2000
     """How many of the newest frames are optimised together."""
     key_frames: int = 128
@@ -81,7 +81,7 @@ class Arguments:
     """Whether results that are in OUT already may be replaced."""
 
     def check(self) -> None:
-        """Raise ``ValueError`` for what contradicts itself."""
+        """Raise ``ValueError`` for arguments that contradict each other."""
         if not self.recordings:
             raise ValueError("no recording was given; expected .mcap files, rosbag2 folders, .bag, .log or .clf files")
         if self.world is not None and self.weights is not None:
@@ -107,16 +107,16 @@ class Arguments:
 
     @property
     def report_settings(self) -> ReportSettings:
-        """How estimates are compared with the truth, whose poses are those of the very frames."""
+        """How estimates are compared with the truth at the same frames."""
         delta = RelativeDelta() if self.rpe_metres is None else RelativeDelta(self.rpe_metres, "metres")
         return ReportSettings(delta=delta, segment_lengths_m=self.segment_lengths_m)
 
 
 def run(arguments: Arguments, console: Console) -> dict[str, Any]:
-    """Run both estimators over the recording, write the results and return what run.json says.
+    """Run both estimators over the recording, write the results and return the content of run.json.
 
     Raises:
-        ValueError, OSError: of one line, about what cannot be read, used or written.
+        ValueError, OSError: with one line about a file that cannot be read, used or written.
     """
     arguments.check()
     settings = arguments.report_settings
@@ -258,7 +258,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
 
 
 def _for_weights(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
-    """The arguments, with the only laser scan for weights that take one, and without what weights do not take."""
+    """The arguments, with the only laser scan for weights of scans, and without inputs that the weights do not take."""
     scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
     if given.image is None and local.image_format.is_scan and len(scans) == 1:
         given = replace(given, image=scans[0])

@@ -16,7 +16,7 @@ _TWISTS = ("TwistStamped", "Twist", "Odometry")
 
 @dataclass(frozen=True)
 class EstimatorSettings(FramedSettings):
-    """What every estimator node needs."""
+    """Parameters of every estimator node."""
 
     world: str = setting(
         "maze3d",
