@@ -64,7 +64,7 @@ class LocalNode(Node):
             return LidarInput(self, settings, self._publish)
         if settings.robot_odometry != "none":
             raise StartError(
-                f"parameter 'robot_odometry' is '{settings.robot_odometry}'; expected 'none', as these weights take images"
+                f"parameter 'robot_odometry' is '{settings.robot_odometry}'; expected 'none': these weights take images"
             )
         from ngo_estimator.nodes.image_input import ImageInput
 

@@ -4,11 +4,10 @@
     ros2 run ngo_estimator run_recording drive.mcap --world maze3d --out results
     ros2 run ngo_estimator run_recording bag_folder --weights my_weights --image /camera/image_raw --out results
 
-RECORDINGS are .mcap files, rosbag2 folders, ROS 1 bags or CARMEN logs, several as one. A recording of a laser scanner needs no
---world. OUT gets odometry.tum, online.tum (each corrected pose as
-it was when its frame was the newest), corrected.tum, trajectories.mcap (odometry, poses, transforms and paths),
-plot.png and run.json; where the recording holds the truth, also truth.tum and metrics.json. The same recording gives
-the same bytes.
+RECORDINGS are .mcap files, rosbag2 folders, ROS 1 bags or CARMEN logs, several as one. Laser scans need no --world. OUT
+gets odometry.tum, online.tum (each corrected pose as it was when its frame was the newest), corrected.tum,
+trajectories.mcap (odometry, poses, transforms and paths), plot.png and run.json; where the recording holds the truth, also
+truth.tum and metrics.json. The same recording gives the same bytes.
 """
 
 import json

@@ -30,8 +30,8 @@ class ScanGraphConfig:
     """How key scans are optimised.
 
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
-    at once where a new loop is ``surprise`` deviations off the graph. Steps and loops are damped as by Cauchy, ``kernel``
-    deviations wide. To each step's covariance come ``step_m`` and ``step_deg`` (deviations), which registration in the
+    at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
+    ``kernel`` deviations wide. To each step's covariance come ``step_m`` and ``step_deg`` (deviations), which registration in the
     same few key scans does not see.
     """
 
