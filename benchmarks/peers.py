@@ -11,7 +11,7 @@ import torch
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.neural_graph_optimizer import MetaSteps
+from ngo_estimator.optimizer.meta_poses import MetaSteps
 from training.baselines.pose_graph import PoseGraphSettings
 
 SETTINGS = PoseGraphSettings()

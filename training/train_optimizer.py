@@ -30,9 +30,9 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.optimizer.loop_closing import OVERLAPS_AFTER
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.neural_graph_optimizer import (
-    OVERLAPS_AFTER,
     NeuralGraphOptimizer,
     NeuralGraphOptimizerConfig,
 )

@@ -5,7 +5,7 @@ the networks have seen.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
+from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines.graph_settings import load_settings
 from training.baselines.loop_factors import LoopFactors, smoothed_odometry
@@ -80,7 +81,7 @@ def limit_estimator(name: str, sources: Sources) -> Estimator:
     else:
         trained, _ = load_optimizer(sources.row_folder(limit.row, 0), sources.world.name)
         optimizer, smooth = apart(trained)
-        corrected = optimized_by(optimizer, pair_head, known=exact_loops if limit.exact_loops else None)
+        corrected = optimized_by(optimizer, pair_head, informed=InformedOptimizer if limit.exact_loops else None)
         # What is true stays so: it is told after the odometry was smoothed.
         return Estimator(lambda arrays: corrected(told(smooth(arrays), limit)), f"{name} {base.identity}")
     return Estimator(lambda arrays: poses(told(arrays, limit)), f"{name} {base.identity}")
@@ -121,7 +122,7 @@ def told(arrays: Arrays, limit: Limit) -> Arrays:
 
 
 def exact_loops(loops: Loops, truth: Tensor, block: int) -> Loops:
-    """Loops with the true relative poses of what they connect, and of the overlaps that are still to be found.
+    """Loops measured as they truly are, and believed more.
 
     Args:
         truth: true poses after each step ``(batch, steps, 3)``.
@@ -129,10 +130,29 @@ def exact_loops(loops: Loops, truth: Tensor, block: int) -> Loops:
     nodes = _nodes(truth, block)
     rows = torch.arange(len(nodes)).unsqueeze(1)
     measured = se2.between(nodes[rows, loops.start], nodes[rows, loops.end + 1])
-    scans = loops.scans and replace(loops.scans, known=lambda overlaps: exact_loops(overlaps, truth, block))
-    return replace(
-        loops, measured=measured.to(loops.measured.dtype), log_scale=loops.log_scale - _MORE_BELIEF, scans=scans
-    )
+    return replace(loops, measured=measured.to(loops.measured.dtype), log_scale=loops.log_scale - _MORE_BELIEF)
+
+
+class InformedOptimizer(NeuralGraphOptimizer):
+    """An optimizer whose loops are measured exactly, those included that it finds under corrected poses.
+
+    Args:
+        optimizer: gives configuration and weights.
+        truth: true poses ``(batch, steps, 3)`` after each step of the trajectories that it is given.
+    """
+
+    def __init__(self, optimizer: NeuralGraphOptimizer, truth: Tensor) -> None:
+        super().__init__(optimizer.config)
+        self.load_state_dict(optimizer.state_dict())
+        self.eval().requires_grad_(False)
+        self._truth = truth
+
+    def iterate(self, steps: MetaSteps, loops: Loops | None = None) -> Iterator[OptimizedMetaPoses]:
+        return super().iterate(steps, None if loops is None else exact_loops(loops, self._truth, self.block))
+
+    def overlaps(self, steps: MetaSteps, loops: Loops, poses: Tensor) -> Loops | None:
+        found = super().overlaps(steps, loops, poses)
+        return None if found is None else exact_loops(found, self._truth, self.block)
 
 
 def exact_factors(found: LoopFactors, truth: np.ndarray, block: int) -> LoopFactors:

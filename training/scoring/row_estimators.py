@@ -149,12 +149,12 @@ def optimized_by(
     optimizer: NeuralGraphOptimizer,
     pair_head: PairHead,
     prepared: Prepared | None = None,
-    known: Callable[[Loops, Tensor, int], Loops] | None = None,
+    informed: Callable[[NeuralGraphOptimizer, Tensor], NeuralGraphOptimizer] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
     """``optimize_offline`` for many trajectories at once.
 
     ``prepared`` is of the same trajectories and the same pair head.
-    ``known`` makes other loops of those that are found, the true poses and the steps in a meta-pose.
+    ``informed`` makes an optimizer that knows the true poses ``(batch, steps, 3)`` of the trajectories it is given.
     """
 
     def odometry_and_loops(first: int, whole: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], Loops | None]:
@@ -177,9 +177,8 @@ def optimized_by(
             some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
             whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
             odometry, loops = odometry_and_loops(first, whole)
-            if loops is not None and known is not None:
-                loops = known(loops, whole["truth"], optimizer.block)
-            result = optimizer(*odometry, whole["motion"], loops)
+            used = optimizer if informed is None else informed(optimizer, whole["truth"])
+            result = used(*odometry, whole["motion"], loops)
             parts.append(_with_tail(result.poses.double(), some["relative"].double()))
         return torch.cat(parts).numpy()
 

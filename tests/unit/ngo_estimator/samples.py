@@ -9,11 +9,8 @@ from ngo_estimator.networks.odometry_smoothing import SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
-from ngo_estimator.optimizer.neural_graph_optimizer import (
-    NeuralGraphOptimizer,
-    NeuralGraphOptimizerConfig,
-    OptimizedTrajectory,
-)
+from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 
 WORLDS = ["maze2d", "maze3d"]
 

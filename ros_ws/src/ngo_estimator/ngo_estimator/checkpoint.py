@@ -29,6 +29,8 @@ LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "odometry_smoother",
     "neural_graph_optimizer",
 )
+RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
+"""Settings of earlier versions, by the kind of network, with the only value that still means the same."""
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
@@ -169,7 +171,7 @@ def load_network(
     """
     description = load_description(path, kind, world)
     try:
-        network = build(config_from_dict(config, description.get("config")))
+        network = build(config_from_dict(config, _without_retired(kind, description.get("config"))))
     except (ValueError, RuntimeError) as error:  # RuntimeError: sizes that no memory holds
         raise CheckpointError(f"{path.with_suffix('.json')}: {' '.join(str(error).split())}") from error
     try:
@@ -190,6 +192,17 @@ def load_network(
     if broken := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
         raise CheckpointError(f"{path}: has weights that are not finite in {', '.join(broken)}")
     return network.eval().requires_grad_(False), description
+
+
+def _without_retired(kind: str, values: Any) -> Any:
+    """The values of a configuration without settings that this version no longer has."""
+    if not isinstance(values, dict):
+        return values
+    retired = RETIRED_SETTINGS.get(kind, {})
+    for name, meant in retired.items():
+        if (value := values.get(name, meant)) is not meant:
+            raise ValueError(f"{name} is {value!r}, which this version no longer has; expected {meant!r}, or none")
+    return {name: value for name, value in values.items() if name not in retired}
 
 
 def load_local(weights: Path, world: str | None = None) -> tuple[LocalPoseNetwork, dict[str, Any]]:

@@ -9,14 +9,8 @@ from torch import Tensor, nn
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig
 from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import (
-    Loops,
-    LoopSearch,
-    find_loops,
-    loop_residuals,
-    odometry_variances,
-    spread_over_span,
-)
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
+from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances, spread_over_span
 from tests.unit.ngo_estimator.samples import make_loops, meta_steps, place_config, with_origin
 
 DOUBLE = torch.float64

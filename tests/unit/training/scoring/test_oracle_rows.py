@@ -13,7 +13,16 @@ from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.baselines.loop_factors import LoopFactors, exact_revisits, found_loops
 from training.baselines.pose_graph import PoseGraphSettings
-from training.scoring.oracle_rows import LIMITS, Limit, apart, exact_factors, exact_loops, right_factors, told
+from training.scoring.oracle_rows import (
+    LIMITS,
+    InformedOptimizer,
+    Limit,
+    apart,
+    exact_factors,
+    exact_loops,
+    right_factors,
+    told,
+)
 from training.scoring.row_estimators import Arrays, local, optimized_by, pose_graph, seen_in
 from training.scoring.table_rows import ROWS
 
@@ -81,7 +90,7 @@ def test_exact_loops_agree_with_the_true_poses(pair_head: PairHead) -> None:
         expected = se2.between(nodes[k, found.start[k]], nodes[k, found.end[k] + 1])
         torch.testing.assert_close(exact.measured[k], expected.float(), atol=1e-5, rtol=1e-5)
     poses = optimized_by(optimizer, pair_head)(some)
-    informed = optimized_by(optimizer, pair_head, known=exact_loops)(some)
+    informed = optimized_by(optimizer, pair_head, informed=InformedOptimizer)(some)
     assert informed.shape == poses.shape and not np.allclose(informed, poses, atol=1e-4)
 
 
@@ -89,9 +98,9 @@ def test_overlaps_that_are_found_later_are_exact_too() -> None:
     relative, log_std, codes, truth = drive_with_a_camera(160)
     search = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
     optimizer = small_optimizer("gauss_newton", iterations=5, search=search)
-    exact = exact_loops(optimizer.find_loops(relative, codes, camera_pair_head()), truth, BLOCK)
-    result = optimizer(relative, log_std, torch.zeros(1, 160, 6), exact)
-    overlaps = slice(exact.start.shape[1], None)
+    found = optimizer.find_loops(relative, codes, camera_pair_head())
+    result = InformedOptimizer(optimizer, truth)(relative, log_std, torch.zeros(1, 160, 6), found)
+    overlaps = slice(found.start.shape[1], None)
     assert result.loops.valid[:, overlaps].sum() > 8
     nodes = torch.cat((torch.zeros(1, 3).double(), truth[0, BLOCK - 1 :: BLOCK]))
     expected = se2.between(nodes[result.loops.start[0, overlaps]], nodes[result.loops.end[0, overlaps] + 1])

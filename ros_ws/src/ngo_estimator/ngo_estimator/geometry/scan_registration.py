@@ -6,9 +6,8 @@ scan with the lines between neighbouring points of the other, and takes a robust
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,12 +77,10 @@ class RegistrationConfig:
 
 @dataclass(frozen=True)
 class Scans:
-    """Ranges ``(batch, steps, rays)`` of the frame after each step (m, 0 where nothing is known), and how they are
-    registered. ``known`` makes other loops of those that they give, where the truth is known."""
+    """Ranges ``(batch, steps, rays)`` of the frame after each step (m, 0: no return), and how to register them."""
 
     ranges: Tensor
     registration: RegistrationConfig
-    known: Callable[[Any], Any] | None = None
 
 
 def register(

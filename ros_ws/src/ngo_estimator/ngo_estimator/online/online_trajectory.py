@@ -22,7 +22,8 @@ from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import in_block_poses
 from ngo_estimator.online.meta_graph import MetaGraph
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, OptimizedTrajectory
+from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 
 _VARIANCES = (1e-12, 1e4)  # what lies below or above is as good as exact or unknown, and float32 has no room for it
 

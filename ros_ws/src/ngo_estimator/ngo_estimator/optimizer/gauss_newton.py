@@ -1,7 +1,7 @@
 """One Gauss-Newton step of a pose graph: a chain of relative poses, and loops between any two of its poses.
 
-Unknown are all poses after the origin, in the map. Each factor compares two of them; the step minimises the sum of
-squared residuals, each weighted with its information. Differentiable by everything that is given as a tensor.
+The unknowns are all poses after the origin, in the map. Each factor compares two poses. The step minimises the sum of
+squared residuals, weighted with their information. It is differentiable with respect to every tensor.
 """
 
 from collections.abc import Sequence
@@ -14,16 +14,17 @@ from torch import Tensor
 from ngo_estimator.geometry import se2
 
 RELATIVE_JITTER = 1e-12
-"""Added to the diagonal, in units of itself: what the rounding of some hundred poses can take from it."""
+"""Share of itself that is added to the diagonal: rounding over some hundred poses can take as much from it."""
 
 
 @dataclass(frozen=True)
 class Factors:
     """Linearised factors ``(batch, factors)`` between pairs of nodes.
 
-    ``nodes`` ``(batch, factors, 2)``; ``jacobian`` ``(batch, factors, 3, 6)``: derivative of what is predicted by the
-    poses (x, y, yaw) of the two; ``residual`` ``(batch, factors, 3)``: measured less predicted; ``information``
-    ``(batch, factors, 3)``: inverse variances of the residual, zero or more.
+    ``nodes`` ``(batch, factors, 2)``; ``jacobian`` ``(batch, factors, 3, 6)``: derivative of the prediction by the
+    poses (x, y, yaw) of both nodes; ``residual`` ``(batch, factors, 3)``: measured less predicted. ``information`` is
+    the inverse covariance of the residual: whole matrices ``(batch, factors, 3, 3)``, positive semidefinite, or their
+    diagonals ``(batch, factors, 3)`` if its components are independent.
     """
 
     nodes: Tensor
@@ -31,14 +32,43 @@ class Factors:
     residual: Tensor
     information: Tensor
 
+    def __post_init__(self) -> None:
+        shape = tuple(self.residual.shape)
+        if tuple(self.information.shape) not in (shape, (*shape, 3)):
+            raise ValueError(
+                f"information is of shape {tuple(self.information.shape)}; expected {shape} or {(*shape, 3)}"
+            )
 
-def chain_factors(poses: Tensor, deviation: Tensor, step_std: Tensor) -> Factors:
+    @property
+    def weighted_jacobian(self) -> Tensor:
+        """Information times Jacobian ``(batch, factors, 3, 6)``, float64."""
+        jacobian, information = self.jacobian.double(), self.information.double()
+        if information.dim() == jacobian.dim():
+            return information @ jacobian
+        return jacobian * information.unsqueeze(-1)
+
+
+def step_information(step_std: Tensor, correlation: Tensor | None = None) -> Tensor:
+    """Information of steps: ``(batch, n, 3)`` without a correlation, ``(batch, n, 3, 3)`` with one.
+
+    Args:
+        step_std: standard deviations ``(batch, n, 3)``.
+        correlation: correlation matrices ``(batch, n, 3, 3)``, positive definite.
+    """
+    if correlation is None:
+        return step_std.square().reciprocal()
+    scale = step_std.reciprocal()
+    inverse: Tensor = torch.linalg.inv(correlation.to(step_std.dtype))
+    return scale.unsqueeze(-1) * inverse * scale.unsqueeze(-2)
+
+
+def chain_factors(poses: Tensor, deviation: Tensor, information: Tensor) -> Factors:
     """The relative meta-poses of a chain.
 
     Args:
         poses: global poses with the origin in front ``(batch, blocks + 1, 3)``.
         deviation: relative poses of ``poses`` less the measured ones ``(batch, blocks, 3)``.
-        step_std: standard deviations ``(batch, blocks, 3)``, along the axes of the earlier pose.
+        information: ``(batch, blocks, 3)`` or ``(batch, blocks, 3, 3)``, along the axes of the earlier pose.
     """
     batch, blocks = deviation.shape[:2]
     index = torch.arange(blocks, device=poses.device)
@@ -51,7 +81,7 @@ def chain_factors(poses: Tensor, deviation: Tensor, step_std: Tensor) -> Factors
         torch.stack((sin, -cos, -offset[..., 0], -sin, cos, zero), dim=-1),
         torch.stack((zero, zero, -one, zero, zero, one), dim=-1),
     )
-    return Factors(nodes, torch.stack(rows, dim=-2), -deviation, step_std.square().reciprocal())
+    return Factors(nodes, torch.stack(rows, dim=-2), -deviation, information)
 
 
 def pair_factors(nodes: Tensor, poses: Tensor, residual: Tensor, information: Tensor) -> Factors:
@@ -61,7 +91,7 @@ def pair_factors(nodes: Tensor, poses: Tensor, residual: Tensor, information: Te
         nodes: the pose measured from, and the pose measured ``(batch, factors, 2)``.
         poses: global poses of all nodes ``(batch, nodes, 3)``.
         residual: measured less predicted pose of the second, along the axes of the map ``(batch, factors, 3)``.
-        information: inverse variances ``(batch, factors, 3)``.
+        information: ``(batch, factors, 3)`` or ``(batch, factors, 3, 3)``, along the axes of the map.
     """
     start, end = (pick(poses, nodes[..., k]) for k in (0, 1))
     offset = end[..., :2] - start[..., :2]
@@ -75,15 +105,16 @@ def pair_factors(nodes: Tensor, poses: Tensor, residual: Tensor, information: Te
 
 
 def normal_blocks(factors: Sequence[Factors]) -> tuple[Tensor, Tensor, Tensor]:
-    """Nodes of all factors ``(batch, n, 2)``, and what each adds to the normal equations of its two, float64.
+    """The part of each factor in the normal equations.
 
-    That is a matrix ``(batch, n, 6, 6)`` and a right hand side ``(batch, n, 6)``.
+    Returns:
+        Nodes ``(batch, n, 2)``, and of these two a matrix ``(batch, n, 6, 6)`` and a right hand side ``(batch, n, 6)``,
+        both float64.
     """
     nodes = torch.cat([f.nodes for f in factors], dim=1)
     jacobian = torch.cat([f.jacobian for f in factors], dim=1).double()
-    information = torch.cat([f.information for f in factors], dim=1).double()
     residual = torch.cat([f.residual for f in factors], dim=1).double()
-    weighted = jacobian * information.unsqueeze(-1)
+    weighted = torch.cat([f.weighted_jacobian for f in factors], dim=1)
     return nodes, weighted.mT @ jacobian, (weighted.mT @ residual.unsqueeze(-1)).squeeze(-1)
 
 

@@ -1,7 +1,7 @@
-"""Normal equations of one pose graph, kept sparse: what the optimizer solves where no gradient is asked for.
+"""Sparse normal equations of one pose graph; the optimizer solves these when nobody needs a gradient.
 
-A pose graph of some hundred poses fills a few per cent of its matrix. SuperLU, with an ordering of minimum degree,
-factorises it several times as fast as a dense Cholesky factorisation.
+The factors of some hundred poses fill a few per cent of the matrix. SuperLU, with an ordering of minimum degree,
+factorises it several times faster than a dense Cholesky factorisation.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _SYMMETRIC = {"SymmetricMode": True}
 
 
 class GraphStructure:
-    """Which poses the factors of a graph join: the same in all Gauss-Newton steps of an optimisation.
+    """The pairs of poses that factors join: the same in all Gauss-Newton steps of an optimisation.
 
     Args:
         nodes: of all factors ``(factors, 2)``, each 0 to ``count - 1``; the pose of node 0 is known.
@@ -35,7 +35,7 @@ class GraphStructure:
         diagonal = np.arange(unknown)
         keys = np.concatenate((column * unknown + row, diagonal * unknown + diagonal))
         blocks, block = np.unique(keys[np.append(~known, np.ones(unknown, bool))], return_inverse=True)
-        # Blocks of node 0 are summed, too, behind all others, and of no account.
+        # Node 0 is known: its blocks are summed behind all others, and not used.
         self._block = torch.full((len(row),), len(blocks))
         self._block[torch.from_numpy(~known)] = torch.from_numpy(block[: len(block) - unknown])
         block_column, block_row = blocks // unknown, blocks % unknown
