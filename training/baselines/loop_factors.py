@@ -17,8 +17,9 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import LoopSearch, find_loops, fused_measurements
+from ngo_estimator.optimizer.loop_closure import LoopSearch, find_loops, frame_odometry
 from ngo_estimator.optimizer.overlaps import find_overlaps
+from ngo_estimator.optimizer.pair_measurement import VIEWS, PairViews, measure_pairs
 from ngo_estimator.optimizer.registered_odometry import registered_steps
 
 _TOGETHER = 8  # trajectories that go through the pair head at once
@@ -173,11 +174,9 @@ def measured_revisits(
     codes, in_blocks = _float32(seen.codes), poses_in_blocks(seen.registered(pair_head, search, block)[0], block)
     earlier, later = torch.from_numpy(frames), torch.from_numpy(ends * block + block - 1)
     with torch.inference_mode():
-        measured, log_scale, _ = fused_measurements(
-            pair_head, codes, in_blocks, earlier.unsqueeze(0), later.unsqueeze(0), search.views
-        )
-        pair = codes[:, earlier], codes[:, later]
-        measured, log_scale = pair_head.register(*pair, measured, log_scale, search.registrations)
+        pairs = earlier.unsqueeze(0), later.unsqueeze(0)
+        views = PairViews.of_trajectories(codes, frame_odometry(in_blocks), *pairs, VIEWS[: search.views])
+        (measured, log_scale, _), _ = measure_pairs(pair_head, views, search.registrations)
         measured = se2.compose(in_blocks.flatten(1, 2)[:, earlier], measured)
     return LoopFactors(frames // block, ends, measured[0].numpy(), log_scale[0].numpy(), _certain(frames))
 
