@@ -25,7 +25,7 @@ from tqdm import tqdm
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.data.images import ImageFormat, scan_image
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import optimize_offline
+from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2DConfig
 from training.common import runs

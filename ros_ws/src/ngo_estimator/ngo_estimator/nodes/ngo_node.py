@@ -35,7 +35,7 @@ from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.trajectory.files import edges_of, write_trajectory
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.online_trajectory import Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100

@@ -9,7 +9,7 @@ from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import Trajectory, TrajectoryUpdate
+from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
 from ngo_estimator.online.step_log import StepLog
 
