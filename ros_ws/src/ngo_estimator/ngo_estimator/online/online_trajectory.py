@@ -37,8 +37,9 @@ class TrajectoryUpdate:
     counts all of the trajectory. ``optimized`` says whether this step ended an optimisation, ``restarted`` whether it
     began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
     ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
-    optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. The arrays are
-    read-only and stay as they are.
+    optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. ``fault`` says
+    what failed inside, empty where nothing did: the trajectory goes on by odometry then. The arrays are read-only and
+    stay as they are.
     """
 
     stamp_ns: int
@@ -52,6 +53,7 @@ class TrajectoryUpdate:
     largest_move_m: float
     closed_loops: int
     window_fill: float
+    fault: str = ""
 
 
 @dataclass(frozen=True)

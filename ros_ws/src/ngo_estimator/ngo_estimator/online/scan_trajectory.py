@@ -1,5 +1,6 @@
 """The online trajectory of a 2D lidar: relative poses and key scans in, the whole corrected trajectory out (no ROS)."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,10 @@ from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.online.online_trajectory import Trajectory, TrajectoryUpdate
 from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
 from ngo_estimator.online.step_log import StepLog
-
-_VARIANCES = (1e-12, 1e4)
 
 
 class ScanTrajectory:
@@ -55,20 +55,21 @@ class ScanTrajectory:
                 that is a little late. The trajectory is as it was before.
         """
         check_step(step, 0, None)
-        taken = self._log.take(step)
+        # Before anything is taken: what fails here leaves the trajectory as it was.
+        taken = self._log.take(replace(step, covariance=bounded(step.covariance)))
         if taken.begins:
             self._begin()
             self._graph.begin_at(step)
             self._online.append(np.zeros(3))
-        due = self._graph.append(taken.relative, _bounded(taken.covariance), step.key)
+        due = self._graph.append(taken.relative, bounded(taken.covariance), step.key)
         self._odom = step.tf_odom_xyyaw
-        self._optimized = False
         if not optimize:
             self._graph.abandon()
         elif due:
             self._graph.begin()
         if self._graph.running:
-            self._optimized = self._graph.advance(self._iterations_per_step)
+            self._graph.advance(self._iterations_per_step)
+        self._optimized = self._graph.optimized
         update = self._result(taken.restarted, taken.gap)
         self._online.append(update.pose_xyyaw)
         return update
@@ -79,12 +80,18 @@ class ScanTrajectory:
         return self._graph.running or self._graph.waiting
 
     @property
+    def fault(self) -> str:
+        """What failed in the last step, or in ``finish``, in words; empty where nothing did."""
+        return self._graph.fault
+
+    @property
     def optimization_s(self) -> float:
         """Computing time of the last optimisation."""
         return self._graph.took_s
 
     def finish(self) -> TrajectoryUpdate | None:
-        """Optimise until nothing moves any more, when no more steps come; None where there is nothing to do."""
+        """Optimise until nothing moves any more, when no more steps come; None where there is nothing to do, or where
+        it failed."""
         if self._log.steps == 0 or not self._graph.finish():
             return None
         self._optimized = True
@@ -124,14 +131,8 @@ class ScanTrajectory:
             largest_move_m=self._graph.largest_move_m if self._optimized else 0.0,
             closed_loops=int((self._graph.loop_weights > 0.5).sum()),
             window_fill=0.0,
+            fault=self._graph.fault,
         )
-
-
-def _bounded(covariance: np.ndarray) -> np.ndarray:
-    """The covariance with eigenvalues between those that are as good as exact and unknown."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    bounded: np.ndarray = (vectors * np.clip(values, *_VARIANCES)) @ vectors.T
-    return bounded
 
 
 def _read_only(values: np.ndarray) -> np.ndarray:
