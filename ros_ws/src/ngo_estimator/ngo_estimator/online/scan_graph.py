@@ -15,7 +15,7 @@ from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
-from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.planar_covariance import bounded, propagate
 from ngo_estimator.geometry.planar_motion import transformed
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
@@ -81,6 +81,10 @@ class ScanGraph:
         """Of the loops in the last optimisation ``(loops,)``, zero to one."""
         self.took_s = 0.0
         """Computing time of the last optimisation."""
+        self.optimized = False
+        """Whether an optimisation ended since the newest frame came."""
+        self.fault = ""
+        """What failed since the newest frame came, in words. Everything is then as it was before, but for the loops."""
 
     @property
     def keys(self) -> int:
@@ -99,7 +103,7 @@ class ScanGraph:
         return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
 
     def begin_at(self, step: RelativeStep) -> None:
-        """Take the first frame, before the first step. No loop leads to it where its scan is missing."""
+        """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""
         self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
         self._frames.append(0)
         self._nodes.append(np.zeros(3))
@@ -107,6 +111,7 @@ class ScanGraph:
 
     def append(self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None) -> bool:
         """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise."""
+        self.optimized, self.fault = False, ""
         last = torch.from_numpy(self.odometry.values[-1])
         self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
         since = self._since_key()
@@ -117,8 +122,17 @@ class ScanGraph:
             self.advance(self._left)  # what comes now adds a node to those that it is about
         known = key.from_key_stamp_ns == self._key_stamp_ns
         # Registration in the same key scans: errors of the steps between do not add up.
-        self._complete(key, since, key.covariance if known else self._since)
-        return self._look_for_loops()
+        self._complete(key, since, bounded(key.covariance if known else self._since))
+        try:
+            return self._look_for_loops()
+        except Exception as error:  # numerics of a library, or a fault of ours: it may cost loops, and nothing else
+            self.fail(error, "the search for loops")
+            return False
+
+    def fail(self, error: Exception, work: str = "an optimisation") -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+        self.fault = f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self._running, self._waiting = None, 0
 
     def _since_key(self) -> np.ndarray:
         """Pose ``(3,)`` of the newest frame, seen from the last node."""
@@ -155,7 +169,13 @@ class ScanGraph:
         return self._waiting > config.keys_between or found > config.surprise
 
     def begin(self) -> None:
-        """Begin to optimise all nodes."""
+        """Begin to optimise all nodes; where that fails, ``fault`` says so."""
+        try:
+            self._begin()
+        except Exception as error:  # see append
+            self.fail(error)
+
+    def _begin(self) -> None:
         began = time.perf_counter()
         self._rows = np.flatnonzero(self._finder.loops.accepted)
         loops = self._finder.loops[self._rows]
@@ -171,10 +191,19 @@ class ScanGraph:
         self.took_s = time.perf_counter() - began
 
     def advance(self, iterations: int) -> bool:
-        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose."""
-        running = self._running
-        if running is None:
+        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
+
+        Where it fails, it is over, every node is where it was, and ``fault`` says so.
+        """
+        if self._running is None:
             raise RuntimeError("no optimisation has begun")
+        try:
+            return self._advance(self._running, iterations)
+        except Exception as error:  # see append
+            self.fail(error)
+            return False
+
+    def _advance(self, running: ScanPoseGraph, iterations: int) -> bool:
         began = time.perf_counter()
         for _ in range(min(iterations, self._left)):
             running.iterate()
@@ -182,12 +211,14 @@ class ScanGraph:
         self.took_s += time.perf_counter() - began
         if self._left:
             return False
+        end = self._end if running.equations is None else running.equations.covariance([self.keys - 1])
+        if not (np.isfinite(running.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running = None
         self._before = self._nodes.values.copy()
         self._nodes.values[:] = running.poses
         self._loop_rows, self.loop_weights = self._rows, running.weights
-        if running.equations is not None:
-            self._end = running.equations.covariance([self.keys - 1])
+        self._end, self.optimized = end, True
         return True
 
     def abandon(self) -> None:
@@ -196,18 +227,24 @@ class ScanGraph:
             self._running, self._waiting = None, self.config.keys_between
 
     @property
-    def waiting(self) -> bool:
-        """Whether there is a loop that no optimisation has seen."""
-        return self._waiting > 0
+    def unfinished(self) -> bool:
+        """Whether an optimisation has begun, or a loop waits for one."""
+        return self.running or self._waiting > 0
+
+    @property
+    def window_fill(self) -> float:
+        """All key scans are optimised: there is no window to fill."""
+        return 0.0
 
     def finish(self) -> bool:
-        """Optimise until nothing moves any more; returns whether there was anything to optimise."""
+        """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
+        self.fault = ""
         if self._running is None:
             if not self._finder.loops.accepted.any():
                 return False
             self.begin()
         self._left = _MOST_ITERATIONS
-        return self.advance(self._left)
+        return self._running is not None and self.advance(self._left)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
@@ -221,8 +258,12 @@ class ScanGraph:
         The difference between two nodes and their odometry is spread evenly over the frames between.
         """
         nodes = self._nodes.values.copy()
-        if before:
-            nodes[: len(self._before)] = self._before
+        if before:  # nodes that came since follow the last of those
+            last = len(self._before) - 1
+            moved = torch.from_numpy(nodes[last:].copy())
+            nodes[: last + 1] = self._before
+            since = se2.between(moved[:1], moved)
+            nodes[last:] = se2.compose(torch.from_numpy(self._before[-1:]), since).numpy()
         odometry, at = torch.from_numpy(self.odometry.values), self._frames.values
         starts, ends = torch.from_numpy(nodes), odometry[torch.from_numpy(at)]
         segment = torch.from_numpy(np.searchsorted(at, np.arange(len(odometry)), side="right") - 1)
