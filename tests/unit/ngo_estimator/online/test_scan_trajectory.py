@@ -306,10 +306,9 @@ def test_a_hostile_covariance_costs_no_trajectory(name: str) -> None:
     trajectory = ScanTrajectory()
     keys = [k for k, step in enumerate(steps) if step.key is not None]
     for k, step in enumerate(steps):
-        if k in (50, keys[20], keys[-20]):
-            step = replace(step, covariance=HOSTILE[name])
-            step = replace(step, key=replace(step.key, covariance=HOSTILE[name])) if step.key else step
-        update = trajectory.update(step)
+        hostile = HOSTILE[name] if k in (50, keys[20], keys[-20]) else step.covariance
+        key = step.key and replace(step.key, covariance=hostile)
+        update = trajectory.update(replace(step, covariance=hostile, key=key))
         assert update.fault == "" and not update.restarted
         assert np.isfinite(update.covariance).all() and np.linalg.eigvalsh(update.covariance)[0] > 0.0
     trajectory.finish()
@@ -363,7 +362,7 @@ def test_pausing_leaves_the_path_and_loses_no_loop() -> None:
     for step in steps[:-20]:
         assert not trajectory.update(step, optimize=False).optimized
     assert trajectory.unfinished
-    assert any([trajectory.update(step).optimized for step in steps[-20:]])
+    assert any(trajectory.update(step).optimized for step in steps[-20:])
     trajectory.finish()
     assert errors(trajectory, true).max() < 0.3
 

@@ -14,15 +14,19 @@ import torch
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.key_scan import KeyScan, no_scan
+from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded, propagate
 from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
+
+_KEYS_PER_OPTIMISED = 200
+"""For each so many nodes an optimisation waits for one more key scan."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,8 @@ class ScanGraphConfig:
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
     at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
     ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to
-    each step's covariance: registration in the same few key scans does not see them.
+    each step's covariance: registration in the same few key scans does not see them. About ``most_scans`` key scans are
+    kept; where there are more, places that many of them show lose some. Their poses stay.
     """
 
     loops: ScanLoopConfig = field(default_factory=ScanLoopConfig)
@@ -43,11 +48,13 @@ class ScanGraphConfig:
     kernel: float = 3.0
     step_m: float = 0.005
     step_deg: float = 0.15
+    most_scans: int = 4000
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.keys_between < 1:
+        if self.iterations < 1 or self.keys_between < 1 or self.most_scans < 100:
             raise ValueError(
-                f"iterations, keys_between are {self.iterations}, {self.keys_between}; expected at least 1 of each"
+                f"iterations, keys_between, most_scans are {self.iterations}, {self.keys_between}, {self.most_scans}; "
+                "expected at least 1, 1 and 100"
             )
         positive = (self.surprise, self.kernel, self.step_m, self.step_deg)
         if not all(0.0 < value < math.inf for value in positive):
@@ -66,7 +73,7 @@ class ScanGraph:
         self._nodes = GrowingRows((3,), np.float64)
         self._steps = GrowingRows((3,), np.float64)
         self._step_covariance = GrowingRows((3, 3), np.float64)
-        self._scans: list[KeyScan] = []
+        self._scans = KeyScanStore()
         self._key_stamp_ns = 0
         self._finder = ScanLoopFinder(config.loops)
         self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
@@ -162,11 +169,21 @@ class ScanGraph:
         else:
             windows = distance_windows(config.windows, graph_distances(poses, accepted, self.keys - 1))
             loops = self._finder.find(self._scans, poses, windows)
+            self._save_memory()
             off = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance).residuals(poses)
             found = float(np.sqrt((off**2).sum(1)).max(initial=0.0))
             self._waiting = max(self._waiting, int(len(loops) > 0))
         self._waiting += self._waiting > 0
-        return self._waiting > config.keys_between or found > config.surprise
+        # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
+        return self._waiting > max(config.keys_between, self.keys // _KEYS_PER_OPTIMISED) or found > config.surprise
+
+    def _save_memory(self) -> None:
+        """Bound the memory of scans that the finder has seen."""
+        self._scans.compact()
+        most = self.config.most_scans
+        if self._scans.kept > most + most // 10:
+            newest = self.config.loops.submap_keys
+            self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.values, newest))
 
     def begin(self) -> None:
         """Begin to optimise all nodes; where that fails, ``fault`` says so."""
@@ -280,8 +297,7 @@ class ScanGraph:
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
-        total = sum(len(scan.points) for scan in self._scans)
-        every = max(1, -(-total // most))
+        every = max(1, -(-self._scans.points // most))
         parts = [
             transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.values, self._scans, strict=True)
         ]
