@@ -13,8 +13,10 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, search
 from ngo_estimator.geometry.planar_motion import Array, between, turned_covariance, wrap
 from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
+from ngo_estimator.networks.step_deviation import STEP_EVIDENCE
 from ngo_estimator.odometry.local_submap import LocalSubmap
 from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
+from ngo_estimator.odometry.step_evidence import StepScaling, step_evidence
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
 
@@ -81,6 +83,7 @@ class ScanEstimate:
         share: share of the scan's points that lie on lines of the last key scans.
         searched: a search over a window preceded the registration.
         unsure: the scan does not say where it was taken; the prediction stands for it.
+        evidence: ``(12,)``, columns as named in ``STEP_EVIDENCE``; zeros for the first scan.
     """
 
     stamp_ns: int
@@ -93,13 +96,15 @@ class ScanEstimate:
     share: float
     searched: bool
     unsure: bool
+    evidence: Array
 
 
 class ScanOdometry:
     """Takes scans one by one, and estimates each as it comes; bounded memory."""
 
-    def __init__(self, config: ScanOdometryConfig | None = None) -> None:
+    def __init__(self, config: ScanOdometryConfig | None = None, scaling: StepScaling | None = None) -> None:
         self.config = config or ScanOdometryConfig()
+        self._scaling = scaling
         self._submap = LocalSubmap(self.config.submap_scans, self.config.search)
         self._prior = MotionPrior(self.config.prior)
         self._pose = np.zeros(3)
@@ -126,14 +131,16 @@ class ScanOdometry:
         found, searched = self._register(scan, prediction)
         unsure = self._is_unsure(found, prediction)
         pose, covariance = (prediction.mean, prediction.covariance) if unsure else (found.pose, found.covariance)
-        return self._accept(scan, wheels, prediction, pose, covariance, found.share, searched, unsure)
+        return self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
 
     def _begin(self, scan: KeyScan, wheels: WheelOdometry | None) -> ScanEstimate:
         self._submap.add(scan, self._pose)
         self._stamp_ns = scan.stamp_ns
         self._prior.begin(scan.stamp_ns, self._pose, wheels)
         zero, none = np.zeros(3), np.zeros((3, 3))
-        return ScanEstimate(scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False)
+        return ScanEstimate(
+            scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False, np.zeros(len(STEP_EVIDENCE))
+        )
 
     def _register(self, scan: KeyScan, prediction: Prediction) -> tuple[Registration, bool]:
         config = self.config
@@ -165,9 +172,7 @@ class ScanOdometry:
                 break
         return best, True
 
-    def _best(
-        self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float
-    ) -> Registration:
+    def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float) -> Registration:
         """The registration, among those from all starts, that fits most points."""
         best = self._icp(scan, starts[0], prior, open_share)
         for start in starts[1:]:
@@ -202,7 +207,7 @@ class ScanOdometry:
         prediction: Prediction,
         pose: Array,
         covariance: Array,
-        share: float,
+        found: Registration,
         searched: bool,
         unsure: bool,
     ) -> ScanEstimate:
@@ -212,21 +217,28 @@ class ScanOdometry:
         if prediction.step_covariance is not None:
             # Both poses share the errors of the submap, and of the prior where the walls say nothing.
             both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
-        if wheels is not None and not unsure and share >= self.config.good_share:
+        if wheels is not None and not unsure and found.share >= self.config.good_share:
             wheels.observe_turn(self._stamp_ns, scan.stamp_ns, float(step[2]))
         distance, turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
         is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
+        evidence = step_evidence(since_key, found, prediction, searched, unsure)
+        step_covariance = turned_covariance(-self._pose[2], both)
+        since_key_covariance = turned_covariance(-self._key[2], covariance)
+        if self._scaling is not None:
+            step_covariance = self._scaling.scaled(step_covariance, evidence)
+            since_key_covariance = self._scaling.scaled(since_key_covariance, evidence)
         estimate = ScanEstimate(
             scan.stamp_ns,
             step,
-            turned_covariance(-self._pose[2], both),
+            step_covariance,
             pose,
             since_key,
-            turned_covariance(-self._key[2], covariance),
+            since_key_covariance,
             is_key,
-            share,
+            found.share,
             searched,
             unsure,
+            evidence,
         )
         self._prior.accept(scan.stamp_ns, pose, step, is_key)
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
