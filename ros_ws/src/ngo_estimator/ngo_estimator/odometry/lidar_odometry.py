@@ -33,9 +33,9 @@ class LidarOdometryConfig:
     """How scans and wheels become odometry.
 
     A scan waits for wheels at most ``wheel_wait_s``. Wheels that were silent for ``wheel_silence_s`` are not waited
-    for. A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are the
-    smallest variances of a step: what rounding leaves of a robot that stands. With ``learned_deviation`` a trained
-    network scales the deviations of steps; it changes no pose of the odometry.
+    for. A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are
+    the smallest variances of a step. With ``learned_deviation`` a trained network scales the deviations that are
+    published; no pose changes.
     """
 
     points: ScanPointsConfig = field(default_factory=ScanPointsConfig)
@@ -52,8 +52,8 @@ class LidarOdometryConfig:
         positive = (self.wheel_wait_s, self.wheel_silence_s, self.least_variance_m2, self.least_variance_rad2)
         if not all(0.0 < value < math.inf for value in positive) or self.most_rays < 2:
             raise ValueError(
-                f"wheel_wait_s, wheel_silence_s, least_variance_m2, least_variance_rad2 are {positive} and most_rays is "
-                f"{self.most_rays}; expected positive numbers, and at least 2 rays"
+                f"wheel_wait_s, wheel_silence_s, least_variance_m2, least_variance_rad2 are {positive} and most_rays "
+                f"is {self.most_rays}; expected positive numbers, and at least 2 rays"
             )
 
 
@@ -61,8 +61,8 @@ class LidarOdometryConfig:
 class LidarStep(RelativeStep):
     """Motion between two scans.
 
-    ``share`` of the points fit the walls seen before; ``unsure`` where the scan says nothing; ``evidence`` ``(12,)`` has
-    the columns ``STEP_EVIDENCE``.
+    ``share`` of the points fit the walls seen before. The scan of an ``unsure`` step does not say where it was taken.
+    ``evidence`` ``(12,)`` has the columns ``STEP_EVIDENCE``.
     """
 
     share: float
@@ -209,7 +209,9 @@ class LidarOdometry:
         least = np.diag((self.config.least_variance_m2, self.config.least_variance_m2, self.config.least_variance_rad2))
         key_step = None
         if estimate.is_key:
-            key_step = KeyScanStep(key, self._key_ns, estimate.since_key, estimate.since_key_covariance + least)
+            key_step = KeyScanStep(
+                key, self._key_ns, estimate.since_key, estimate.since_key_covariance + least, estimate.factors
+            )
             self._key_ns = key.stamp_ns
         origin, self._origin = self._origin, None
         nothing = np.zeros(0, np.float32)
@@ -239,7 +241,7 @@ class LidarOdometry:
         return pose
 
     def _key_scan(self, scan: LidarScan) -> KeyScan:
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
         try:
@@ -269,4 +271,4 @@ class LidarOdometry:
             ends = self._wheels.pose_at(self._last.stamp_ns), self._wheels.pose_at(scan.stamp_ns)
             if ends[0] is not None and ends[1] is not None:
                 twist = between(ends[0], ends[1]) / between_s
-        return Sweep(scan.time_increment * np.arange(len(scan.ranges)), twist)
+        return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)

@@ -84,6 +84,8 @@ class ScanEstimate:
         searched: a search over a window preceded the registration.
         unsure: the scan does not say where it was taken; the prediction stands for it.
         evidence: ``(12,)``, columns as named in ``STEP_EVIDENCE``; zeros for the first scan.
+        factors: ``(3,)`` on the deviations (x, y, yaw), by the trained network; ones without it. They are in
+            ``step_covariance`` and not in ``since_key_covariance``.
     """
 
     stamp_ns: int
@@ -97,6 +99,7 @@ class ScanEstimate:
     searched: bool
     unsure: bool
     evidence: Array
+    factors: Array
 
 
 class ScanOdometry:
@@ -222,23 +225,20 @@ class ScanOdometry:
         distance, turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
         is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
         evidence = step_evidence(since_key, found, prediction, searched, unsure)
-        step_covariance = turned_covariance(-self._pose[2], both)
-        since_key_covariance = turned_covariance(-self._key[2], covariance)
-        if self._scaling is not None:
-            step_covariance = self._scaling.scaled(step_covariance, evidence)
-            since_key_covariance = self._scaling.scaled(since_key_covariance, evidence)
+        factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
         estimate = ScanEstimate(
             scan.stamp_ns,
             step,
-            step_covariance,
+            turned_covariance(-self._pose[2], both) * np.outer(factors, factors),
             pose,
             since_key,
-            since_key_covariance,
+            turned_covariance(-self._key[2], covariance),
             is_key,
             found.share,
             searched,
             unsure,
             evidence,
+            factors,
         )
         self._prior.accept(scan.stamp_ns, pose, step, is_key)
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns

@@ -1,4 +1,4 @@
-"""Evidence of a registered step, and its covariance as the trained network scales it."""
+"""Evidence of a registered step, and the factors that the trained network gives it."""
 
 import math
 
@@ -47,10 +47,8 @@ class StepScaling:
         self._head, self._bias = values["head.weight"], values["head.bias"]
         self._limit = math.log(network.config.largest)
 
-    def scaled(self, covariance: Array, evidence: Array) -> Array:
-        """A covariance ``(3, 3)`` of (x, y, yaw) with both deviations times their factors."""
-        out = self._head @ np.tanh(self._first @ ((evidence - self._middle) / self._scale) + self._offset) + self._bias
-        position, heading = np.exp(self._limit * np.tanh(out / self._limit))
-        factors = np.array((position, position, heading))
-        scaled: Array = covariance * np.outer(factors, factors)
-        return scaled
+    def factors(self, evidence: Array) -> Array:
+        """Factors ``(3,)`` on the deviations of (x, y, yaw), for evidence ``(12,)``."""
+        hidden = np.tanh(self._first @ ((evidence - self._middle) / self._scale) + self._offset)
+        position, heading = np.exp(self._limit * np.tanh((self._head @ hidden + self._bias) / self._limit))
+        return np.array((position, position, heading))
