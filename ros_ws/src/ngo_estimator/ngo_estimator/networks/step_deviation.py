@@ -24,6 +24,8 @@ of the prediction's deviations (m, rad).
 """
 
 
+UNSURE = STEP_EVIDENCE.index("unsure")
+
 _MIDDLE = (0.95, -2.1, -2.35, -2.75, 0.3, 0.05, 0.3, 0.2, 0.0, 0.9, -1.2, -1.3)
 _SCALE = (0.06, 0.3, 0.12, 0.25, 0.1, 0.12, 0.25, 0.3, 0.3, 0.3, 0.12, 0.15)
 
@@ -56,7 +58,11 @@ class StepDeviation(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, evidence: Tensor) -> Tensor:
-        """Logarithms ``(..., 2)`` of the factors (position, heading), for evidence ``(..., 12)``."""
+        """Logarithms ``(..., 2)`` of the factors (position, heading), for evidence ``(..., 12)``.
+
+        An unsure step keeps its deviations: they are the prediction's.
+        """
         limit = math.log(self.config.largest)
-        log_factors: Tensor = limit * (self.head(self.layers((evidence - self.middle) / self.scale)) / limit).tanh()
+        out = self.head(self.layers((evidence - self.middle) / self.scale))
+        log_factors: Tensor = limit * (out / limit).tanh() * (1.0 - evidence[..., UNSURE, None])
         return log_factors

@@ -6,7 +6,7 @@ import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array, wrap
 from ngo_estimator.geometry.scan_matching import Registration
-from ngo_estimator.networks.step_deviation import StepDeviation
+from ngo_estimator.networks.step_deviation import UNSURE, StepDeviation
 from ngo_estimator.odometry.motion_prior import Prediction
 
 
@@ -49,6 +49,8 @@ class StepScaling:
 
     def factors(self, evidence: Array) -> Array:
         """Factors ``(3,)`` on the deviations of (x, y, yaw), for evidence ``(12,)``."""
+        if evidence[UNSURE] > 0.0:
+            return np.ones(3)
         hidden = np.tanh(self._first @ ((evidence - self._middle) / self._scale) + self._offset)
         position, heading = np.exp(self._limit * np.tanh((self._head @ hidden + self._bias) / self._limit))
         return np.array((position, position, heading))
