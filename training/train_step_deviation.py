@@ -1,9 +1,9 @@
-"""Train how far a lidar's steps are to be trusted: factors on their deviations, by likelihood where the poses are known.
+"""Train factors on the deviations of a lidar's steps, by likelihood where the poses are known.
 
     python -m training.train_step_deviation --logs belgioioso.log.gz edmonton.log.gz
 
-Drives through simulated buildings, some without wheels, teach it; CARMEN logs that a mapper corrected may be added. Their
-steps are stored under RUNS once. It ends with the weights written to OUT/scan/step_deviation.safetensors.
+Drives through simulated buildings, some without wheels, teach it; CARMEN logs that a mapper corrected may be added.
+Their steps are stored under RUNS once. It ends with the weights written to OUT/scan/step_deviation.safetensors.
 """
 
 import hashlib
@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,9 @@ from ngo_estimator.networks.step_deviation import StepDeviation, StepDeviationCo
 from ngo_estimator.odometry.lidar_odometry import LidarOdometryConfig
 from ngo_estimator.online.scan_graph import ScanGraphConfig
 from training.common import runs
+from training.common.command_line import run_command
 from training.data.lidar_steps import KeySteps, building_steps, log_steps
 from training.data.step_windows import WINDOWS, StepWindows, figures, negative_log_likelihood, windows_of
-from training.recordings.recording_source import run_script
 
 WORLD = "scan"
 REFERENCE = (0.05, math.radians(0.25))
@@ -71,7 +72,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     half = arguments.buildings // 2, arguments.without_wheels // 2
     train = data_of(building_drives(arguments, _TRAIN_SEED, arguments.buildings, arguments.without_wheels))
     validation = data_of(building_drives(arguments, _VALIDATION_SEED, *half))
-    logs = [_stored(arguments.runs, f"log-{path.name}-{_sha(path)}", lambda p=path: log_steps(p)) for path in arguments.logs]
+    logs = [
+        _stored(arguments.runs, f"log-{path.name}-{_sha(path)}", lambda p=path: log_steps(p)) for path in arguments.logs
+    ]
     if logs:
         of_logs = data_of(logs, LOG_WINDOWS, REFERENCE)
         train |= {k: StepWindows.joined([train[k], *[of_logs[k]] * arguments.log_share]) for k in LOG_WINDOWS}
@@ -79,7 +82,10 @@ def main(arguments: Arguments) -> dict[str, float]:
     metrics = {"loss": loss}
     with torch.no_grad():
         for steps, windows in validation.items():
-            for name, factors in (("constant", 0.0 * network(windows.evidence)), ("learned", network(windows.evidence))):
+            for name, factors in (
+                ("constant", 0.0 * network(windows.evidence)),
+                ("learned", network(windows.evidence)),
+            ):
                 metrics |= {f"{name}_{steps}_{key}": value for key, value in figures(windows, factors).items()}
     details = {
         "training": {**runs.record("train_step_deviation", arguments), "seconds": round(time.monotonic() - began)},
@@ -97,7 +103,7 @@ def building_drives(arguments: Arguments, seed: int, with_wheels: int, without: 
         for aliased in (False, True):
             settings = (seed + k, arguments.length_m, aliased, k < with_wheels)
             name = "-".join(map(str, settings))
-            drives.append(_stored(arguments.runs, f"building-{name}", lambda s=settings: building_steps(*s)))
+            drives.append(_stored(arguments.runs, f"building-{name}", partial(building_steps, *settings)))
     return drives
 
 
@@ -149,4 +155,4 @@ def _sha(path: Path) -> str:
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

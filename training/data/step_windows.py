@@ -4,9 +4,9 @@ Errors that repeat from step to step add up faster than independent ones. The li
 several lengths, with covariances propagated to their ends.
 """
 
+import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,10 +103,10 @@ def negative_log_likelihood(windows: StepWindows, log_factors: Tensor) -> Tensor
 
 
 def figures(windows: StepWindows, log_factors: Tensor) -> dict[str, float]:
-    """Mean negative log-likelihood, the share of errors within three deviations, and the root of the mean squared one."""
+    """Mean negative log-likelihood, the share of errors within three deviations, and their median in deviations."""
     squared, _ = squared_deviations(windows, log_factors)
     return {
         "nll": float(negative_log_likelihood(windows, log_factors).mean()),
         "within_3": float((squared <= 9.0).float().mean()),
-        "median_deviations": float(np.sqrt(float(squared.median()))),
+        "median_deviations": math.sqrt(float(squared.median())),
     }
