@@ -73,7 +73,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     train = data_of(building_drives(arguments, _TRAIN_SEED, arguments.buildings, arguments.without_wheels))
     validation = data_of(building_drives(arguments, _VALIDATION_SEED, *half))
     logs = [
-        _stored(arguments.runs, f"log-{path.name}-{_sha(path)}", lambda p=path: log_steps(p)) for path in arguments.logs
+        _stored(arguments.runs, f"log-{path.name}-{_sha(path)}", partial(log_steps, path)) for path in arguments.logs
     ]
     if logs:
         of_logs = data_of(logs, LOG_WINDOWS, REFERENCE)
@@ -132,7 +132,7 @@ def fitted(data: Data, arguments: Arguments) -> tuple[StepDeviation, float]:
             some = windows[torch.from_numpy(random.permutation(len(windows))[: _BATCH[steps]])]
             loss = loss + negative_log_likelihood(some, network(some.evidence)).mean()
         optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimizer.step()
         rate.step()
         losses.append(loss.item())

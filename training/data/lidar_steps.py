@@ -1,4 +1,4 @@
-"""Steps between a lidar's key scans where the poses are known: simulated buildings, and logs that a mapper corrected."""
+"""Steps between the key scans of a lidar where the poses are known: simulated buildings, and logs with a reference."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator

@@ -1,4 +1,4 @@
-"""Factors on a step's deviations: none before training, within their limits after it, the same in numpy and in torch."""
+"""Factors on a step's deviations: none before training, bounded after it, the same in numpy and in torch."""
 
 from pathlib import Path
 
