@@ -36,13 +36,15 @@ class KeyScanStep:
     """The key scan that a step ends at, and where it was taken.
 
     ``from_key_stamp_ns`` is the stamp of the key scan before it. The pose ``relative_xyyaw`` (3,) is seen from there,
-    with its ``covariance`` (3, 3).
+    with its ``covariance`` (3, 3) by registration, by which steps and loops are weighed against each other. ``factors``
+    (3,) on its deviations (x, y, yaw) are for the covariance that is published.
     """
 
     scan: KeyScan
     from_key_stamp_ns: int
     relative_xyyaw: np.ndarray
     covariance: np.ndarray
+    factors: np.ndarray = field(default_factory=lambda: np.ones(3))
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,7 @@ def _key_scan_message(scan: "key_scan.KeyScan", step: "KeyScanStep | None") -> K
     if step is not None:
         message.x, message.y, message.yaw = step.relative_xyyaw.tolist()
         message.covariance = step.covariance.ravel()
+        message.factors = step.factors
     return message
 
 
@@ -108,7 +109,7 @@ def _key_scan_step(message: KeyScan) -> "KeyScanStep":
     from ngo_estimator.data.relative_step import KeyScanStep
 
     relative, covariance = np.array([message.x, message.y, message.yaw]), np.array(message.covariance).reshape(3, 3)
-    return KeyScanStep(_key_scan(message), to_ns(message.from_stamp), relative, covariance)
+    return KeyScanStep(_key_scan(message), to_ns(message.from_stamp), relative, covariance, np.array(message.factors))
 
 
 def relative_step(message: RelativePose) -> "RelativeStep":

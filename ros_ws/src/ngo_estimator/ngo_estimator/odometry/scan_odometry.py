@@ -13,8 +13,10 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, search
 from ngo_estimator.geometry.planar_motion import Array, between, turned_covariance, wrap
 from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
+from ngo_estimator.networks.step_deviation import STEP_EVIDENCE
 from ngo_estimator.odometry.local_submap import LocalSubmap
 from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
+from ngo_estimator.odometry.step_evidence import StepScaling, step_evidence
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 
@@ -86,6 +88,9 @@ class ScanEstimate:
         share: share of the scan's points that lie on lines of the last key scans.
         searched: a search over a window preceded the registration.
         unsure: the scan does not say where it was taken: the prediction stands for it, or a second place is as likely.
+        evidence: ``(12,)``, columns as named in ``STEP_EVIDENCE``; zeros for the first scan.
+        factors: ``(3,)`` on the deviations (x, y, yaw), by the trained network; ones without it. They are in
+            ``step_covariance`` and not in ``since_key_covariance``.
     """
 
     stamp_ns: int
@@ -98,13 +103,16 @@ class ScanEstimate:
     share: float
     searched: bool
     unsure: bool
+    evidence: Array
+    factors: Array
 
 
 class ScanOdometry:
     """Takes scans one by one, and estimates each as it comes; bounded memory."""
 
-    def __init__(self, config: ScanOdometryConfig | None = None) -> None:
+    def __init__(self, config: ScanOdometryConfig | None = None, scaling: StepScaling | None = None) -> None:
         self.config = config or ScanOdometryConfig()
+        self._scaling = scaling
         self._submap = LocalSubmap(self.config.submap_scans, self.config.search)
         self._prior = MotionPrior(self.config.prior)
         self._pose = np.zeros(3)
@@ -133,14 +141,17 @@ class ScanOdometry:
         pose, covariance = (prediction.mean, prediction.covariance) if unsure else (found.pose, found.covariance)
         if doubt is not None and not unsure:
             covariance, unsure = covariance + doubt, True
-        return self._accept(scan, wheels, prediction, pose, covariance, found.share, searched, unsure)
+        return self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
 
     def _begin(self, scan: KeyScan, wheels: WheelOdometry | None) -> ScanEstimate:
         self._submap.add(scan, self._pose)
         self._stamp_ns = scan.stamp_ns
         self._prior.begin(scan.stamp_ns, self._pose, wheels)
         zero, none = np.zeros(3), np.zeros((3, 3))
-        return ScanEstimate(scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False)
+        nothing = np.zeros(len(STEP_EVIDENCE))
+        return ScanEstimate(
+            scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False, nothing, np.ones(3)
+        )  # fmt: skip
 
     def _register(self, scan: KeyScan, prediction: Prediction) -> tuple[Registration, Array | None, bool]:
         """The best registration, the covariance of its doubt where there is any, and whether a search was needed."""
@@ -211,7 +222,7 @@ class ScanOdometry:
         prediction: Prediction,
         pose: Array,
         covariance: Array,
-        share: float,
+        found: Registration,
         searched: bool,
         unsure: bool,
     ) -> ScanEstimate:
@@ -221,21 +232,25 @@ class ScanOdometry:
         if prediction.step_covariance is not None:
             # Both poses share the errors of the submap, and of the prior where the walls say nothing.
             both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
-        if wheels is not None and not unsure and share >= self.config.good_share:
+        if wheels is not None and not unsure and found.share >= self.config.good_share:
             wheels.observe_turn(self._stamp_ns, scan.stamp_ns, float(step[2]))
         distance, turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
         is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
+        evidence = step_evidence(since_key, found, prediction, searched, unsure)
+        factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
         estimate = ScanEstimate(
             scan.stamp_ns,
             step,
-            turned_covariance(-self._pose[2], both),
+            turned_covariance(-self._pose[2], both) * np.outer(factors, factors),
             pose,
             since_key,
             turned_covariance(-self._key[2], covariance),
             is_key,
-            share,
+            found.share,
             searched,
             unsure,
+            evidence,
+            factors,
         )
         self._prior.accept(scan.stamp_ns, pose, step, is_key, unsure)
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns

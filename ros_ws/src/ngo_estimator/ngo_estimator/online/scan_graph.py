@@ -72,7 +72,8 @@ class ScanGraph:
         self._frames = GrowingRows((), np.int64)  # of the nodes
         self._nodes = GrowingRows((3,), np.float64)
         self._steps = GrowingRows((3,), np.float64)
-        self._step_covariance = GrowingRows((3, 3), np.float64)
+        self._step_covariance = GrowingRows((3, 3), np.float64)  # for the optimisation
+        self._published_covariance = GrowingRows((3, 3), np.float64)
         self._scans = KeyScanStore()
         self._key_stamp_ns = 0
         self._finder = ScanLoopFinder(config.loops)
@@ -129,7 +130,12 @@ class ScanGraph:
             self.advance(self._left)  # what comes now adds a node to those that it is about
         known = key.from_key_stamp_ns == self._key_stamp_ns
         # Registration in the same key scans: errors of the steps between do not add up.
-        self._complete(key, since, bounded(key.covariance if known else self._since))
+        if known:
+            covariance = bounded(key.covariance)
+            self._complete(key, since, covariance, covariance * np.outer(key.factors, key.factors))
+        else:
+            covariance = bounded(self._since)
+            self._complete(key, since, covariance, covariance)
         try:
             return self._look_for_loops()
         except Exception as error:  # numerics of a library, or a fault of ours: it may cost loops, and nothing else
@@ -147,13 +153,14 @@ class ScanGraph:
         since: np.ndarray = se2.between(ends[0], ends[1]).numpy()
         return since
 
-    def _complete(self, key: KeyScanStep, since: np.ndarray, covariance: np.ndarray) -> None:
+    def _complete(self, key: KeyScanStep, since: np.ndarray, covariance: np.ndarray, published: np.ndarray) -> None:
         config = self.config
         floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
         self._steps.append(since)
         self._step_covariance.append(covariance + floor)
+        self._published_covariance.append(published + floor)
         pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
-        self._end = propagate(self._end, pose, since, covariance + floor)
+        self._end = propagate(self._end, pose, since, published + floor)
         self._nodes.append(pose)
         self._frames.append(len(self.odometry) - 1)
         self._scans.append(key.scan)
@@ -196,16 +203,18 @@ class ScanGraph:
         began = time.perf_counter()
         self._rows = np.flatnonzero(self._finder.loops.accepted)
         loops = self._finder.loops[self._rows]
-        chain = np.arange(self.keys - 1)
-        steps = RelativePoses.of_covariances(
-            np.stack((chain, chain + 1), axis=1), self._steps.values, self._step_covariance.values
-        )
+        steps = self._chain(self._step_covariance.values)
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         gates = np.ones(len(loops))
         self._running = ScanPoseGraph(steps, measured, gates, self._nodes.values, self.config.kernel)
         self._left = self.config.iterations
         self._waiting = 0
         self.took_s = time.perf_counter() - began
+
+    def _chain(self, covariance: np.ndarray) -> RelativePoses:
+        """The steps between the nodes, with covariances ``(keys - 1, 3, 3)``."""
+        chain = np.arange(self.keys - 1)
+        return RelativePoses.of_covariances(np.stack((chain, chain + 1), axis=1), self._steps.values, covariance)
 
     def advance(self, iterations: int) -> bool:
         """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
@@ -228,7 +237,9 @@ class ScanGraph:
         self.took_s += time.perf_counter() - began
         if self._left:
             return False
-        end = self._end if running.equations is None else running.equations.covariance([self.keys - 1])
+        end = self._end
+        if self.keys > 1:
+            end = running.covariance(self._chain(self._published_covariance.values), self.keys - 1)
         if not (np.isfinite(running.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running = None

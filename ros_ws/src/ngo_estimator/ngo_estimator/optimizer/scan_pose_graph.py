@@ -84,8 +84,6 @@ class ScanPoseGraph:
         self.poses = poses.copy()
         self.weights = gates.copy()
         """What the loops weigh ``(n,)``, zero to one."""
-        self.equations: NormalEquations | None = None
-        """Of the last step."""
         self.converged = False
         self._structure = GraphStructure(np.concatenate((steps.nodes, loops.nodes)), len(poses))
         self._cost = self._total(self.poses)
@@ -97,8 +95,7 @@ class ScanPoseGraph:
             self._steps.factors(self.poses, self._kernel_weights(self._steps)),
             self._loops.factors(self.poses, self.weights),
         ]
-        self.equations = NormalEquations(factors, self._structure)
-        step = self.equations.step()[0].numpy()
+        step = NormalEquations(factors, self._structure).step()[0].numpy()
         for _ in range(_HALVINGS):
             poses = self.poses + step
             cost = self._total(poses)
@@ -111,6 +108,14 @@ class ScanPoseGraph:
         poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
         self.converged = bool(np.abs(step).max() < _LEAST_STEP)
         self.poses, self._cost = poses, cost
+
+    def covariance(self, steps: RelativePoses, node: int) -> np.ndarray:
+        """Covariance ``(3, 3)`` of a node's pose where the steps are known as well as ``steps`` say."""
+        factors = [
+            steps.factors(self.poses, self._kernel_weights(self._steps)),
+            self._loops.factors(self.poses, self.weights),
+        ]
+        return NormalEquations(factors, self._structure).covariance([node])
 
     def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
         squared = (measured.residuals(self.poses) ** 2).sum(1)
