@@ -3,7 +3,7 @@
 A scan whose stamp is right sees the turn that the wheels report between the same stamps. For every lag of a grid the
 estimator sums the squared differences between both turns; the lag with the least sum explains the stamps. The wheels'
 own squares are means over one of their periods: interpolation between two noisy readings shrinks them, and lags that
-fall between readings would look better than the right one. Sums for lags and pairs of lags are kept.
+fall between readings would look better than the right one. One sum a lag is kept.
 """
 
 import math
@@ -20,13 +20,10 @@ _PERIODS = 33
 
 @dataclass(frozen=True)
 class WheelLagConfig:
-    """How the lag is estimated, in s: lags up to ``largest_s`` either way in steps of ``step_s``.
-
-    Turns that differ by more than ``largest_rad`` at every lag tell nothing: slip, frozen wheels and bad matches are no
-    lag. Neither do intervals over ``longest_s``, nor turns below ``least_turn_rad``. After ``fewest`` turns a lag
-    replaces the present one where its squares are smaller by ``significance`` deviations of the difference, as the
-    turns themselves scatter. Old turns fade with a half-life of ``half_life`` turns.
-    """
+    """How the lag is estimated, in s: lags up to ``largest_s`` either way in steps of ``step_s``. Turns that
+    differ by more than ``largest_rad`` at every lag tell nothing: slip, frozen wheels and bad matches are no lag. Intervals over ``longest_s`` tell nothing, nor do
+    turns below ``least_turn_rad``. After ``fewest`` turns a lag is significant where its sum is below that of the
+    present one by ``significance`` mean squares. Old turns fade with a half-life of ``half_life`` turns."""
 
     largest_s: float = 0.4
     step_s: float = 0.02
@@ -34,7 +31,7 @@ class WheelLagConfig:
     longest_s: float = 0.5
     least_turn_rad: float = 0.01
     fewest: int = 40
-    significance: float = 4.0
+    significance: float = 30.0
     half_life: int = 2000
 
     def __post_init__(self) -> None:
@@ -61,7 +58,6 @@ class WheelLag:
         count = round(self.config.largest_s / self.config.step_s)
         self._lags = np.arange(-count, count + 1) * self.config.step_s
         self._sums = np.zeros(len(self._lags))
-        self._products = np.zeros((len(self._lags), len(self._lags)))
         self._weight = 0.0
         self._waiting: deque[tuple[float, float, float]] = deque(maxlen=64)
         self.lag_s = 0.0
@@ -91,9 +87,7 @@ class WheelLag:
             fade = 0.5 ** (1.0 / self.config.half_life)
             if float(np.abs(turns - turn).min()) > self.config.largest_rad:
                 continue
-            squares = turn * turn - 2.0 * turn * turns + np.convolve(around**2, mean, "valid")
-            self._sums = fade * self._sums + squares
-            self._products = fade * self._products + np.outer(squares, squares)
+            self._sums = fade * self._sums + turn * turn - 2.0 * turn * turns + np.convolve(around**2, mean, "valid")
             self._weight = fade * self._weight + 1.0
             taken = True
         return taken and self._decide()
@@ -114,13 +108,10 @@ class WheelLag:
         before, least, after = self._sums[best - 1 : best + 2]
         bend = before - 2.0 * least + after
         lag = self._lags[best] + (0.5 * (before - after) / bend * self.config.step_s if bend > 0.0 else 0.0)
+        present = float(np.interp(self.lag_s, self._lags, self._sums))
         if abs(lag - self.lag_s) < 0.25 * self.config.step_s:
             return False
-        present = int(np.argmin(np.abs(self._lags - self.lag_s)))
-        products = self._products[np.ix_((present, best), (present, best))]
-        variance = products[0, 0] + products[1, 1] - 2.0 * products[0, 1]
-        gain = self._sums[present] - least
-        if present != best and gain < self.config.significance * math.sqrt(max(variance, 0.0)):
+        if present - least < self.config.significance * least / self._weight:
             return False
         self.lag_s = float(lag)
         return True
