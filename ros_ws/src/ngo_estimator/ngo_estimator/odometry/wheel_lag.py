@@ -1,9 +1,8 @@
 """The time by which wheel odometry and scans disagree, from the turns that both measure.
 
 A scan whose stamp is right sees the turn that the wheels report between the same stamps. For every lag of a grid the
-estimator sums the squared differences between both turns; the lag with the least sum explains the stamps. The wheels'
-own squares are means over one of their periods: interpolation between two noisy readings shrinks them, and lags that
-fall between readings would look better than the right one. One sum a lag is kept.
+estimator sums the squared differences between both turns; the lag with the least sum explains the stamps. One sum a
+lag is kept.
 """
 
 import math
@@ -14,14 +13,11 @@ import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array
 
-_PERIODS = 33
-"""The wheels' period is the median of so many readings, less one."""
-
 
 @dataclass(frozen=True)
 class WheelLagConfig:
-    """How the lag is estimated, in s: lags up to ``largest_s`` either way in steps of ``step_s``. Turns that
-    differ by more than ``largest_rad`` at every lag tell nothing: slip, frozen wheels and bad matches are no lag. Intervals over ``longest_s`` tell nothing, nor do
+    """How the lag is estimated, in s: lags up to ``largest_s`` either way in steps of ``step_s``. A difference of turns
+    counts at most ``largest_rad``: slip and bad matches are no lag. Intervals over ``longest_s`` tell nothing, nor do
     turns below ``least_turn_rad``. After ``fewest`` turns a lag is significant where its sum is below that of the
     present one by ``significance`` mean squares. Old turns fade with a half-life of ``half_life`` turns."""
 
@@ -72,34 +68,19 @@ class WheelLag:
     def update(self, stamps_s: Array, yaws: Array) -> bool:
         """Compare the waiting turns with the wheels' unwrapped yaws ``(n,)`` at stamps ``(n,)``; True for a new lag."""
         taken = False
-        if not self._waiting or len(stamps_s) < 2:
-            return False
-        lags, mean = self._around(min(float(np.median(np.diff(stamps_s[-_PERIODS:]))), self.config.largest_s))
-        while self._waiting and self._waiting[0][1] - lags[0] <= stamps_s[-1]:
+        while self._waiting and len(stamps_s) and self._waiting[0][1] + self.config.largest_s <= stamps_s[-1]:
             start_s, end_s, turn = self._waiting.popleft()
-            if start_s - lags[-1] < stamps_s[0]:
+            if start_s - self.config.largest_s < stamps_s[0]:
                 continue
-            around = np.interp(end_s - lags, stamps_s, yaws) - np.interp(start_s - lags, stamps_s, yaws)
-            beside = len(mean) // 2
-            turns = around[beside : len(around) - beside]
+            turns = np.interp(end_s - self._lags, stamps_s, yaws) - np.interp(start_s - self._lags, stamps_s, yaws)
             if max(abs(turn), float(np.abs(turns).max())) < self.config.least_turn_rad:
                 continue
             fade = 0.5 ** (1.0 / self.config.half_life)
-            if float(np.abs(turns - turn).min()) > self.config.largest_rad:
-                continue
-            self._sums = fade * self._sums + turn * turn - 2.0 * turn * turns + np.convolve(around**2, mean, "valid")
+            off = np.minimum(np.abs(turns - turn), self.config.largest_rad)
+            self._sums = fade * self._sums + off**2
             self._weight = fade * self._weight + 1.0
             taken = True
         return taken and self._decide()
-
-    def _around(self, period_s: float) -> tuple[Array, Array]:
-        """The lags and half a period beside them, and the weights of a mean over one period."""
-        beside = round(0.5 * period_s / self.config.step_s)
-        lags = np.arange(-beside, len(self._lags) + beside) * self.config.step_s + self._lags[0]
-        weights = np.ones(2 * beside + 1)
-        if beside:
-            weights[[0, -1]] = 0.5
-        return lags, weights / weights.sum()
 
     def _decide(self) -> bool:
         best = int(np.argmin(self._sums))
