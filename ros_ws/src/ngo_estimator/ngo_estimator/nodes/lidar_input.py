@@ -12,7 +12,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from ngo_common.nodes.qos import overridable
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes import messages
@@ -77,18 +76,9 @@ class LidarInput:
             listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
         # Every node on a robot publishes transforms: no single publisher is held on to.
         if settings.robot_odometry == "tf":
-            self._node.create_subscription(
-                TFMessage,
-                settings.tf_topic,
-                self._on_tf,
-                QoSProfile(depth=_DEPTH),
-                qos_overriding_options=overridable(),
-            )
+            listening.to_all(TFMessage, settings.tf_topic, self._on_tf, QoSProfile(depth=_DEPTH))
         latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        static = settings.tf_topic + "_static"
-        self._node.create_subscription(
-            TFMessage, static, self._on_static, latched, qos_overriding_options=overridable()
-        )
+        listening.to_all(TFMessage, settings.tf_topic + "_static", self._on_static, latched)
 
     def _on_static(self, message: TFMessage) -> None:
         for each in message.transforms:
@@ -173,6 +163,7 @@ class LidarInput:
         """Start anew with the next scan; returns what that means, in words."""
         self._core.reset()
         self._held.clear()
+        self._publish(None)
         return "the next scan is the new origin of the odometry"
 
     def details(self) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The subscriptions of a node whose messages come from one publisher a topic, and can't end the node."""
+"""The subscriptions of a node whose messages can't end it, most of them from one publisher a topic."""
 
 import traceback
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.status import NodeStatus
 
@@ -21,6 +22,16 @@ class Listening:
     def to(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
         """Take the messages of one publisher; their frames, where they have any, tell publishers apart."""
 
+        take = self._safe(topic, callback)
+        made = Input(self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s)
+        self._inputs.append(made)
+
+    def to_all(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
+        """Take the messages of all publishers."""
+        take = self._safe(topic, callback)
+        self._node.create_subscription(message_type, topic, take, qos, qos_overriding_options=overridable())
+
+    def _safe(self, topic: str, callback: Callable[[Any], None]) -> Callable[[Any], None]:
         def take(message: Any) -> None:
             try:
                 callback(message)
@@ -30,8 +41,7 @@ class Listening:
                 self._status.dropped(f"message on {topic}", reason)
                 self._node.get_logger().debug(traceback.format_exc())
 
-        made = Input(self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s)
-        self._inputs.append(made)
+        return take
 
     def set_timeout(self, timeout_s: float) -> None:
         """How long a publisher may be silent until another takes its place."""

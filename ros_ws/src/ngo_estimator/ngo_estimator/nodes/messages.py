@@ -128,7 +128,7 @@ def relative_step(message: RelativePose) -> "RelativeStep":
         from_place_code=np.array(message.from_place_code, np.float32) if message.from_place_code else None,
         key=_key_scan_step(message.key_scan[0]) if message.key_scan else None,
         origin_scan=_key_scan(message.origin_scan[0]) if message.origin_scan else None,
-        robot_odom_xyyaw=np.array(message.robot_odom) if len(message.robot_odom) == 3 else None,
+        robot_odom_xyyaw=np.array(message.robot_odom) if len(message.robot_odom) else None,
     )
 
 

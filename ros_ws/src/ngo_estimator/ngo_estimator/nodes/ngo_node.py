@@ -134,6 +134,7 @@ class NgoNode(LifecycleNode):
         self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
         self._paused = False
         self._gaps = self._restarts = self._new_gaps = 0
+        self._fault = ""
         self._begin_anew()
         self._live.lock()
         built.callback(self._live.lock, False)
@@ -232,6 +233,7 @@ class NgoNode(LifecycleNode):
             )
         self._gaps += update.gap
         self._new_gaps += update.gap
+        self._fault = update.fault or self._fault
         if update.optimized:
             self._last_correction_m = update.largest_move_m
             self._status.took("time an optimisation", self._core.optimization_s)
@@ -350,6 +352,9 @@ class NgoNode(LifecycleNode):
         if self._new_gaps:
             found.append(f"{self._new_gaps} gaps in the relative poses, bridged by the odometry")
             self._new_gaps = 0
+        if self._fault:
+            found.append(f"internal fault, the trajectory goes on by odometry: {self._fault}")
+            self._fault = ""
         if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:
             found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
         return found

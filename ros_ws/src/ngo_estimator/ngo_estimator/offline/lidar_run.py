@@ -39,11 +39,13 @@ class LidarRun:
         """Steps that bridge scans that were lost."""
         self.unsure = 0
         """Scans that did not say where they were taken."""
+        self.faults: list[str] = []
+        """What failed inside, in words; the trajectory went on by odometry there."""
 
     @property
     def facts(self) -> dict[str, Any]:
         """What else is worth keeping of the run."""
-        return {"unsure": self.unsure, "lag_s": self._odometry.lag_s}
+        return {"unsure": self.unsure, "lag_s": self._odometry.lag_s, "faults": len(self.faults)}
 
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
@@ -52,6 +54,8 @@ class LidarRun:
             lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
         if self.unsure:
             lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
+        if self.faults:
+            lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
         return lines
 
     def run(
@@ -87,10 +91,15 @@ class LidarRun:
                     update = self._online.update(step)
                     self.gaps += update.gap
                     self.unsure += step.unsure
+                    self._note_fault()
                     yield RecordedStep(step, update)
                 return
             except ValueError as error:
                 self._reject("not usable", str(error))
+
+    def _note_fault(self) -> None:
+        if self._online.fault:
+            self.faults.append(self._online.fault)
 
     def _reject(self, reason: str, example: str) -> None:
         self.rejected[reason] += 1
@@ -98,7 +107,8 @@ class LidarRun:
 
     def _finished(self, truth: Truth | None) -> Iterator[RecordedRun]:
         """The trajectory that ends here, if there is one."""
-        self._online.finish()
+        if self._online.finish() is None:
+            self._note_fault()
         trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
         self._online.reset()
         if trajectory is not None:

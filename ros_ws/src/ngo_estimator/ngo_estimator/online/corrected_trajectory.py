@@ -22,8 +22,9 @@ class TrajectoryUpdate:
     counts all of the trajectory. ``optimized`` says whether this step ended an optimisation, ``restarted`` whether it
     began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
     ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
-    optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. The arrays are
-    read-only and stay as they are.
+    optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. ``fault`` says
+    what failed inside, empty where nothing did: the trajectory goes on by odometry then. The arrays are read-only and
+    stay as they are.
     """
 
     stamp_ns: int
@@ -37,6 +38,7 @@ class TrajectoryUpdate:
     largest_move_m: float
     closed_loops: int
     window_fill: float
+    fault: str
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,10 @@ class PoseGraph(Protocol):
 
     loop_weights: np.ndarray
     took_s: float
+    optimized: bool
+    """Whether an optimisation ended since the newest frame came."""
+    fault: str
+    """What failed since the newest frame came, in words; empty where nothing did."""
 
     @property
     def running(self) -> bool:
@@ -109,6 +115,9 @@ class PoseGraph(Protocol):
     def abandon(self) -> None:
         """Leave undone what has begun."""
 
+    def fail(self, error: Exception) -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
 
@@ -135,8 +144,8 @@ class CorrectedTrajectory(ABC):
         """A graph without any frame."""
 
     @abstractmethod
-    def _check(self, step: RelativeStep) -> None:
-        """Raise ``RejectedStep`` for a step that cannot be used."""
+    def _checked(self, step: RelativeStep) -> RelativeStep:
+        """The step as it is taken; raises ``RejectedStep`` for one that cannot be used."""
 
     @abstractmethod
     def _begin_at(self, step: RelativeStep) -> None:
@@ -157,6 +166,11 @@ class CorrectedTrajectory(ABC):
         self._optimized = False
         self._odom = np.zeros(3)  # of the newest frame, on TF
 
+    @property
+    def fault(self) -> str:
+        """What failed in the last step, or in ``finish``, in words; empty where nothing did."""
+        return self._graph.fault
+
     def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
         """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
 
@@ -167,7 +181,7 @@ class CorrectedTrajectory(ABC):
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
                 that is a little late. The trajectory is as it was before.
         """
-        self._check(step)
+        step = self._checked(step)
         taken = self._log.take(step)
         if taken.begins:
             self._begin()
@@ -175,16 +189,23 @@ class CorrectedTrajectory(ABC):
             self._online.append(np.zeros(3))
         due = self._append(step, taken)
         self._odom = step.tf_odom_xyyaw
-        self._optimized = False
         if not optimize:
             self._graph.abandon()
-        elif due:
-            self._graph.begin()
-        if self._graph.running:
-            self._optimized = self._graph.advance(self._iterations_per_step)
+        self._optimized = self._optimise(due and optimize)
         update = self._result(taken.restarted, taken.gap)
         self._online.append(update.pose_xyyaw)
         return update
+
+    def _optimise(self, due: bool) -> bool:
+        """Go on with an optimisation, or begin one; returns whether the newest frame ended one."""
+        try:
+            if due:
+                self._graph.begin()
+            if self._graph.running:
+                self._graph.advance(self._iterations_per_step)
+        except Exception as error:  # numerics of a library, or a fault of ours: it may cost an optimisation, no more
+            self._graph.fail(error)
+        return self._graph.optimized
 
     @property
     def unfinished(self) -> bool:
@@ -197,8 +218,13 @@ class CorrectedTrajectory(ABC):
         return self._graph.took_s
 
     def finish(self) -> TrajectoryUpdate | None:
-        """Optimise what is left, when no more steps come; None where there is nothing."""
-        if self._log.steps == 0 or not self._graph.finish():
+        """Optimise what is left, when no more steps come; None where there is nothing, or where it failed."""
+        try:
+            done = self._log.steps > 0 and self._graph.finish()
+        except Exception as error:  # see _optimise
+            self._graph.fail(error)
+            done = False
+        if not done:
             return None
         self._optimized = True
         return self._result(restarted=False, gap=False)
@@ -234,6 +260,7 @@ class CorrectedTrajectory(ABC):
             largest_move_m=graph.largest_move_m if self._optimized else 0.0,
             closed_loops=int((graph.loop_weights > 0.5).sum()),
             window_fill=graph.window_fill,
+            fault=graph.fault,
         )
 
 

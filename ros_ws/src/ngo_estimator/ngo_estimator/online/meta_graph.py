@@ -90,6 +90,8 @@ class MetaGraph:
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         self._running: _Running | None = None
+        self.optimized, self.fault = False, ""
+        """Whether an optimisation ended, and what failed, since the newest frame came."""
         self.took_s = 0.0
         """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
         self._active, self._before = np.zeros(0, np.int64), np.zeros((0, 3))
@@ -116,6 +118,7 @@ class MetaGraph:
 
     def append(self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
         """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block."""
+        self.optimized, self.fault = False, ""
         log_std = 0.5 * np.log(variance)
         self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
         self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
@@ -128,8 +131,11 @@ class MetaGraph:
             self._loops.append(code)
         if (len(self.odometry) - 1) % self._block:
             return False
-        if self._running is not None:
-            self.advance(self._running.left)  # what comes now changes the nodes that it is about
+        if self._running is not None:  # what comes now changes the nodes that it is about
+            try:
+                self.advance(self._running.left)
+            except Exception as error:  # it may cost an optimisation, and nothing else
+                self.fail(error)
         self._complete_block()
         return True
 
@@ -301,6 +307,7 @@ class MetaGraph:
         self._running, self.took_s = None, running.took_s
         self._apply(running, running.result)
         self._pose, self._covariance = self._newest()
+        self.optimized = True
         return True
 
     @property
@@ -330,6 +337,11 @@ class MetaGraph:
     def abandon(self) -> None:
         """Leave undone what has begun."""
         self._running = None
+
+    def fail(self, error: Exception) -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+        self.fault = f"an optimisation failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self.abandon()
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""

@@ -99,8 +99,9 @@ class OnlineTrajectory(CorrectedTrajectory):
     def _new_graph(self) -> MetaGraph:
         return MetaGraph(self._optimizer, self._pair_head, self._window // self._block, self._key_frames)
 
-    def _check(self, step: RelativeStep) -> None:
+    def _checked(self, step: RelativeStep) -> RelativeStep:
         check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_length)
+        return step
 
     def _begin_at(self, step: RelativeStep) -> None:
         if self._pair_head is not None:
