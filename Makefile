@@ -40,7 +40,7 @@ train: build ## every network of a world, into the estimator's package: WORLD=ma
 		train_optimizer evaluate; do \
 		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) || exit; done
 
-results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d
+results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d|scan
 	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)
 
 bench: build ## speed of nodes and online core beside GTSAM, last a line of JSON: ARGS="--worlds maze3d"

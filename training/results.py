@@ -9,6 +9,7 @@ every row on mazes that nothing was trained or chosen on, and writes ``training/
 """
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from training import results_scan
 from training.baselines.network_odometry import open_odometry
 from training.common import runs
 from training.common.curves import write_at_once
@@ -189,4 +191,7 @@ def summary(
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    if {"scan", "--world=scan"} & set(sys.argv):
+        results_scan.main(tyro.cli(results_scan.Arguments, description=results_scan.__doc__))
+    else:
+        main(tyro.cli(Arguments, description=__doc__))

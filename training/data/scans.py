@@ -105,7 +105,8 @@ class ScannedMaze(gymnasium.Env[Any, Any]):
         observation, *rest, info = self._world.step(action)
         return self._scan(observation), *rest, info  # type: ignore[return-value]
 
-    def _scan(self, observation: np.ndarray) -> np.ndarray:
+    def rays(self, observation: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """What the scanner measures: its ranges ``(rays,)``, the angle of the first and the step to the next."""
         scanner, angles = self.scanner, self._world.ray_angles_rad
         half = math.radians(scanner.field_of_view_deg) / 2.0 + 1e-9
         # A ray straight back is cast twice, as the first and the last.
@@ -115,5 +116,8 @@ class ScannedMaze(gymnasium.Env[Any, Any]):
         ranges = depth + scanner.noise_m * self._noise.standard_normal(len(depth))
         lost = (depth > scanner.range_max_m) | (self._noise.random(len(depth)) < scanner.dropout)
         step = float(angles[1] - angles[0]) * scanner.every
-        ranges = np.where(lost, np.inf, ranges)
-        return scan_image(self._image, ranges, float(angles[chosen[0]]), step, 0.0, math.inf).reshape(-1)
+        return np.where(lost, np.inf, ranges), float(angles[chosen[0]]), step
+
+    def _scan(self, observation: np.ndarray) -> np.ndarray:
+        ranges, first, step = self.rays(observation)
+        return scan_image(self._image, ranges, first, step, 0.0, math.inf).reshape(-1)

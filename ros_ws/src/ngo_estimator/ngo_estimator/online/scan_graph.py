@@ -154,17 +154,21 @@ class ScanGraph:
         self._waiting += self._waiting > 0
         return self._waiting > config.keys_between or found > config.surprise
 
-    def begin(self) -> None:
-        """Begin to optimise all nodes."""
-        began = time.perf_counter()
-        self._rows = np.flatnonzero(self._finder.loops.accepted)
-        loops = self._finder.loops[self._rows]
+    def measurements(self) -> tuple[RelativePoses, RelativePoses]:
+        """The steps from each node to the next, and the accepted loops."""
+        loops = self._finder.loops[np.flatnonzero(self._finder.loops.accepted)]
         chain = np.arange(self.keys - 1)
         steps = RelativePoses.of_covariances(
             np.stack((chain, chain + 1), axis=1), self._steps.values, self._step_covariance.values
         )
-        measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
-        gates = np.ones(len(loops))
+        return steps, RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
+
+    def begin(self) -> None:
+        """Begin to optimise all nodes."""
+        began = time.perf_counter()
+        self._rows = np.flatnonzero(self._finder.loops.accepted)
+        steps, measured = self.measurements()
+        gates = np.ones(len(self._rows))
         self._running = ScanPoseGraph(steps, measured, gates, self._nodes.values, self.config.kernel)
         self._left = self.config.iterations
         self._waiting = 0
@@ -215,12 +219,13 @@ class ScanGraph:
         pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
         return pose, propagate(self._end, pose, since, self._since)
 
-    def frame_poses(self, before: bool = False) -> np.ndarray:
+    def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
         """Poses of all frames ``(frames, 3)``, as they are or as they were before the last optimisation.
 
-        The difference between two nodes and their odometry is spread evenly over the frames between.
+        The difference between two nodes and their odometry is spread evenly over the frames between. With ``nodes``
+        ``(nodes, 3)`` these are the poses of the nodes.
         """
-        nodes = self._nodes.values.copy()
+        nodes = (self._nodes.values if nodes is None else nodes).copy()
         if before:
             nodes[: len(self._before)] = self._before
         odometry, at = torch.from_numpy(self.odometry.values), self._frames.values

@@ -74,6 +74,11 @@ class ScanTrajectory:
         return update
 
     @property
+    def graph(self) -> ScanGraph:
+        """The graph of key scans."""
+        return self._graph
+
+    @property
     def unfinished(self) -> bool:
         """Whether loops wait for an optimisation, which later steps, or ``finish``, are to run."""
         return self._graph.running or self._graph.waiting
