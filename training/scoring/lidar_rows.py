@@ -53,6 +53,7 @@ class Estimate:
 class Pipeline:
     """Our estimators with the shipped settings, and what a row changes of them.
 
+    ``wheels`` are listened to where the robot has any.
     ``odometry`` and ``graph`` are changes of the front end and of the back end, by the setting's name with dots:
     ``{"loops.least_agreeing": 0}``.
     """
@@ -102,6 +103,7 @@ class DriveRuns:
 
     def run(self, pipeline: Pipeline) -> _Run:
         """Both estimators over the drive; raises ``ValueError`` where it gives no trajectory."""
+        pipeline = dataclasses.replace(pipeline, wheels=pipeline.wheels and bool(self.drive.wheels))
         key = identity_of(pipeline)
         if key not in self._runs:
             self._runs[key] = self._optimized(self._front(pipeline), pipeline.graph)
@@ -236,12 +238,12 @@ class Row:
 
 def _ours(**changes: Any) -> Row:
     pipeline = Pipeline(**changes)
-    return Row(partial(ours, pipeline=pipeline), pipeline, needs_wheels=pipeline.wheels)
+    return Row(partial(ours, pipeline=pipeline), pipeline)
 
 
 def _gtsam(solve: Solver) -> Row:
     config = GraphPeerConfig()
-    return Row(partial(graph_peer, solve=solve, config=config), config, True, (ngo_estimator, lidar_peers))
+    return Row(partial(graph_peer, solve=solve, config=config), config, code=(ngo_estimator, lidar_peers))
 
 
 def _mrpt(program: mrpt_slam.Program) -> Row:
@@ -261,7 +263,7 @@ ROWS: dict[str, Row] = {
     "ours_without_wheels": _ours(wheels=False),
     "gtsam_lm": _gtsam(lidar_peers.solve_lm),
     "gtsam_gnc": _gtsam(lidar_peers.solve_gnc),
-    "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), False, (lidar_peers,), _kiss_missing),
+    "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
     "icp_slam": _mrpt("icp-slam"),
     "rbpf_slam": _mrpt("rbpf-slam"),
     # The ablation.
