@@ -24,9 +24,9 @@ import ngo_sim
 from training.common import runs
 from training.common.curves import write_at_once
 from training.data import scans, simulated_drives
+from training.data.scans import CONDITIONS
 from training.data.simulated_drives import BUILDING_TEST_SEEDS, building_drive, maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
-from training.evaluate_scan import CONDITIONS
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, logs_below
 from training.report import lidar_figures, lidar_page

@@ -1,6 +1,6 @@
-"""Simulated 2D lidars: mazes of drawn width and pace, seen by scanners of drawn geometry and quality.
+"""Simulated 2D lidars: mazes of random width and pace, seen by lidars of random geometry and quality.
 
-What is drawn follows from the maze's seed alone, so an episode is the same wherever it is simulated.
+Everything random follows from the maze's seed, so an episode is the same wherever it is simulated.
 """
 
 from __future__ import annotations
@@ -20,6 +20,22 @@ from ngo_sim.mazes import Maze
 
 _CAST_RAYS = 721  # of the simulated scanner before its own rays are chosen: half a degree from one to the next
 _DRAWN, _NOISE = 7, 8  # numbers of the random generators of an episode, none of them the driver's
+
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "as drawn in training": {},
+    "noise 0 cm": {"noise_m": 0.0},
+    "noise 1 cm": {"noise_m": 0.01},
+    "noise 3 cm": {"noise_m": 0.03},
+    "noise 5 cm": {"noise_m": 0.05},
+    "dropouts 0 %": {"dropout": 0.0},
+    "dropouts 5 %": {"dropout": 0.05},
+    "dropouts 20 %": {"dropout": 0.2},
+    "noise 5 cm, dropouts 20 %": {"noise_m": 0.05, "dropout": 0.2},
+    "field of view 180 deg": {"field_of_view_deg": 180.0},
+    "field of view 360 deg": {"field_of_view_deg": 360.0},
+    "range 4 m": {"range_max_m": 4.0},
+}
+"""Conditions of the tables by name: what they change of the scanner that is drawn."""
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from training.data.batches import seen_from_first
 from training.scoring.lidar_scores import Scored
-from training.scoring.metrics import seen_from_first
 
 Drives = Mapping[str, Mapping[str, Scored]]
 

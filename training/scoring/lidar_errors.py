@@ -3,7 +3,7 @@
 import numpy as np
 
 from training.data.lidar_drives import Reference, ReferencePoses, Relations, TruePoses
-from training.scoring.metrics import seen_from_first, trajectory_error
+from training.scoring.metrics import trajectory_error
 from training.scoring.relations import interpolated, relation_errors
 
 Errors = dict[str, np.ndarray]

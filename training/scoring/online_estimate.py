@@ -1,4 +1,4 @@
-"""What a robot would have known at the time: each pose as the online estimator first gives it."""
+"""The online estimate: each pose as it was when its frame was the newest."""
 
 from collections.abc import Iterator
 

@@ -32,8 +32,8 @@ class LateStep(RejectedStep):
 class KeyScanStep:
     """The key scan that a step ends at, and where it was taken.
 
-    ``from_key_stamp_ns`` is the stamp of the key scan before it, from which the pose ``relative_xyyaw`` (3,) is seen, with
-    its ``covariance`` (3, 3).
+    ``from_key_stamp_ns`` is the stamp of the key scan before it. The pose ``relative_xyyaw`` (3,) is seen from there,
+    with its ``covariance`` (3, 3).
     """
 
     scan: KeyScan
@@ -49,8 +49,8 @@ class RelativeStep:
     ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
     ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
     ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
-    older one, which only the first step after a start has: of all others it came already. ``key`` is there where a lidar's
-    scan at the end of the step is a key scan, ``origin_scan``, the lidar's first scan, in the first step after a start.
+    older one, which only the first step after a start has: of all others it came already. ``key`` is there where the
+    step ends at a key scan of a lidar, ``origin_scan``, the lidar's first scan, in the first step after a start.
     ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one.
     """
 
@@ -66,6 +66,11 @@ class RelativeStep:
     key: KeyScanStep | None = field(default=None, kw_only=True)
     origin_scan: KeyScan | None = field(default=None, kw_only=True)
     robot_odom_xyyaw: np.ndarray | None = field(default=None, kw_only=True)
+
+    @property
+    def tf_odom_xyyaw(self) -> np.ndarray:
+        """Pose (3,) of the newer frame in the frame ``odom`` on TF: the robot's own where it has one."""
+        return self.odom_xyyaw if self.robot_odom_xyyaw is None else self.robot_odom_xyyaw
 
 
 def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:

@@ -29,9 +29,9 @@ _LEAST_POINTS = 3
 class LidarOdometryConfig:
     """How scans and wheels become odometry.
 
-    A scan waits for wheels at most ``wheel_wait_s``. Wheels that were silent for ``wheel_silence_s`` are not waited for.
-    A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are the smallest
-    variances of a step: what rounding leaves of a robot that stands.
+    A scan waits for wheels at most ``wheel_wait_s``. Wheels that were silent for ``wheel_silence_s`` are not waited
+    for. A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are
+    the smallest variances of a step.
     """
 
     points: ScanPointsConfig = field(default_factory=ScanPointsConfig)
@@ -47,14 +47,17 @@ class LidarOdometryConfig:
         positive = (self.wheel_wait_s, self.wheel_silence_s, self.least_variance_m2, self.least_variance_rad2)
         if not all(0.0 < value < math.inf for value in positive) or self.most_rays < 2:
             raise ValueError(
-                f"wheel_wait_s, wheel_silence_s, least_variance_m2, least_variance_rad2 are {positive} and most_rays is "
-                f"{self.most_rays}; expected positive numbers, and at least 2 rays"
+                f"wheel_wait_s, wheel_silence_s, least_variance_m2, least_variance_rad2 are {positive} and most_rays "
+                f"is {self.most_rays}; expected positive numbers, and at least 2 rays"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class LidarStep(RelativeStep):
-    """Motion between two scans; ``share`` of the points fit the walls seen before, ``unsure`` where the scan says nothing."""
+    """Motion between two scans.
+
+    ``share`` of the points fit the walls seen before. The scan of an ``unsure`` step does not say where it was taken.
+    """
 
     share: float
     unsure: bool
@@ -212,7 +215,7 @@ class LidarOdometry:
         return pose
 
     def _key_scan(self, scan: LidarScan) -> KeyScan:
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
         try:
@@ -242,4 +245,4 @@ class LidarOdometry:
             ends = self._wheels.pose_at(self._last.stamp_ns), self._wheels.pose_at(scan.stamp_ns)
             if ends[0] is not None and ends[1] is not None:
                 twist = between(ends[0], ends[1]) / between_s
-        return Sweep(scan.time_increment * np.arange(len(scan.ranges)), twist)
+        return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)

@@ -165,9 +165,7 @@ class ScanOdometry:
                 break
         return best, True
 
-    def _best(
-        self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float
-    ) -> Registration:
+    def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float) -> Registration:
         """The registration, among those from all starts, that fits most points."""
         best = self._icp(scan, starts[0], prior, open_share)
         for start in starts[1:]:

@@ -2,15 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-
-import numpy as np
+from typing import Any
 
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
-from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, Truth
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from ngo_estimator.trajectory.files import SpatialPoses, seconds
+from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 
 _REASONS: dict[type[ValueError], str] = {
@@ -42,12 +41,21 @@ class LidarRun:
         """Scans that did not say where they were taken."""
 
     @property
-    def lag_s(self) -> float:
-        """How much older the scans are than their stamps, by the wheels' clock."""
-        return self._odometry.lag_s
+    def facts(self) -> dict[str, Any]:
+        """What else is worth keeping of the run."""
+        return {"unsure": self.unsure, "lag_s": self._odometry.lag_s}
+
+    def remarks(self) -> list[str]:
+        """What a person should know of the run, a line each."""
+        lines = []
+        if lag_s := self._odometry.lag_s:
+            lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
+        if self.unsure:
+            lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
+        return lines
 
     def run(
-        self, records: Iterable[LidarScan | WheelPose], truth: SpatialPoses | None = None
+        self, records: Iterable[LidarScan | WheelPose], truth: Truth | None = None
     ) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.
 
@@ -88,10 +96,11 @@ class LidarRun:
         self.rejected[reason] += 1
         self.examples.setdefault(reason, example)
 
-    def _finished(self, truth: SpatialPoses | None) -> Iterator[RecordedRun]:
+    def _finished(self, truth: Truth | None) -> Iterator[RecordedRun]:
         """The trajectory that ends here, if there is one."""
         self._online.finish()
         trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
         self._online.reset()
         if trajectory is not None:
-            yield RecordedRun(trajectory, truth, np.zeros((0, 3)), walls)
+            true, residual = (truth or Truth()).poses()
+            yield RecordedRun(trajectory, true, residual, walls)

@@ -15,8 +15,9 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, poses_in_blocks
+from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
-from ngo_estimator.online.online_loops import Candidates, OnlineLoops
+from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.registered_odometry import registered_steps
@@ -229,7 +230,7 @@ class MetaGraph:
             nodes[self._gone] = se2.compose(new[segment], relative + share[:, None] * bent[segment]).numpy()
         return nodes
 
-    def _drift(self, found: Candidates) -> np.ndarray:
+    def _drift(self, found: KeptLoops) -> np.ndarray:
         """How far candidates to key frames may be off at most, as variances ``(n, 3)``; infinite for all others.
 
         The odometry alone would let a pose of long ago lie anywhere; the loops that were closed since say more.

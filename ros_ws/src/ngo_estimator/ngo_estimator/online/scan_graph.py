@@ -30,9 +30,9 @@ class ScanGraphConfig:
     """How key scans are optimised.
 
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
-    at once where a new loop is ``surprise`` deviations off the graph. Steps and loops are damped as by Cauchy, ``kernel``
-    deviations wide. To each step's covariance come ``step_m`` and ``step_deg`` (deviations), which registration in the
-    same few key scans does not see.
+    at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
+    ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to
+    each step's covariance: registration in the same few key scans does not see them.
     """
 
     loops: ScanLoopConfig = field(default_factory=ScanLoopConfig)

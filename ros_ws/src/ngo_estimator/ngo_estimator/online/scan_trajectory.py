@@ -45,7 +45,7 @@ class ScanTrajectory:
         self._online = GrowingRows((3,), np.float64)
         self._graph = ScanGraph(self._config)
         self._optimized = False
-        self._robot_odom: np.ndarray | None = None
+        self._odom = np.zeros(3)  # of the newest frame, on TF
 
     def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
         """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
@@ -61,7 +61,7 @@ class ScanTrajectory:
             self._graph.begin_at(step)
             self._online.append(np.zeros(3))
         due = self._graph.append(taken.relative, _bounded(taken.covariance), step.key)
-        self._robot_odom = step.robot_odom_xyyaw
+        self._odom = step.tf_odom_xyyaw
         self._optimized = False
         if not optimize:
             self._graph.abandon()
@@ -116,8 +116,7 @@ class ScanTrajectory:
 
     def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
         pose, covariance = self._graph.newest()
-        odom = self._log.last_odom if self._robot_odom is None else self._robot_odom
-        map_from_odom = se2.compose(torch.from_numpy(pose), se2.inverse(torch.from_numpy(odom))).numpy()
+        map_from_odom = se2.compose(torch.from_numpy(pose), se2.inverse(torch.from_numpy(self._odom))).numpy()
         return TrajectoryUpdate(
             stamp_ns=int(self._log.stamps_ns.values[-1]),
             pose_xyyaw=_read_only(pose),

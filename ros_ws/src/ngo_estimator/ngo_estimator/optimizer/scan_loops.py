@@ -41,7 +41,8 @@ class ScanLoopConfig:
 
     Every ``every``-th key asks, at up to ``most_per_key`` places that are ``least_gap_m`` of path and more behind it.
     Places are every ``place_step``-th key, with ``submap_keys`` keys around each; ``source_keys`` keys are searched
-    together, by ``search_points`` of their points. A place may be ``reach_m`` outside of the window. A match of places
+    together, by ``search_points`` of their points. A place may be ``reach_m`` outside of the window. Positions are
+    searched over ``search_factor`` times the window, so that a second peak beside it is seen. A match of places
     is searched ``match_m`` around the place. Points farther than ``range_m`` from the robot take no part in the search,
     and ``most_submaps`` submaps are kept: both bound the memory.
 
@@ -61,6 +62,7 @@ class ScanLoopConfig:
     source_keys: int = 4
     search_points: int = 300
     reach_m: float = 2.0
+    search_factor: float = 2.0
     match_m: float = 4.0
     range_m: float = 20.0
     most_submaps: int = 24
@@ -96,6 +98,8 @@ class ScanLoopConfig:
                 f"least_gap_m, reach_m, match_m, range_m, agreement_m, agreement_deg are {lengths}; expected finite "
                 "numbers from 0 on"
             )
+        if not 1.0 <= self.search_factor < math.inf:
+            raise ValueError(f"search_factor is {self.search_factor}; expected a finite number of at least 1")
         if not (self.most_disagreement >= 0.0 and 0.0 <= self.agreeing_per_deviation < math.inf):
             raise ValueError(
                 f"most_disagreement, agreeing_per_deviation are {self.most_disagreement}, "
@@ -247,8 +251,9 @@ class ScanLoopFinder:
             views, poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys, most=config.most_per_key
         )
         taken = [candidate.place for candidate in chosen]
+        wider = windows * (config.search_factor, config.search_factor, 1.0)
         chosen += [
-            _Candidate(place, between(poses[place], poses[key]), windows[place], windows[place])
+            _Candidate(place, between(poses[place], poses[key]), wider[place], windows[place])
             for place in near
             if place not in taken
         ]

@@ -1,8 +1,8 @@
 """A pose graph over key scans: a chain of steps and robust loops, each with a whole information matrix.
 
-It is the loop closing of the Neural Graph Optimizer where no network takes part: every iteration gates loops and steps by
-their residuals under the current poses, and takes a Gauss-Newton step. It begins at the last solution. A step is gated,
-as well, since registration can be wrong and sure of it: the graph may break there if loops say so.
+It is the loop closing of the Neural Graph Optimizer where no network takes part. Every iteration gates loops and steps
+by their residuals under the current poses, and takes a Gauss-Newton step. It begins at the last solution. Steps are
+gated since registration can be wrong and sure of it: the graph may break there if loops say so.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ _HALVINGS = 4
 class RelativePoses:
     """Measured poses of nodes, each seen from another.
 
-    ``nodes`` ``(n, 2)``: seen from the first, the second; ``relative`` ``(n, 3)`` (m, m, rad); ``root`` ``(n, 3, 3)``: a
-    root of the information matrix, ``root.T @ root``, along the axes of the first node.
+    ``nodes`` ``(n, 2)``: the second is seen from the first; ``relative`` ``(n, 3)`` (m, m, rad). ``root`` ``(n, 3, 3)``
+    makes the information matrix ``root.T @ root``, along the axes of the first node.
     """
 
     nodes: np.ndarray

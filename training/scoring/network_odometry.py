@@ -1,4 +1,4 @@
-"""The odometry of networks that rows of the results have for themselves, on the trajectories of a table."""
+"""The odometry of rows with a network of their own, on the trajectories of a table."""
 
 import json
 from collections.abc import Callable
@@ -12,17 +12,17 @@ from torch import Tensor
 from ngo_estimator.checkpoint import LOCAL, load_local
 from training.baselines.deepvo import DEEPVO, load_deepvo, trajectory_steps
 from training.common import runs
-from training.data.drive_plan import driven_in_table
-from training.data.streams import images_of
-from training.featurise import fill, open_store
-from training.scoring.metrics import seen_from_first
+from training.data.batches import seen_from_first
+from training.data.drive_plan import drives_of_table
+from training.data.episodes import images_of
+from training.data.feature_store import fill, open_store
 from training.scoring.table_rows import ROWS, Sources
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
 
 ARRAYS = ("relative", "truth")
-"""What a store of odometry holds: steps, and true poses after each of them, ``(trajectories, steps, 3)``."""
+"""Arrays of a store of odometry: steps, and true poses after each of them, ``(trajectories, steps, 3)``."""
 
 _MADE_WITH = "networks.json"
 _TOGETHER = 256  # pairs of frames that go through a network at once
@@ -52,11 +52,11 @@ def make_odometry(row: str, sources: Sources, split: str, table: str, count: int
         relative = steps_of(images_of(world, episode)).numpy()
         return {"relative": relative, "truth": seen_from_first(episode.poses_xyyaw)[1:]}
 
-    fill(store, world, driven_in_table(world, table, split, count), (0, 1), arrays_of)
+    fill(store, world, drives_of_table(world, table, split, count), (0, 1), arrays_of)
 
 
 def _network(kind: str, folder: Path, world: str) -> tuple[Callable[[Tensor], Tensor], str]:
-    """What makes steps ``(steps, 3)`` of images ``(steps + 1, height, width, channels)``, and the weights' hash."""
+    """A function from images ``(steps + 1, height, width, channels)`` to steps ``(steps, 3)``, and the hash."""
     if kind == DEEPVO:
         deepvo, description = load_deepvo(folder, world)
         return lambda images: trajectory_steps(deepvo, images), description["sha256"]

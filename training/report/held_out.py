@@ -1,8 +1,7 @@
-"""Measure what was trained on recordings on the recording that was held out: the table of the simulators, and plots."""
+"""The errors of networks of a robot on the recording that was held out: a table, and plots."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,6 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
@@ -20,15 +17,16 @@ from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_offline
 from ngo_estimator.trajectory.plot import TRUTH, save_plot
-from training.data.streams import relative_poses
-from training.featurise import Networks, features_of_track
-from training.recordings.recording_source import NO_LOOPS, RecordedData
+from training.data.batches import relative_poses, seen_from_first
+from training.data.features import OPTIMIZER_INPUTS, Networks
+from training.recordings.recording_features import features_of_track
+from training.recordings.recording_source import NO_LOOPS, RecordedArguments, open_recorded
 from training.recordings.recording_tracks import Track
+from training.report.error_table import print_errors
 from training.report.training_records import learning_curve
-from training.scoring.metrics import TrajectoryError, path_length_m, seen_from_first, trajectory_error
+from training.scoring.metrics import path_length_m, trajectory_error
 from training.scoring.online_estimate import online_poses, with_origin
 
-FEATURES = ("relative", "log_std", "motion", "codes", "origin_code")
 COLORS = {"odometry": "#2ca02c", "online": "#9467bd", "corrected": "#ff7f0e"}
 _MEAN_STEP = "mean step"
 _CURVES = {
@@ -40,7 +38,7 @@ _CURVES = {
 Poses = dict[str, np.ndarray]
 
 
-def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: bool = True) -> dict[str, Any]:
+def evaluate_recorded(recordings: RecordedArguments, weights: Path, runs: Path, online: bool = True) -> dict[str, Any]:
     """Print the table, write plots into ``runs/NAME/results`` and return the table.
 
     ``mean step`` is what an estimator does that knows the actions and looks at nothing: every step is the mean of those
@@ -49,33 +47,34 @@ def evaluate_recorded(data: RecordedData, weights: Path, runs: Path, online: boo
     Raises:
         ValueError: there are no steps to measure on, or the networks were trained on other ones.
     """
-    name = data.domain.name
+    name = recordings.name
     folder = weights / name
-    networks = Networks(load_local(folder, name)[0], load_place(folder, name)[0])
-    data.check_trained(networks.local.config)
+    local = load_local(folder, name)
+    data = open_recorded(recordings, runs, local)
+    networks = Networks(local[0], load_place(folder, name)[0])
     optimizer, description = load_optimizer(folder, name)
     tracks = [track for track in data.tracks("test") if len(track) > 2 * optimizer.block]
     tracks = [track for track in tracks if path_length_m(track.poses_xyyaw) > 0.0]
     if not tracks:
         raise ValueError(f"the held-out part has no stretch of {2 * optimizer.block} steps in which the robot moves")
     mean_steps = MeanSteps(data.tracks("train"))
-    measured: list[tuple[Track, Poses]] = []
+    estimates: list[tuple[Track, Poses]] = []
     for track in tqdm(tracks, desc=f"{name} held out"):
         features = features_of_track(data.domain, track, networks)
-        arrays = [torch.from_numpy(features[key]) for key in FEATURES]
+        arrays = [torch.from_numpy(features[key]) for key in OPTIMIZER_INPUTS]
         corrected = optimize_offline(optimizer, networks.place.pair_head, *arrays).poses[0]
         poses = {_MEAN_STEP: mean_steps.poses(track), "odometry": with_origin(se2.r2g(arrays[0]).numpy())}
         if online:
             core = OnlineTrajectory(optimizer, networks.place.pair_head, max(len(track), 2 * optimizer.block))
             poses["online"] = online_poses(core, features)
-        measured.append((track, {**poses, "corrected": with_origin(corrected.numpy())}))
-    result = {"name": name, "split": list(data.parts.words), **_table(name, measured)}
+        estimates.append((track, {**poses, "corrected": with_origin(corrected.numpy())}))
+    result = {"name": name, "split": list(data.parts.words), **_table(name, estimates)}
     if NO_LOOPS in description:
         result[NO_LOOPS] = description[NO_LOOPS]
         print(f"no loops are closed: {description[NO_LOOPS]}")
     out = runs / name / "results"
     out.mkdir(parents=True, exist_ok=True)
-    for path in draw(out, runs / name, measured):
+    for path in draw(out, runs / name, estimates):
         print(path)
     (out / "table.json").write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result))
@@ -101,28 +100,20 @@ def _actions(track: Track) -> Tensor:
     return torch.zeros(len(track) - 1) if track.actions is None else torch.from_numpy(track.actions)
 
 
-def _table(name: str, measured: list[tuple[Track, Poses]]) -> dict[str, Any]:
-    columns = [field.name for field in dataclasses.fields(TrajectoryError)]
-    frames = sum(len(track) for track, _ in measured)
-    driven = sum(path_length_m(track.poses_xyyaw) for track, _ in measured)
-    table = Table(
-        title=f"{name}, held out: {len(measured)} trajectories, {frames} frames, {driven:.1f} m: mean (median)"
-    )
-    for column in ("", *columns):
-        table.add_column(column)
-    result: dict[str, Any] = {"trajectories": len(measured), "frames": frames, "path_m": driven}
-    for kind in measured[0][1]:
-        errors = [dataclasses.astuple(trajectory_error(poses[kind], track.poses_xyyaw)) for track, poses in measured]
-        values = np.array(errors)
-        table.add_row(kind, *(f"{m:.3f} ({d:.3f})" for m, d in zip(values.mean(0), np.median(values, 0), strict=True)))
-        result[kind] = {column: float(mean) for column, mean in zip(columns, values.mean(0), strict=True)}
-    Console().print(table)
-    return result
+def _table(name: str, estimates: list[tuple[Track, Poses]]) -> dict[str, Any]:
+    frames = sum(len(track) for track, _ in estimates)
+    path_m = sum(path_length_m(track.poses_xyyaw) for track, _ in estimates)
+    errors = {
+        kind: [trajectory_error(poses[kind], track.poses_xyyaw) for track, poses in estimates]
+        for kind in estimates[0][1]
+    }
+    title = f"{name}, held out: {len(estimates)} trajectories, {frames} frames, {path_m:.1f} m"
+    return {"trajectories": len(estimates), "frames": frames, "path_m": path_m, **print_errors(title, errors)}
 
 
-def draw(out: Path, run: Path, measured: list[tuple[Track, Poses]]) -> list[Path]:
+def draw(out: Path, run: Path, estimates: list[tuple[Track, Poses]]) -> list[Path]:
     """Write the plots: the longest trajectory, errors against frames, and the learning curves; returns their paths."""
-    track, poses = max(measured, key=lambda one: len(one[0]))
+    track, poses = max(estimates, key=lambda one: len(one[0]))
     paths = [out / "trajectory.png", out / "error.png"]
     truth = seen_from_first(track.poses_xyyaw)
     shown = {kind: poses[kind] for kind in ("odometry", "corrected")}

@@ -1,6 +1,6 @@
-"""Everything that the tables of results need and that is missing: networks, features, settings and rows' weights.
+"""Make what the tables of results need and what is missing: networks, features, settings and weights of rows.
 
-What is there is left alone, and every script goes on where it was stopped, so this can be run again at any time.
+Existing files are left alone, and every command continues after a stop, so this can run again at any time.
 """
 
 import json
@@ -26,10 +26,10 @@ from training import (
     tune_pose_graph,
 )
 from training.baselines.deepvo import DEEPVO
-from training.baselines.network_odometry import make_odometry, open_odometry
 from training.common.curves import write_at_once
 from training.data.data_source import TRAIN_STORE
-from training.featurise import open_store
+from training.data.feature_store import open_store
+from training.scoring.network_odometry import make_odometry, open_odometry
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
 
@@ -120,12 +120,12 @@ def _smoother(sources: Sources, scripts: Scripts) -> Iterator[Step]:
 
 def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-    known = {
+    needed = {
         "loops": True,
         "registered": sources.world.registers_odometry,
         "smoothed": sources.world.smoothing,
     }
-    for form in (form for form in tune_pose_graph.FORMS if known[form]):
+    for form in (form for form in tune_pose_graph.FORMS if needed[form]):
         changes = {**common, "form": form}
         arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
         what = "tuning of the pose graph" + ("" if form == "loops" else f", {form}")
@@ -212,8 +212,8 @@ def _own_odometry(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterato
 
 def _speed(sources: Sources, scripts: Scripts) -> None:
     world: Any = sources.world.name
-    measured = throughput.main(replace(scripts.speed, world=world))
-    write_at_once(sources.speed_file, json.dumps(measured) + "\n")
+    speed = throughput.main(replace(scripts.speed, world=world))
+    write_at_once(sources.speed_file, json.dumps(speed) + "\n")
 
 
 def _call(main: Callable[[Any], object], arguments: Any) -> Callable[[], object]:

@@ -1,4 +1,4 @@
-"""What a training gets its batches from: a stream for each epoch, and batches to be measured on that are made once."""
+"""Batches of a training for Lightning: a stream for each epoch, and validation batches that are made once."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -6,7 +6,8 @@ from functools import cached_property
 import lightning
 from torch.utils.data import DataLoader, IterableDataset
 
-from training.data.streams import Batch, Share, loader
+from training.data.batches import Batch, Share
+from training.data.streams import loader
 
 EpochStream = Callable[[int, Share], IterableDataset[Batch]]
 """Makes the stream of an epoch, for one of the processes that train together."""
