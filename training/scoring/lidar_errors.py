@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from training.data.batches import seen_from_first
 from training.data.lidar_drives import Reference, ReferencePoses, Relations, TruePoses
 from training.scoring.metrics import trajectory_error
 from training.scoring.relations import interpolated, relation_errors
