@@ -22,6 +22,7 @@ from tqdm import tqdm
 import ngo_recordings
 import ngo_sim
 from training.common import runs
+from training.common.command_line import run_command
 from training.common.curves import write_at_once
 from training.data import scans, simulated_drives
 from training.data.scans import CONDITIONS
@@ -33,7 +34,7 @@ from training.report import lidar_figures, lidar_page
 from training.scoring.lidar_bars import PUBLISHED, Bar, Table, bars
 from training.scoring.lidar_rows import ROWS, Row
 from training.scoring.lidar_scores import DriveSource, Scored, score_drive
-from training.scoring.statistics import mean_interval
+from training.scoring.statistics import compare, mean_interval
 
 Numbers = dict[str, dict[str, Any]]
 """``{mean, ci95}`` by the metric's key."""
@@ -41,6 +42,7 @@ Numbers = dict[str, dict[str, Any]]
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
 _SIMULATED = (ngo_sim, scans, simulated_drives)
 _READ = (ngo_recordings, lidar_logs)
+_PAIRED = "ate_m"
 _SCANNER_ROWS = ("ours_without_wheels",)
 
 
@@ -96,12 +98,13 @@ def main(arguments: Arguments) -> dict[str, Any]:
     found = bars(tables, scanners)
     logs = tables.pop("logs", {})
     result = {
-        "command": f"{record['command']} --world scan{' --logs FOLDER' if logs else ''}",
+        "command": _command(record["command"], bool(logs)),
         "revision": record["revision"],
         "settings": {name: getattr(arguments, name) for name in ("buildings", "length_m", "mazes", "frames")},
         "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
         "tables": {name: _table_numbers(table) for name, table in tables.items()},
         "scanners": {name: _table_numbers(table) for name, table in scanners.items()},
+        "paired": {name: _paired(table) for name, table in {"logs": logs, **tables}.items()},
         "bars": [bar.as_json() for bar in found],
         "skipped": skipped,
         "failed": _failures({"logs": logs, **tables, **scanners}),
@@ -113,6 +116,11 @@ def main(arguments: Arguments) -> dict[str, Any]:
     write_at_once(arguments.docs / "results_scan.md", lidar_page.page(result, images))
     _print(found, skipped)
     return result
+
+
+def _command(recorded: str, with_logs: bool) -> str:
+    flags = recorded.partition("training.results")[2].split() + (["--logs", "FOLDER"] if with_logs else [])
+    return " ".join(("make results WORLD=scan", *([f'ARGS="{" ".join(flags)}"'] if flags else [])))
 
 
 def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
@@ -221,6 +229,19 @@ def _table_numbers(table: Table) -> dict[str, Numbers]:
     return {row: {key: _interval(np.array(values)) for key, values in errors.items()} for row, errors in by_row.items()}
 
 
+def _paired(table: Table) -> dict[str, Any]:
+    """By row: how much larger its ATE is than ours on the same drives, in a table of two drives or more."""
+    by_row: dict[str, list[tuple[float, float]]] = {}
+    for rows in table.values():
+        ours = rows["ours"].errors if "ours" in rows else {}
+        for row, scored in rows.items():
+            if row != "ours" and _PAIRED in ours and _PAIRED in scored.errors:
+                by_row.setdefault(row, []).append((float(scored.errors[_PAIRED][0]), float(ours[_PAIRED][0])))
+    return {
+        row: {_PAIRED: compare(*np.array(pairs).T).as_json()} for row, pairs in by_row.items() if len(pairs) > 1
+    }  # fmt: skip
+
+
 def _failures(tables: Mapping[str, Table]) -> list[str]:
     return [
         f"{table}, {drive}, {row}: {scored.failed}"
@@ -238,3 +259,7 @@ def _print(found: Sequence[Bar], skipped: Sequence[str]) -> None:
         console.print(f"{'met   ' if bar.met else 'MISSED'}  {bar.name}: {bar.value:.4g}, {limit}", soft_wrap=True)
     for text in skipped:
         console.print(f"skipped  {text}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)

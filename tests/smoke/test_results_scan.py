@@ -33,6 +33,7 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     ate = result["tables"]["buildings"]["ours"]["ate_m"]
     assert 0.0 < ate["mean"] < 0.3
     assert ate["ci95"][0] <= ate["mean"] <= ate["ci95"][1]
+    assert result["paired"]["buildings"]["wheels"]["ate_m"]["relative_percent"]["mean"] > 0.0
     assert result["logs"] == {}
     assert result["failed"] == []
     assert [line for line in result["skipped"] if line.startswith("logs: no folder")]

@@ -56,6 +56,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
             f"{settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} m "
             "each, with drawn scanners and wheels.",
             _table(result["tables"][name], _BUILDING_COLUMNS),
+            _against_ours(result["paired"][name]),
         ]
     parts += [
         "## Mazes, scanners of many qualities",
@@ -105,6 +106,16 @@ def _across(logs: Mapping[str, Any], key: str) -> str:
     rows = list(dict.fromkeys(row for numbers in logs.values() for row in numbers if key in numbers[row]))
     body = [[_TITLES.get(row, row), *(_number(logs[log].get(row, {}).get(key)) for log in logs)] for row in rows]
     return _markdown(["", *logs], body)
+
+
+def _against_ours(paired: Mapping[str, Any]) -> str:
+    """How much larger each row's ATE is than ours, with its interval, in one line each."""
+    body = []
+    for row, numbers in paired.items():
+        relative = numbers["ate_m"]["relative_percent"]
+        low, high = relative["ci95"]
+        body.append([_TITLES.get(row, row), f"{relative['mean']:+.1f} [{low:+.1f}, {high:+.1f}]"])
+    return _markdown(["ATE against ours, same drives", "%"], body)
 
 
 def _scanners(result: Mapping[str, Any]) -> str:
