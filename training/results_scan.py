@@ -42,6 +42,7 @@ Numbers = dict[str, dict[str, Any]]
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
 _SIMULATED = (ngo_sim, scans, simulated_drives)
 _READ = (ngo_recordings, lidar_logs)
+_MOST_SCANS = 20_000  # of a building: some robots stand for hours
 _PAIRED = "ate_m"
 _SCANNER_ROWS = ("ours_without_wheels",)
 
@@ -143,8 +144,8 @@ def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSo
         table: [
             DriveSource(
                 f"{table}_{seed}",
-                f"building {seed} {table} {arguments.length_m:g} m",
-                partial(building_drive, seed, arguments.length_m, table == "aliased"),
+                f"building {seed} {table} {arguments.length_m:g} m, {_MOST_SCANS} scans",
+                partial(building_drive, seed, arguments.length_m, table == "aliased", _MOST_SCANS),
                 _SIMULATED,
             )
             for seed in chosen

@@ -35,9 +35,9 @@ class MrptConfig:
     takes longer than ``limit_s`` is stopped.
     """
 
-    step_m: float = 0.25
-    step_deg: float = 10.0
-    most_rays: int = 181
+    step_m: float = 0.2
+    step_deg: float = 5.0
+    most_rays: int = 361
     limit_s: float = 1200.0
 
     def __post_init__(self) -> None:
