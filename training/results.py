@@ -2,6 +2,7 @@
 
     python -m training.results --world maze2d
     python -m training.results --world maze3d
+    python -m training.results --world scan      # of the lidar: training.results_scan
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
 measured in mazes that nothing was trained or chosen on. The command writes ``training/results/WORLD.json``,
@@ -191,7 +192,7 @@ def summary(
 
 
 if __name__ == "__main__":
-    if {"scan", "--world=scan"} & set(sys.argv):
+    if "--world scan" in " ".join(sys.argv).replace("--world=", "--world "):
         run_command(results_scan.main, results_scan.Arguments, results_scan.__doc__)
     else:
         run_command(main, Arguments, __doc__)

@@ -1,6 +1,8 @@
 """The lidar's results at toy size: every row, the files, and a second run that computes nothing."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -55,3 +57,11 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_row_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ValueError, match="gtsam_lm"):
         results_scan.Arguments(rows=("gtsam",))
+
+
+@pytest.mark.parametrize("world", [("--world", "scan"), ("--world=scan",)])
+def test_the_command_of_results_takes_the_lidar(world: tuple[str, ...]) -> None:
+    command = [sys.executable, "-m", "training.results", *world, "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    assert "--logs" in shown
+    assert "--prefixes" not in shown
