@@ -31,24 +31,10 @@ from ngo_sim.maze2d import Maze2DConfig
 from training.common import runs
 from training.data.episodes import simulate
 from training.data.features import OPTIMIZER_INPUTS, features_of
-from training.data.scans import ScannedMaze
+from training.data.scans import CONDITIONS, ScannedMaze
 from training.data.worlds import WORLDS
 from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
 
-CONDITIONS: dict[str, dict[str, Any]] = {
-    "as drawn in training": {},
-    "noise 0 cm": {"noise_m": 0.0},
-    "noise 1 cm": {"noise_m": 0.01},
-    "noise 3 cm": {"noise_m": 0.03},
-    "noise 5 cm": {"noise_m": 0.05},
-    "dropouts 0 %": {"dropout": 0.0},
-    "dropouts 5 %": {"dropout": 0.05},
-    "dropouts 20 %": {"dropout": 0.2},
-    "noise 5 cm, dropouts 20 %": {"noise_m": 0.05, "dropout": 0.2},
-    "field of view 180 deg": {"field_of_view_deg": 180.0},
-    "field of view 360 deg": {"field_of_view_deg": 360.0},
-    "range 4 m": {"range_max_m": 4.0},
-}
 OWN_SCANNER = "maze2d"
 
 
