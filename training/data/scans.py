@@ -1,5 +1,7 @@
 """Simulated 2D lidars: mazes of random width and pace, seen by lidars of random geometry and quality.
 
+Estimators are measured on these mazes, and nothing is trained on them.
+
 Everything random follows from the maze's seed, so an episode is the same wherever it is simulated.
 """
 
@@ -56,7 +58,7 @@ class Scanner:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Scanner:
-        """A scanner like those that the networks learn from."""
+        """A scanner of the tables: what it sees varies from maze to maze."""
         every = int(rng.integers(1, 5))
         return cls(
             every=every,
@@ -66,6 +68,15 @@ class Scanner:
             dropout=float(rng.uniform(0.0, 0.05)),
             range_max_m=float(np.exp(rng.uniform(math.log(4.0), math.log(30.0)))),
         )
+
+
+SCAN_IMAGE = ImageFormat(
+    height=1, width=289, channels=1, dtype="float32", field_of_view_deg=360.0, depth_gain_m=1.5, depth_softening_m=0.75
+)
+"""A format of scans that covers all directions, as networks for scanners of any geometry take it."""
+
+ROWS = (4, 7)
+"""Range of the rows of a table's mazes, both ends included."""
 
 
 def drawn_config(rng: np.random.Generator, size: Mapping[str, int]) -> Maze2DConfig:
