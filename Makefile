@@ -9,11 +9,12 @@ FRAMES ?= 1000
 DATA ?=
 NAME ?= my_robot
 ARGS ?=
+TRAIN_ARGS ?=
 
 export PYTHON ROS V
 
-TYPED := ros_ws/src/ngo_common/ngo_common ros_ws/src/ngo_recordings/ngo_recordings ros_ws/src/ngo_sim/ngo_sim ros_ws/src/ngo_estimator/ngo_estimator \
-	tools/ros2_stand_in training demo benchmarks
+TYPED := ros_ws/src/ngo_common/ngo_common ros_ws/src/ngo_recordings/ngo_recordings ros_ws/src/ngo_sim/ngo_sim \
+	ros_ws/src/ngo_estimator/ngo_estimator tools/ros2_stand_in training demo benchmarks
 
 OPEN := . ./env.sh
 
@@ -35,10 +36,13 @@ build: venv ## the workspace, with colcon
 demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000
 	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
 
-train: build ## every network of a world, into the estimator's package: WORLD=maze3d|maze2d|scan, or DATA="a.mcap b.mcap" NAME=my_robot
+# ARGS goes to every script of the chain (topics, --holdout, --reduction), TRAIN_ARGS to those that train networks alone
+# (--precision, --accelerator, --devices, --strategy, --seed, --epochs).
+train: build ## every network: WORLD=maze3d|maze2d|scan, or DATA="a.mcap b.mcap" NAME=my_robot ARGS="--image /scan"; TRAIN_ARGS="--precision 32-true"
 	@$(OPEN) && for script in train_local train_place featurise $(if $(filter maze3d-,$(WORLD)-$(DATA)),train_smoother) \
 		train_optimizer evaluate; do \
-		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) || exit; done
+		case $$script in train_*) own="$(TRAIN_ARGS)" ;; *) own= ;; esac; \
+		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) $$own || exit; done
 
 results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d
 	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)

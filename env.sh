@@ -75,6 +75,8 @@ _ngo_env_open() {
         return 1
     fi
     _ngo_env_has "$PATH" "$_ngo_root/tools" || export PATH="$PATH:$_ngo_root/tools"
+    # `python -m training...`, demo and benchmarks from any folder.
+    _ngo_env_has "${PYTHONPATH-}" "$_ngo_root" || export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}$_ngo_root"
     if [ -n "$_ngo_nounset" ]; then set -u; fi
     unset _ngo_root _ngo_underlay _ngo_shell _ngo_nounset _ngo_entry
     unset -f _ngo_env_open _ngo_env_fail _ngo_env_prepend _ngo_env_has

@@ -20,9 +20,9 @@ from ngo_estimator.geometry import se2
 from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.episodes import Episode
 from training.common.runs import ROOT, WEIGHTS
+from training.data.batches import seen_from_first
+from training.data.features import features_of
 from training.data.worlds import MazeSize, world_named
-from training.featurise import features_of
-from training.scoring.metrics import seen_from_first
 
 SIZES = {"maze2d": MazeSize(7, 8), "maze3d": MazeSize()}
 """The mazes that are driven through."""

@@ -28,7 +28,7 @@ export NGO_ENV_UNDERLAY_ONLY=1
 
 paths=(src) cmake_args=(-DBUILD_TESTING=OFF)
 if [ "$(cat "$VENV/ngo_underlay")" = wheels ]; then
-    # What the wheels lack, and what keeps CMake from using them.
+    # tf2_msgs, which the wheels lack, and a workaround for their CMake files.
     paths+=(wheels)
     cmake_args+=("-DCMAKE_PROJECT_INCLUDE=$ROOT/ros_ws/wheels/drop_missing_python_includes.cmake")
 fi

@@ -1,4 +1,4 @@
-# What the build scripts share: where things are, which ROS 2 is used, how a step is shown.  Sourced, never run.
+# Functions of all build scripts: paths, the choice of the ROS 2, the display of a step. Sourced, never run.
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." >/dev/null && pwd)"
 VENV="$ROOT/.venv"

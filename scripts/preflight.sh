@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Checks that this machine has what the build needs, before anything is installed. One line for each thing that is missing.
+# Checks the machine's tools before anything is installed. Prints one line for each missing tool.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
@@ -45,4 +45,4 @@ if [ ! -d "$VENV" ]; then
     [ "$free_mib" -ge 4096 ] || lack "4 GiB of free disk space for .venv: $ROOT has $free_mib MiB"
 fi
 
-[ "$missing" = 0 ] || die "this machine lacks what is listed above"
+[ "$missing" = 0 ] || die "the tools listed above are missing"

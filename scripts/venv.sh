@@ -6,7 +6,7 @@ set -euo pipefail
 one_at_a_time
 
 underlay="$(find_underlay)"
-# The key goes by what decides the content, not by times of files: a fresh checkout of the same pins changes nothing.
+# The key depends on the pins, not on times of files: a fresh checkout of the same pins changes nothing.
 key="$(cat "$ROOT"/requirements/*.txt | sha256sum | cut -c 1-16) $underlay"
 if [ -x "$VENV/bin/python" ] && [ "$(cat "$VENV/ngo_key" 2>/dev/null)" = "$key" ]; then
     if [ -z "${PYTHON-}" ] || [ "$("$PYTHON" -V 2>&1)" = "$("$VENV/bin/python" -V)" ]; then

@@ -1,10 +1,10 @@
-"""Fit how far errors of the corrected pose are beyond the covariance that the optimizer states, on validation mazes.
+"""Fit the covariance of the corrected pose to its errors on validation mazes.
 
     python -m training.calibrate_covariance --world maze3d
 
-The covariance follows from what the optimizer believes of steps and loops, and it believes too much where their errors
-are alike. One factor, the mean normalised squared error of the newest pose (1 where the covariance is right), goes into
-the description of the weights.
+The optimizer treats errors of steps and loops as independent. They are not, so its covariance is too small. One factor
+corrects this: the mean normalised squared error of the newest pose (1 where the covariance is right). It goes into the
+description of the weights.
 """
 
 import dataclasses
@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training.common import runs
-from training.data.streams import simulate
+from training.common.command_line import run_command
+from training.data.episodes import simulate
+from training.data.features import features_of
 from training.data.worlds import VALIDATION_SEEDS, WorldName, world_named
-from training.featurise import features_of
 from training.scoring.online_estimate import steps_of
 
 _OWN = ("format", "network", "world", "sha256", "config")
@@ -59,7 +59,7 @@ def main(arguments: Arguments) -> float:
     optimizer.config = dataclasses.replace(plain, covariance_scale=scale)
     details = {key: value for key, value in description.items() if key not in _OWN}
     save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, world.name, details)
-    print(f"{world.name}: squared errors are {scale:.2f} times what the covariance says; it is multiplied with that")
+    print(f"{world.name}: squared errors are {scale:.2f} times the covariance, which gets this factor")
     return scale
 
 
@@ -77,4 +77,4 @@ def normalized_errors(core: OnlineTrajectory, features: dict[str, np.ndarray]) -
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

@@ -4,41 +4,38 @@
     python -m training.evaluate --data drive_1.mcap drive_2.mcap --name my_robot
     python -m training.evaluate --estimate odometry.tum online.tum corrected.tum --truth truth.tum
 
-With `--world`, a world's networks drive through whole trajectories of a split: their odometry, the online estimate
-(each pose as it was first published) and the corrected one (the final path). With `--data`, what was trained on
-recordings is measured on the one that was held out, with plots in RUNS/NAME/results. With `--estimate`,
-trajectories in the TUM format are compared by ATE, RPE and KITTI's segment errors, as evo does. The last line printed
-is the table as one JSON object.
+`--world` drives through whole mazes of a split. It measures the odometry, the online estimate (each pose when it was
+first published) and the corrected path at the end. `--data` measures the networks of a robot on the recording that was
+held out, with plots in RUNS/NAME/results. `--estimate` compares TUM files by ATE, RPE and KITTI's segment errors, with
+the definitions of evo. The last line is the table as one JSON object.
 """
 
-import dataclasses
 import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 import tyro
-from rich.console import Console
-from rich.table import Table
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_offline
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings
 from training.common import runs
-from training.data.streams import simulate
+from training.data.episodes import simulate
+from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
-from training.featurise import features_of
-from training.recordings.recording_source import RecordedArguments, open_recorded
+from training.recordings.recording_source import RecordedArguments
+from training.report.error_table import print_errors
+from training.report.held_out import evaluate_recorded
 from training.scoring.file_errors import evaluate_files
 from training.scoring.metrics import TrajectoryError, trajectory_error
 from training.scoring.online_estimate import run_online, with_origin
-from training.scoring.recording_errors import FEATURES, evaluate_recorded
 
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
@@ -50,7 +47,7 @@ class Arguments:
     world: WorldName | None = None
     """World to measure in."""
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings that networks were trained on, and how: as given to the training."""
+    """Recordings of the training, with the same arguments."""
     split: Literal["validation", "test"] = "validation"
     """Mazes to measure on."""
     trajectories: int = 20
@@ -60,28 +57,28 @@ class Arguments:
     weights: Path = runs.WEIGHTS
     """Folder with NAME/*.safetensors."""
     online: bool = True
-    """Whether to measure the online estimate, too, which runs the optimizer at every eighth frame."""
+    """Whether to measure the online estimate also; it runs the optimizer at every eighth frame."""
     window_frames: int = 0
-    """Frames of the online estimate's window; 0 for all of them. With a window the path that it leaves at the end, with
-    key frames before it, is measured, too, as `bounded`."""
+    """Frames of the online estimate's window; 0 for all. With a window there is one more row: `bounded`, the path at
+    the end, with key frames before the window."""
     key_frames: int = 128
     """Key frames before that window."""
     estimate: tuple[Path, ...] = ()
-    """Estimated trajectories in the TUM format, to be compared with `--truth` instead of measuring in a world."""
+    """Estimated trajectories in the TUM format, to compare with `--truth`."""
     truth: Path | None = None
     """True trajectory in the TUM format."""
     files_tolerance_s: float = 0.01
-    """Files: how far apart in time an estimated and a true pose of one moment may be."""
+    """Files: largest time between an estimated pose and the true pose that it is compared with."""
     delta: float = 1.0
-    """Files: between poses how far apart the RPE is taken."""
+    """Files: distance between the two poses of the RPE."""
     delta_unit: Literal["frames", "metres"] = "frames"
-    """Files: what delta counts."""
+    """Files: unit of delta."""
     all_pairs: bool = False
-    """Files: whether the RPE is taken from every pose, or from the end of one pair to the next."""
+    """Files: whether pairs of the RPE start at every pose, or at the end of the pair before."""
     segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
     """Files: lengths of KITTI's segments."""
     runs: Path = runs.ROOT / "runs"
-    """Recordings: folder of what was read from them; gets NAME/results/."""
+    """Recordings: folder with NAME/data, which was read from them; gets NAME/results/."""
 
     def __post_init__(self) -> None:
         given = (self.world is not None) + bool(self.recordings.data) + bool(self.estimate)
@@ -90,7 +87,7 @@ class Arguments:
 
     @property
     def report_settings(self) -> ReportSettings:
-        """What is measured of files."""
+        """Settings of the comparison of files."""
         delta = RelativeDelta(self.delta, self.delta_unit, self.all_pairs)
         return ReportSettings(self.files_tolerance_s, delta, self.segment_lengths_m)
 
@@ -98,8 +95,7 @@ class Arguments:
 def main(arguments: Arguments) -> dict[str, object]:
     """Print the table and return it."""
     if arguments.recordings.data:
-        data = open_recorded(arguments.recordings, arguments.runs)
-        return evaluate_recorded(data, arguments.weights, arguments.runs, arguments.online)
+        return evaluate_recorded(arguments.recordings, arguments.weights, arguments.runs, arguments.online)
     if arguments.world is None:
         assert arguments.truth is not None
         return {**evaluate_files(arguments.estimate, arguments.truth, arguments.report_settings)}
@@ -118,7 +114,7 @@ def main(arguments: Arguments) -> dict[str, object]:
         for group in (seeds[i : i + 8] for i in range(0, len(seeds), 8)):
             for episode in simulate(world, group, frames):
                 features = features_of(world, episode, folder, (local, place))
-                arrays = [torch.from_numpy(features[name]) for name in FEATURES]
+                arrays = [torch.from_numpy(features[name]) for name in OPTIMIZER_INPUTS]
                 corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
                 poses = {
                     "odometry": with_origin(se2.r2g(arrays[0]).numpy()),
@@ -136,19 +132,11 @@ def main(arguments: Arguments) -> dict[str, object]:
         "trajectories": len(seeds),
         "frames": frames,
     }
-    table = Table(title=f"{world.name}, {len(seeds)} {arguments.split} mazes of {frames} frames: mean (median)")
-    columns = [field.name for field in dataclasses.fields(TrajectoryError)]
-    for column in ("", *columns):
-        table.add_column(column)
-    for name, found in errors.items():
-        values = np.array([dataclasses.astuple(error) for error in found])
-        table.add_row(name, *(f"{m:.3f} ({d:.3f})" for m, d in zip(values.mean(0), np.median(values, 0), strict=True)))
-        result[name] = {column: float(mean) for column, mean in zip(columns, values.mean(0), strict=True)}
+    result |= print_errors(f"{world.name}, {len(seeds)} {arguments.split} mazes of {frames} frames", errors)
     wins = sum(
         c.position_rmse_m < o.position_rmse_m for o, c in zip(errors["odometry"], errors["corrected"], strict=True)
     )
     result["corrected_better_in"] = wins
-    Console().print(table)
     print(json.dumps(result))
     return result
 

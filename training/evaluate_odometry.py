@@ -1,9 +1,9 @@
-"""Measure the odometry of local networks alone on validation mazes: of a step, over many steps, and of whole drives.
+"""Measure the odometry of local networks on validation mazes: single steps, many steps and whole drives.
 
     python -m training.evaluate_odometry --world maze3d
     python -m training.evaluate_odometry --world maze3d --driver learned --weights FOLDER OTHER_FOLDER
 
-The last line is the result as one JSON object, one entry for each folder of weights.
+The last line is the result as one JSON object, with one entry for each folder of weights.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from ngo_estimator.checkpoint import load_local
 from training.common import runs
 from training.data.worlds import world_named
 from training.report.results_page import interval, markdown
-from training.scoring.validation_steps import measured
+from training.scoring.validation_steps import odometry_errors
 from training.train_local import RPE_STEPS
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Which networks are measured, and where."""
+    """Settings of the measurement."""
 
     world: Literal["maze2d", "maze3d"]
     """World to drive in."""
@@ -51,7 +51,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     networks = []
     for folder in arguments.weights:
         network, description = load_local(folder / world.name, world.name)
-        found = measured(network.eval(), world, arguments.mazes, arguments.frames, RPE_STEPS)
+        found = odometry_errors(network.eval(), world, arguments.mazes, arguments.frames, RPE_STEPS)
         networks.append({"sha256": description["sha256"], "training": description["training"]["command"], **found})
     rows = [
         [

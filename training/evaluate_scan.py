@@ -1,10 +1,10 @@
-"""Measure the scan model for scanners of many qualities, on validation mazes.
+"""Measure the scan model with lidars of many qualities, on validation mazes.
 
     python -m training.evaluate_scan
 
-Each row replaces one or two properties of the scanners that are drawn; noise of 5 cm and dropouts of 20 % are beyond
-what the networks learned from, and `maze2d` is the scanner of that simulator, free of noise, in its own mazes. The last
-line printed is the table as one JSON object.
+Each row changes one or two properties of the drawn lidars. Noise of 5 cm and dropouts of 20 % lie outside of the
+training data. The row `maze2d` has the noise-free lidar of that simulator, in its own mazes. The last line is the table
+as one JSON object.
 """
 
 import dataclasses
@@ -25,16 +25,15 @@ from tqdm import tqdm
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.data.images import ImageFormat, scan_image
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import optimize_offline
+from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2DConfig
 from training.common import runs
+from training.data.episodes import simulate
+from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.scans import ScannedMaze
-from training.data.streams import simulate
 from training.data.worlds import WORLDS
-from training.featurise import features_of
 from training.scoring.metrics import TrajectoryError, path_length_m, trajectory_error
-from training.scoring.recording_errors import FEATURES
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as drawn in training": {},
@@ -58,7 +57,7 @@ class Arguments:
     """Settings of the evaluation."""
 
     trajectories: int = 10
-    """Trajectories of each row, each in a maze of its own; the same mazes in every row but the last."""
+    """Trajectories of a row, each in a maze of its own; all rows but the last have the same mazes."""
     frames: int = 2000
     """Frames of a trajectory."""
     rows: tuple[str, ...] = ()
@@ -113,7 +112,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
             lengths = []
             for episode in episodes(row, arguments.trajectories, arguments.frames):
                 features = features_of(world, episode, folder, (local, place))
-                arrays = [torch.from_numpy(features[name]) for name in FEATURES]
+                arrays = [torch.from_numpy(features[name]) for name in OPTIMIZER_INPUTS]
                 corrected = optimize_offline(optimizer, place.pair_head, *arrays).poses[0]
                 for name, poses in (("odometry", se2.r2g(arrays[0])), ("corrected", corrected)):
                     from_origin = np.concatenate((np.zeros((1, 3)), poses.numpy()))

@@ -1,10 +1,10 @@
-"""Look at a recording before training on it: what is in it, what is used for what, and what is wrong with it.
+"""Report on a recording before training: its topics, their use, and its faults.
 
     python -m training.inspect_recording drive.mcap
     python -m training.inspect_recording part_0.mcap part_1.mcap --ground-truth tf:map:base_link --out drive.png
 
-Prints a report and draws a picture beside the first file. Exit code 1 where the recording cannot be used at all, with
-one line that says why and what to do.
+Prints the report and draws a picture beside the first file. The exit code is 1 where the recording cannot be used, with
+one line that gives the reason and the remedy.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from training.recordings.recording_report import REVISIT_AFTER_M, REVISIT_M, Rep
 
 @dataclass(frozen=True)
 class Arguments:
-    """What is looked at, and how it is shown."""
+    """Settings of a report."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
     """Files ending in .mcap or .db3, or folders of rosbag2; several count as one recording."""
@@ -74,6 +74,8 @@ def text(report: Report) -> list[str]:
         clock = (
             "no header: when it was logged counts"
             if times.without_header
+            else "stamps of simulated time"
+            if times.simulated
             else (
                 f"stamp less log time {1e3 * times.skew_median_s:+.1f} ms (spread {1e3 * times.skew_spread_s:.1f} ms)"
             )

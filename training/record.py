@@ -1,10 +1,10 @@
-"""Record the topics of a running graph, until Ctrl-C or for a time.
+"""Record topics of a running graph, until Ctrl-C or for some seconds.
 
     python -m training.record --out drive.mcap
     python -m training.record --out drive --topics /camera/image_raw /odom /tf /tf_static --seconds 60
 
-A name that ends in .mcap is the file; any other is a new folder in the layout of rosbag2, for `ros2 bag info` and
-`ros2 bag play`. A recorder that is killed leaves a file that is readable up to its last second.
+A name that ends in .mcap is the file. Any other name is a new folder in the layout of rosbag2, for `ros2 bag info` and
+`ros2 bag play`. If the recorder is killed, the file is readable up to its last second.
 """
 
 import signal
@@ -24,14 +24,14 @@ _LOOK_S = 0.2
 
 @dataclass(frozen=True)
 class Arguments:
-    """What is recorded, and where to."""
+    """Settings of a recording."""
 
     out: Path
     """A new file ending in .mcap, or a new folder."""
     topics: tuple[str, ...] = ()
-    """Which topics; none: all that there are, also those that come later."""
+    """Topics to record; none: all of the graph, including later ones."""
     seconds: float = 0.0
-    """How long; 0: until Ctrl-C."""
+    """Duration; 0: until Ctrl-C."""
 
     def __post_init__(self) -> None:
         if self.seconds < 0.0:

@@ -1,11 +1,11 @@
-"""The tables and figures of a world's results, by one command from nothing.
+"""Make the tables and figures of a world's results, by one command from nothing.
 
     python -m training.results --world maze2d
     python -m training.results --world maze3d
 
-makes whatever is missing (networks, features, the pose graph's settings, three trainings of every optimizer), measures
-every row on mazes that nothing was trained or chosen on, and writes ``training/results/WORLD.json``,
-``docs/results_WORLD.md`` and ``docs/images/results_WORLD_*.png``. Run again, it goes on where it was stopped.
+Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
+measured in mazes that nothing was trained or chosen on. The command writes ``training/results/WORLD.json``,
+``docs/results_WORLD.md`` and ``docs/images/results_WORLD_*.png``. Run it again to continue after a stop.
 """
 
 import json
@@ -14,18 +14,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
-from training.baselines.network_odometry import open_odometry
 from training.common import runs
+from training.common.command_line import run_command
 from training.common.curves import write_at_once
+from training.data.feature_store import open_store
 from training.data.worlds import world_named
-from training.featurise import open_store
+from training.prerequisites import Scripts, Wanted, prepare
 from training.report import attention, figures, results_page, tables
-from training.report.prerequisites import Scripts, Wanted, prepare
 from training.report.training_records import trainings_json
-from training.scoring.error_cache import Measured, measure
+from training.scoring.error_cache import Evaluation, evaluate_row
+from training.scoring.network_odometry import open_odometry
 from training.scoring.oracle_rows import LIMITED_WORLDS, LIMITS, limit_estimator
 from training.scoring.row_estimators import Arrays, Prepared, estimators
 from training.scoring.table_rows import ROWS, Sources, rows_of
@@ -38,13 +38,13 @@ class Arguments:
     world: Literal["maze2d", "maze3d"]
     """World to measure in."""
     split: Literal["validation", "test"] = "test"
-    """Mazes to measure on; designs are chosen on validation, and the test split is for the final tables alone."""
+    """Mazes to measure in. Designs are chosen on validation; the test split is for the final tables alone."""
     trajectories: int = 0
-    """Trajectories of each table, each in a maze of its own; 0 for as many as the world's tables have."""
+    """Trajectories of each table, each in a maze of its own; 0 for the world's number."""
     seeds: int = 3
     """Trainings of each optimizer, with the seeds 0, 1, ..."""
     prefixes: tuple[int, ...] = ()
-    """Numbers of steps after which errors are given, as if the robot had stopped there; by default the world's."""
+    """Numbers of steps after which errors are given, as if the robot had stopped there; none: the world's."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/*.safetensors of the local network and the place encoder."""
     out: Path = runs.ROOT / "training" / "results"
@@ -74,16 +74,16 @@ def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]
     sources = Sources(world, arguments.weights, arguments.runs, arguments.out)
     prepare(sources, Wanted(arguments.split, arguments.trajectories, arguments.seeds), scripts or Scripts())
     stores = {table: table_data(arguments, sources, table).arrays for table in world.tables}
-    measured = {table: measured_rows(arguments, sources, table) for table in world.tables}
-    result = {**record, **summary(arguments, sources, stores, measured)}
+    evaluations = {table: evaluate_rows(arguments, sources, table) for table in world.tables}
+    result = {**record, **summary(arguments, sources, stores, evaluations)}
     result.pop("arguments")
     if world.name in LIMITED_WORLDS:
         result["limits"] = {
-            table: tables.rows_json(limited(arguments, sources, table, found), result["steps"], world)
-            for table, found in measured.items()
+            table: tables.rows_json(limiting_rows(arguments, sources, table, found), result["steps"], world)
+            for table, found in evaluations.items()
         }
     write_at_once(arguments.out / f"{world.name}.json", json.dumps(result, indent=2) + "\n")
-    images = figures.draw_all(arguments.docs / "images", sources, arguments.split, stores, measured, result)
+    images = figures.draw_all(arguments.docs / "images", sources, arguments.split, stores, evaluations, result)
     write_at_once(arguments.docs / f"results_{world.name}.md", results_page.page(result, images, world))
     print(f"{world.name}: {arguments.out / f'{world.name}.json'}, {arguments.docs / f'results_{world.name}.md'}")
     return result
@@ -98,7 +98,7 @@ class TableData:
 
 
 def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "local") -> TableData:
-    """What a row sees of a table's trajectories; raises ``ValueError`` if there are too few, or too short ones."""
+    """The features that a row gets of a table; raises ``ValueError`` for too few or too short trajectories."""
     kind = ROWS[row]
     own = kind.own_networks or kind.odometry is not None
     sources = sources.of_row(row, 0) if own else sources
@@ -115,11 +115,11 @@ def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "l
     return TableData({name: array[: arguments.trajectories] for name, array in arrays.items()}, identity)
 
 
-def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Measured]]:
-    """What every row makes of a table's trajectories."""
+def evaluate_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Evaluation]]:
+    """The evaluations of every row on a table's trajectories, one for each training seed."""
     shared = table_data(arguments, sources, table)
     cache = cache_folder(arguments, table)
-    result: dict[str, list[Measured]] = {}
+    result: dict[str, list[Evaluation]] = {}
     prepared: Prepared = {}
     with tqdm(rows_of(sources.world), desc=f"{sources.world.name} {table}", unit="row") as bar:
         for row in bar:
@@ -128,7 +128,7 @@ def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
             if not np.array_equal(data.arrays["truth"], shared.arrays["truth"]):
                 raise ValueError(f"the features of {row} are of other trajectories than those of the table {table}")
             result[row] = [
-                measure(
+                evaluate_row(
                     estimator,
                     data.arrays,
                     data.identity,
@@ -142,19 +142,19 @@ def measured_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
 
 
 def cache_folder(arguments: Arguments, table: str) -> Path:
-    """Folder of what rows make of a table's trajectories."""
+    """Folder of the evaluations of a table."""
     return arguments.runs / arguments.world / "results" / f"{arguments.split}_{table}"
 
 
-def limited(
-    arguments: Arguments, sources: Sources, table: str, measured: dict[str, list[Measured]]
-) -> dict[str, list[Measured]]:
-    """What limits the rows of a table, beside these rows: of optimizers the first training seed."""
+def limiting_rows(
+    arguments: Arguments, sources: Sources, table: str, evaluations: dict[str, list[Evaluation]]
+) -> dict[str, list[Evaluation]]:
+    """The evaluations of the rows that show the limits of a table; of optimizers those of the first training seed."""
     data, cache = table_data(arguments, sources, table), cache_folder(arguments, table)
-    result = {row: measured[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
+    result = {row: evaluations[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
     for name in tqdm(LIMITS, desc=f"{sources.world.name} {table} limits", unit="row"):
         estimator = limit_estimator(name, sources)
-        found = measure(estimator, data.arrays, data.identity, (), sources.world, cache / f"{name}.npz")
+        found = evaluate_row(estimator, data.arrays, data.identity, (), sources.world, cache / f"{name}.npz")
         result[name] = [found]
     return result
 
@@ -163,7 +163,7 @@ def summary(
     arguments: Arguments,
     sources: Sources,
     stores: dict[str, Arrays],
-    measured: dict[str, dict[str, list[Measured]]],
+    evaluations: dict[str, dict[str, list[Evaluation]]],
 ) -> dict[str, Any]:
     """The content of the JSON."""
     world, prefixes = sources.world, sorted(arguments.prefixes)
@@ -174,8 +174,8 @@ def summary(
         "trajectories": arguments.trajectories,
         "steps": steps,
         "seeds": list(range(arguments.seeds)),
-        "tables": {name: tables.table_json(table, prefixes, steps, world) for name, table in measured.items()},
-        "paired": {name: tables.paired_json(table, steps, world) for name, table in measured.items()},
+        "tables": {name: tables.table_json(table, prefixes, steps, world) for name, table in evaluations.items()},
+        "paired": {name: tables.paired_json(table, steps, world) for name, table in evaluations.items()},
         "local_bias_deg": {
             name: tables.heading_bias_json(arrays["relative"], arrays["truth"]) for name, arrays in stores.items()
         },
@@ -189,4 +189,4 @@ def summary(
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

@@ -2,7 +2,7 @@
 
     python -m training.throughput --world maze2d
 
-How fast a training took it stands in the JSON beside the weights, as ``training.datapoints_per_s``.
+The speed of a real training is in the JSON beside its weights, as ``training.datapoints_per_s``.
 """
 
 import json
@@ -13,8 +13,9 @@ from typing import Literal
 import tyro
 from torch.utils.data import IterableDataset
 
-from training.common.curves import memory_mb, rows
-from training.data.streams import Batch, PairStream, PlaceStream, TrajectoryStream, loader
+from training.common.curves import batch_size, memory_mb
+from training.data.batches import Batch
+from training.data.streams import PairStream, PlaceStream, TrajectoryStream, loader
 from training.data.worlds import TRAIN_SEEDS, world_named
 
 _WARM_UP = 16  # batches: the processes have started, the simulator is compiled, and none lies ready
@@ -53,7 +54,7 @@ def main(arguments: Arguments) -> dict[str, float]:
             next(batches)
         count, started = 0, time.monotonic()
         while time.monotonic() < started + arguments.seconds:
-            count += rows(next(batches)) * datapoints_a_row
+            count += batch_size(next(batches)) * datapoints_a_row
         table[f"{name}_datapoints_per_s"] = round(count / (time.monotonic() - started), 1)
         memory = max(memory, memory_mb())
         del batches

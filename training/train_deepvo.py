@@ -1,10 +1,10 @@
-"""Train DeepVO, the baseline of the results, on the mazes and frames that the local network learns from.
+"""Train DeepVO, the baseline of the results, in the mazes of the local network.
 
     python -m training.train_deepvo --world maze3d
 
-It sees stretches of trajectories where the local network sees single pairs, with the same number of frame pairs, the
-same schedule and loss, mirror images and calibration; as in the original it is not told the actions. Run again, it goes
-on where it was stopped.
+DeepVO sees stretches of trajectories where the local network sees single pairs. Number of frame pairs, schedule, loss,
+mirror images and calibration are the same. As in the original it is not told the actions. Run it again to continue
+after a stop.
 """
 
 import dataclasses
@@ -16,20 +16,22 @@ from typing import TYPE_CHECKING, Any, Literal
 import lightning
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import save_checkpoint
 from ngo_estimator.geometry import se2
 from training.baselines.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
+from training.baselines.graph_settings import fit_calibration
 from training.common import runs
-from training.common.data_module import StreamedData
-from training.data import streams
-from training.data.streams import ALL, Batch, PairStream, Share, images_of, mirrored, relative_poses, simulate
+from training.common.command_line import run_command
+from training.common.step_losses import step_losses, step_metrics, windows_within
+from training.data import episodes
+from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, seen_from_first
+from training.data.data_module import StreamedData
+from training.data.episodes import images_of, simulate
+from training.data.streams import PairStream
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.scoring.metrics import seen_from_first
-from training.train_local import episode_pairs, step_losses, step_metrics, windows_within
-from training.tune_pose_graph import fit_calibration
+from training.train_local import episode_pairs
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
@@ -87,7 +89,7 @@ class StretchStream(PairStream):
 
     @property
     def batches_a_group(self) -> int:
-        return streams._GROUP * self.stretches_a_maze // self.batch_size
+        return episodes.GROUP * self.stretches_a_maze // self.batch_size
 
     def batches(self, episodes: list["Episode"], rng: np.random.Generator) -> Iterator[Batch]:
         images = [images_of(self.world, episode) for episode in episodes]
@@ -210,4 +212,4 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

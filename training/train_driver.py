@@ -1,11 +1,11 @@
-"""Train the learned driver of the 3D world: a network that drives as far as it can, by advantage actor-critic (PPO).
+"""Train the learned driver of the 3D world: a network that drives as far as it can, by PPO.
 
     python -m training.train_driver
 
-The reward is the distance travelled (paper, section 4.2). It begins with lessons (DAgger) of a teacher that knows the
-maze and drives for distance: turning about at the end of a long corridor costs before it pays, and was not found
-without them. Run again, it goes on after its last checkpoint, in mazes that it has not met. It ends with the weights
-written into the simulator's package. Progress goes to `metrics.csv` in its folder below `runs/`, beside `run.json`.
+The reward is the distance travelled (paper, section 4.2). The training begins with lessons (DAgger) of a teacher that
+knows the maze: without them the driver never found that turning about at the end of a long corridor pays. The weights
+go into the package of the simulator, the progress into `metrics.csv` beside `run.json` below `runs/`. Run it again to
+continue after the last checkpoint, in mazes that it has not met.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ class Arguments:
     """Settings of a training of the driver."""
 
     lessons: int = 12
-    """Rounds in which a teacher says what it would do, before it trains by itself."""
+    """Rounds of lessons before the reinforcement learning."""
     lesson_decisions: int = 500
     """Decisions of each environment in a lesson."""
     lesson_updates: int = 300
-    """Updates after a lesson, of as many decisions each as those of the training."""
+    """Updates after a lesson."""
     lesson_learning_rate: float = 1e-3
-    """Learning rate of the first lesson; it falls along a line."""
+    """Learning rate of the first lesson; it falls linearly."""
     decisions: int = 500_000
-    """Decisions to train on by itself, of all environments together; each holds its action for three frames."""
+    """Decisions of the reinforcement learning, of all environments together; each holds its action for three frames."""
     environments: int = 16
     """Mazes that are driven through side by side."""
     steps: int = 128
@@ -64,11 +64,11 @@ class Arguments:
     mazes: int = 16
     """Mazes of one size that an environment makes at a time."""
     learning_rate: float = 3e-4
-    """At the beginning; it falls to zero along a line."""
+    """Learning rate at the beginning; it falls linearly to zero."""
     discount: float = 0.98
-    """Worth of a reward one decision later."""
+    """Discount of a reward one decision later."""
     entropy: float = 0.005
-    """Weight of the entropy of the actions in the loss, at the beginning; it falls to zero as well."""
+    """Weight of the entropy of the actions in the loss at the beginning; it falls linearly to zero."""
     checkpoint_decisions: int = 50_000
     """Decisions between two checkpoints."""
     threads: int = 1

@@ -1,12 +1,11 @@
-"""Fine-tune all networks of a world together, from the weights of the stages, on short trajectories.
+"""Fine-tune all networks of a world together, from their trained weights, on short trajectories.
 
     python -m training.train_end_to_end --world maze2d
 
-Worker processes simulate the trajectories, each in a maze of its own and each used once. The loss of the corrected
-trajectory reaches back through optimizer, loop measurements and aggregation into both encoders; not through a
-registration, so that where loops are registered the place encoder learns which are loops alone, and the ranges that it
-sees stay as they are. Run again, it goes on where it was stopped. It ends with a set of weights of its own that the
-estimator takes like those of the stages.
+Each simulated trajectory is in a maze of its own and is used once. The loss of the corrected trajectory reaches both
+encoders through optimizer, loop measurements and aggregation, but no registration of scans: there the place encoder
+learns loops alone, and its ranges stay. The result is a set of weights of its own for the estimator. Run it again to
+continue after a stop.
 """
 
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from typing import Any, Literal
 
 import lightning
 import torch
-import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import (
@@ -35,11 +33,13 @@ from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.common import runs
-from training.common.data_module import StreamedData
-from training.data.streams import Batch, Share, TrajectoryStream
+from training.common.command_line import run_command
+from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
+from training.data.batches import Batch, Share
+from training.data.data_module import StreamedData
+from training.data.streams import TrajectoryStream
 from training.data.trajectories import rmse_figures
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, world_named
-from training.train_local import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.train_optimizer import trajectory_loss
 
 
@@ -232,4 +232,4 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

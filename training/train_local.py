@@ -1,26 +1,24 @@
-"""Train the local pose network of a world on pairs of frames that worker processes simulate.
+"""Train the local pose network on pairs of consecutive frames.
 
     python -m training.train_local --world maze2d
     python -m training.train_local --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. With `--data`, it learns from recordings, each pair many times over, and
-keeps the epoch that was best on the parts that it does not learn from. It ends with the network's output calibrated on
-mazes (or those parts) that it has not seen, one bias and scale a component, folded into its normalisation, and its
-weights written into the estimator's package.
+Pairs come from simulated mazes (`--world`) or from recordings (`--data`). After the training the output is calibrated
+on frames that the network has not seen: one bias and one scale for each component. The weights go into the package of
+the estimator. Training on recordings keeps the epoch with the smallest validation loss. Run it again to continue after
+a stop.
 """
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import lightning
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
-from torch.nn.functional import smooth_l1_loss
 from torch.utils.data import IterableDataset
 
 from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
@@ -28,49 +26,38 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from training.common import runs
-from training.common.data_module import StreamedData
+from training.common.command_line import run_command
+from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics
+from training.data.batches import ACTION_HISTORY, Batch, Share, action_histories, relative_poses
+from training.data.data_module import StreamedData
 from training.data.data_source import Domain
-from training.data.streams import (
-    ACTION_HISTORY,
-    Batch,
-    PairStream,
-    Share,
-    action_histories,
-    images_of,
-    relative_poses,
-    simulate,
-)
-from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
+from training.data.episodes import images_of, simulate
+from training.data.streams import PairStream
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.recordings.recording_source import SourceArguments, open_recorded, told_to
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
-HEADING_WEIGHT = 3.0
-LIKELIHOOD_WEIGHT = 0.1
 CALIBRATION_MAZES = 64
 """Mazes that the output of a world's network is calibrated in."""
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the local pose network."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     without_action: bool = False
-    """Whether the network of a world is to do without the actions, from the images alone."""
+    """Worlds: whether the network sees images alone, without the actions."""
     action_history: int | None = None
-    """How many of the latest actions a network is told, if any; none: the world's number, twelve of recordings."""
+    """Number of latest actions that the network is told; none: the world's number, or twelve for recordings."""
     error_windows: tuple[int, ...] | None = None
-    """Numbers of consecutive steps whose errors count added up; none: the world's."""
+    """Worlds: lengths of the windows of steps over which the loss sums errors; none: the world's."""
     width: float = 0.25
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 8
     """Passes of new data."""
     datapoints: int = 200_000
-    """Frame pairs in an epoch, of all processes; of recordings at most each pair twice."""
+    """Frame pairs in an epoch, of all processes. Of recordings, each pair counts at most twice."""
     batch_size: int = 256
     """Frame pairs in a step of the optimiser, in each process; less on small recordings."""
     learning_rate: float = 2e-3
@@ -87,7 +74,7 @@ class Arguments(runs.TrainerArguments):
     """Folder of checkpoints and logs."""
 
     def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
+        super().__post_init__()
         if self.without_action and self.world is None:
             raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
         if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
@@ -100,7 +87,7 @@ class Arguments(runs.TrainerArguments):
 
 
 class LocalTraining(lightning.LightningModule):
-    """The losses of steps and of the windows of some consecutive ones, ``step_losses``."""
+    """The training of a local network by ``step_losses`` of single steps and of windows."""
 
     def __init__(self, arguments: Arguments, network: LocalPoseNetwork, error_windows: tuple[int, ...] = (1,)) -> None:
         super().__init__()
@@ -137,7 +124,7 @@ class LocalTraining(lightning.LightningModule):
 
 
 def simulated_world(arguments: Arguments) -> World:
-    """The world that the arguments name, as they ask for it."""
+    """The world that the arguments name, with their changes."""
     world = world_named(str(arguments.world))
     if arguments.action_history is not None:
         world = dataclasses.replace(world, action_history=arguments.action_history)
@@ -147,19 +134,19 @@ def simulated_world(arguments: Arguments) -> World:
 
 
 class Steps(Protocol):
-    """Where the pairs of frames come from."""
+    """A source of pairs of consecutive frames."""
 
     def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
-        """Those of an epoch, for one of the processes that train together."""
+        """The pairs of an epoch, for one of the processes that train together."""
 
     def validation(self) -> list[Batch]:
-        """Those that each epoch is measured on."""
+        """The validation pairs of each epoch."""
 
     def unseen(self) -> list[Batch]:
-        """Those that the network's output is calibrated with."""
+        """The pairs that calibrate the network's output."""
 
     def typical(self) -> Tensor:
-        """Relative poses ``(n, 3)`` like those of the training."""
+        """Typical relative poses ``(n, 3)`` of the training."""
 
 
 class SimulatedSteps:
@@ -194,7 +181,7 @@ def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
 
 
 def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    """What a network makes of a batch of pairs, from what it is told of each step."""
+    """The network's estimate of a batch of pairs: mean, logarithm of the deviations, motion features."""
     estimate: tuple[Tensor, Tensor, Tensor] = network(
         batch["earlier"], batch["later"], batch.get("action"), batch.get("twist")
     )
@@ -202,10 +189,10 @@ def estimated(network: LocalPoseNetwork, batch: Batch) -> tuple[Tensor, Tensor, 
 
 
 def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """The losses of a network on a batch in which as many steps as the longest of ``windows`` has follow each other.
+    """The losses of a network on a batch of stretches, each with the steps of the longest of ``windows``.
 
-    Of what it makes of the frames alone ``step_losses`` of single steps; where it is told of earlier actions too, also
-    those of all windows of what it makes of both, which leave the first part of it alone.
+    The estimate from the frames alone has the ``step_losses`` of single steps. Where the network also takes earlier
+    actions, its fused estimate has those of all windows; their gradient does not reach the estimate from the frames.
     """
     estimates = network.estimates(batch["earlier"], batch["later"], batch.get("action"), batch.get("twist"))
     truth, std = batch["relative"], network.relative_std
@@ -218,52 +205,11 @@ def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, 
     return pose_loss + of_fused[0], likelihood + of_fused[1]
 
 
-def windows_within(steps: int, windows: tuple[int, ...]) -> tuple[int, ...]:
-    """Those of the ``windows`` that so many steps which follow each other have room for."""
-    return tuple(window for window in windows if window <= steps)
-
-
-def step_losses(
-    mean: Tensor, log_std: Tensor, truth: Tensor, std: Tensor, windows: tuple[int, ...] = (1,)
-) -> tuple[Tensor, Tensor]:
-    """Smooth-L1 on relative poses ``(..., 3)`` in units of ``std``, and the likelihood of what ``log_std`` says.
-
-    The first is the mean over ``windows``: of ``k`` steps that follow each other along the last axis but one, the
-    errors are added up and divided by the root of ``k``, so that windows weigh the same where errors are independent.
-    Where they last, as what a robot with momentum does beside its actions, the longer windows weigh more. The sum of
-    the steps' errors is the drift in heading, and nearly that in position while the robot turns little.
-    """
-    error = (mean - truth) / std
-    weight = error.new_tensor([1.0, 1.0, HEADING_WEIGHT])
-    pose_loss = error.new_zeros(())
-    for window in windows:
-        drift = error if window == 1 else error.unfold(-2, window, 1).sum(-1) / math.sqrt(window)
-        loss = smooth_l1_loss(drift, torch.zeros_like(drift), reduction="none", beta=0.1)
-        pose_loss = pose_loss + (loss * weight).mean() / len(windows)
-    log_scale = log_std - std.log()
-    # The errors are detached: a network that may trade accuracy for a modest belief ends with less accuracy.
-    likelihood = (0.5 * (error.detach() * torch.exp(-log_scale)).square().clamp(max=50.0) + log_scale).mean()
-    return pose_loss, likelihood
-
-
-def step_metrics(mean: Tensor, log_std: Tensor, truth: Tensor) -> dict[str, float]:
-    """Errors a step: RMSE (m, deg), constant bias (m, deg) and how many predicted deviations the errors have."""
-    error = mean - truth
-    error = se2.wrapped(error).double()
-    return {
-        "rmse_m": float(error[:, :2].square().sum(1).mean().sqrt()),
-        "rmse_deg": float(error[:, 2].square().mean().sqrt().rad2deg()),
-        "bias_forward_m": float(error[:, 0].mean()),
-        "bias_deg": float(error[:, 2].mean().rad2deg()),
-        "normalized_error": float((error / log_std.exp()).square().mean().sqrt()),
-    }
-
-
 @torch.no_grad()
 def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig:
     """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares).
 
-    The deviations get a scale each that makes their mean square that of the errors.
+    Each deviation is scaled so that its mean square equals that of the errors.
     """
     network = network.eval()
     parts = [estimated(network, p) for p in pairs]
@@ -298,8 +244,8 @@ def main(arguments: Arguments) -> dict[str, float]:
         domain: Domain = world
         steps = SimulatedSteps(arguments, world)
         windows = world.error_windows
-        told = {"action_history": world.action_history, "error_windows": list(windows)}
-        settings: dict[str, Any] | None = {**told, **world.stream_settings}
+        of_steps = {"action_history": world.action_history, "error_windows": list(windows)}
+        settings: dict[str, Any] | None = {**of_steps, **world.stream_settings}
     else:
         domain = recorded.domain
         if arguments.action_history is not None:
@@ -335,7 +281,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple[LocalPoseNetwork, dict[str, str]]:
-    """A fresh network, or that of the weights to begin with, and what is to be said of them in the JSON.
+    """A fresh network or that of ``--from-weights``, and the entry of the JSON that names these weights.
 
     Raises ``RecordingError`` where those weights take other images, or are told other things of a step.
     """
@@ -345,9 +291,8 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         config = network.config
         if (config.actions, config.twist) != (domain.actions, domain.twist):
             raise RecordingError(
-                f"{folder} takes {_told(config.actions, config.twist)}, {domain.name} has "
-                f"{_told(domain.actions, domain.twist)}; expected the same (--action none, --twist none leave "
-                "them out)"
+                f"{folder} takes {told_to(config)}, {domain.name} has {told_to(domain)}; expected the same "
+                "(--action none, --twist none leave them out)"
             )
         if config.image != domain.image:
             raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")
@@ -381,10 +326,6 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
     return LocalPoseNetwork(config), {}
 
 
-def _told(actions: int, twist: bool) -> str:
-    return "actions" if actions else "velocities" if twist else "images alone"
-
-
 @torch.no_grad()
 def measure(network: LocalPoseNetwork, pairs: list[Batch], rpe_steps: int = 0) -> dict[str, float]:
     """``step_metrics`` of a network over episodes.
@@ -406,4 +347,4 @@ def measure(network: LocalPoseNetwork, pairs: list[Batch], rpe_steps: int = 0) -
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

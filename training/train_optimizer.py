@@ -3,9 +3,9 @@
     python -m training.train_optimizer --world maze2d
     python -m training.train_optimizer --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. Trained on recordings, an optimizer that does not correct the trajectories
-of the validation part is replaced by one that closes no loops and leaves the odometry as it is. It ends with the
-weights written into the estimator's package.
+The weights go into the package of the estimator. Training on recordings checks the optimizer on the validation part: if
+it does not correct these trajectories, an optimizer that closes no loops is written instead. Run it again to continue
+after a stop.
 """
 
 import dataclasses
@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 
 import lightning
 import torch
-import tyro
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
@@ -38,8 +37,11 @@ from ngo_estimator.optimizer.neural_graph_optimizer import (
     NeuralGraphOptimizerConfig,
 )
 from training.common import runs
+from training.common.command_line import run_command
+from training.common.precision import Precision
+from training.data.batches import Batch
 from training.data.data_source import Domain
-from training.data.streams import Batch
+from training.data.feature_store import training_stores
 from training.data.trajectories import (
     StoredTrajectories,
     StretchData,
@@ -47,9 +49,13 @@ from training.data.trajectories import (
     loops_of,
     rmse_figures,
 )
-from training.data.worlds import WorldName, world_named
-from training.featurise import training_stores
-from training.recordings.recording_source import NO_LOOPS, RecordedArguments, check_source, open_recorded, run_script
+from training.data.worlds import world_named
+from training.recordings.recording_source import (
+    NO_LOOPS,
+    RecordedData,
+    SourceArguments,
+    open_recorded,
+)
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
@@ -58,28 +64,24 @@ _LEAST_GAIN = 0.1
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the optimizer."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     form: Literal["loops", "gauss_newton", "paper"] = "loops"
-    """With loop closures; with loop closures alone, no attention and no convolution; or the paper's form."""
+    """loops: attention, convolution and loop closures. gauss_newton: loop closures alone. paper: no loop closures."""
     iterations: int = 5
     """Attend-optimise iterations."""
     smoothing: bool | None = None
-    """Whether odometry is smoothed before loops are closed, as ``train_smoother`` learned to; by default as suits the
-    world, and not of recordings."""
+    """Whether the smoother of ``train_smoother`` smooths the odometry before loops are closed; none: the world's
+    default, and no smoothing for recordings."""
     width: int = 64
     """Channels of aggregation and optimizer."""
     loops_per_pose: int | None = None
-    """Loop candidates of a meta-pose; by default as suits the world."""
+    """Loop candidates of a meta-pose; none: the world's default."""
     max_loops: int | None = None
-    """Loop candidates of a trajectory; by default as suits the world."""
+    """Loop candidates of a trajectory; none: the world's default."""
     epochs: int | None = None
-    """Epochs; the learning rate falls to zero over all of them. By default as many as suit the world."""
+    """Epochs, over which the learning rate falls to zero; none: the world's default."""
     steps: int = 40
     """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
     batch_size: int = 8
@@ -88,17 +90,14 @@ class Arguments(runs.TrainerArguments):
     """Highest learning rate."""
     seed: int = 0
     """Seed of initial weights and of the order of the data."""
-    precision: Literal["bf16-mixed", "32-true"] = field(default="32-true", kw_only=True)
-    """Arithmetic of the network; what closes loops is in float64 always."""
+    precision: Precision = field(default="32-true", kw_only=True)
+    """Arithmetic of the network; loops are always closed in float64."""
     weights: Path = runs.WEIGHTS
     """Folder with NAME's other networks."""
     out: Path = runs.WEIGHTS
     """Folder that gets NAME/neural_graph_optimizer.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
 
 
 def trajectory_loss(
@@ -189,7 +188,7 @@ class OptimizerTraining(lightning.LightningModule):
 
 
 class Choices(NamedTuple):
-    """The arguments that are the domain's unless they are given."""
+    """Arguments with a default of their own in each domain."""
 
     smoothing: bool
     loops_per_pose: int
@@ -198,7 +197,7 @@ class Choices(NamedTuple):
 
 
 def choices(arguments: Arguments, domain: Domain) -> Choices:
-    """What is trained for how long: the domain's choices, but for those that are given."""
+    """The given arguments, and the domain's defaults for all others."""
     given = arguments
     return Choices(
         domain.smoothing and given.form != "paper" if given.smoothing is None else given.smoothing,
@@ -214,7 +213,7 @@ def config_of(
     scale: tuple[float, float, float],
     smoother: SmootherConfig | None = None,
 ) -> NeuralGraphOptimizerConfig:
-    """What the optimizer is made of; ``scale`` is the typical error of the odometry over a meta-pose."""
+    """The optimizer's configuration; ``scale`` is the typical error of the odometry over a meta-pose."""
     local, _ = load_local(arguments.weights / domain.name, domain.name)
     aggregation = PoseAggregationConfig(
         motion_feature_size=local.config.feature_size, width=arguments.width, relative_std=local.config.relative_std
@@ -243,12 +242,15 @@ def config_of(
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
-    domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
+    name = arguments.world or arguments.recordings.name
+    folder = arguments.weights / name
+    local, local_description = load_local(folder, name)
+    recorded: RecordedData | None = None
+    if arguments.world is None:
+        recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
+    domain = world_named(name) if recorded is None else recorded.domain
     chosen = choices(arguments, domain)
     arguments = replace(arguments, **chosen._asdict())  # a run's record says what was trained
-    folder = arguments.weights / domain.name
-    _, local_description = load_local(folder, domain.name)
     place, place_description = load_place(folder, domain.name)
     about: dict[str, Any] = {"place_encoder_sha256": place_description["sha256"]}
     smooths: dict[str, Any] = {}
@@ -339,4 +341,4 @@ def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], 
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

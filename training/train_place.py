@@ -1,21 +1,20 @@
-"""Train the place encoder and its pair head on pairs of frames that show one place, well apart in time.
+"""Train the place encoder and its pair head on pairs of frames of one place, well apart in time.
 
     python -m training.train_place --world maze2d
     python -m training.train_place --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. Recordings in which too few places are seen twice teach nothing about
-places: then it says so and writes the encoder untrained, and the optimizer will close no loops. It ends with the
-weights written into the estimator's package.
+The weights go into the package of the estimator. Recordings in which the robot returns to too few places teach nothing
+about places: the command says so, writes an untrained encoder, and the optimizer closes no loops. Run it again to
+continue after a stop.
 """
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import lightning
 import torch
-import tyro
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import IterableDataset
@@ -24,29 +23,26 @@ from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_chec
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PlaceConfig
 from training.common import runs
-from training.common.data_module import StreamedData
+from training.common.command_line import run_command
+from training.data.batches import Batch, Share
+from training.data.data_module import StreamedData
 from training.data.data_source import Domain
-from training.data.streams import Batch, PlaceStream, Share
-from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
+from training.data.streams import PlaceStream
+from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 from training.recordings.recording_source import (
     NO_LOOPS,
-    RecordedArguments,
     RecordedData,
-    check_source,
+    SourceArguments,
     open_recorded,
-    run_script,
+    trained_local,
 )
 from training.recordings.recording_streams import RecordedPlaces
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the place encoder."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     width: float = 0.19
     """Channels of the convolutions, as a fraction of FlowNetS's."""
     epochs: int = 10
@@ -67,9 +63,6 @@ class Arguments(runs.TrainerArguments):
     """Folder that gets NAME/place_encoder.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of checkpoints and logs."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
 
 
 class PlaceTraining(lightning.LightningModule):
@@ -162,13 +155,13 @@ class PlaceTraining(lightning.LightningModule):
 
 
 class Places(Protocol):
-    """Where the pairs of frames come from."""
+    """A source of pairs of frames of one place."""
 
     def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
-        """Those of an epoch, for one of the processes that train together."""
+        """The pairs of an epoch, for one of the processes that train together."""
 
     def validation(self) -> list[Batch]:
-        """Those that each epoch is measured on."""
+        """The validation pairs of each epoch."""
 
 
 class SimulatedPlaces:
@@ -192,7 +185,10 @@ def main(arguments: Arguments) -> dict[str, float]:
 
     There are none where recordings hold too few places.
     """
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
+    recorded: RecordedData | None = None
+    if arguments.world is None:
+        local = trained_local(arguments.out, arguments.recordings.name)
+        recorded = open_recorded(arguments.recordings, arguments.runs, local)
     places: Places
     if recorded is None:
         world = world_named(str(arguments.world))
@@ -234,7 +230,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 
 
 def settings_of(world: World) -> dict[str, Any]:
-    """What a training depends on beside its arguments."""
+    """Settings of the world that a training depends on, for its record."""
     settings = world.stream_settings
     if world.sees_ranges and world.registration is not None:
         settings["registration"] = dataclasses.asdict(world.registration)
@@ -278,4 +274,4 @@ def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> 
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

@@ -1,19 +1,18 @@
-"""Train what smooths the odometry, on whole trajectories of the feature store, before the optimizer that it is part of.
+"""Train the smoother of the odometry on whole trajectories of the feature store.
 
     python -m training.train_smoother --world maze3d
     python -m training.train_smoother --data drive_1.mcap drive_2.mcap --name my_robot
 
-Run again, it goes on where it was stopped. It ends with the weights written beside those of the other networks, from
-where ``train_optimizer`` takes them where it smooths (``--smoothing True``).
+The weights go beside those of the other networks. `train_optimizer` takes them from there where it smooths
+(`--smoothing True`), so train the smoother first. Run it again to continue after a stop.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning
 import torch
-import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
@@ -22,13 +21,15 @@ from ngo_estimator.networks.local_pose_network import LocalPoseConfig
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training.common import runs
+from training.common.command_line import run_command
+from training.common.precision import Precision
+from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
+from training.data.batches import Batch
 from training.data.data_source import TRAIN_STORE
-from training.data.streams import Batch
+from training.data.feature_store import training_stores
 from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
-from training.data.worlds import WorldName, world_named
-from training.featurise import training_stores
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded, run_script
-from training.train_local import LIKELIHOOD_WEIGHT, step_losses, windows_within
+from training.data.worlds import world_named
+from training.recordings.recording_source import RecordedData, SourceArguments, open_recorded
 
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
@@ -38,13 +39,9 @@ _BLOCK = PoseAggregationConfig(1).block
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(SourceArguments):
     """Settings of a training of the odometry smoother."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     epochs: int = 300
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
@@ -55,7 +52,7 @@ class Arguments(runs.TrainerArguments):
     """Highest learning rate."""
     seed: int = 0
     """Seed of initial weights and of the order of the data."""
-    precision: Literal["bf16-mixed", "32-true"] = field(default="32-true", kw_only=True)
+    precision: Precision = field(default="32-true", kw_only=True)
     """Arithmetic of the network."""
     weights: Path = runs.WEIGHTS
     """Folder with NAME's local network and place encoder, of which the features are."""
@@ -63,9 +60,6 @@ class Arguments(runs.TrainerArguments):
     """Folder that gets NAME/odometry_smoother.safetensors."""
     runs: Path = runs.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
 
 
 class SmootherTraining(lightning.LightningModule):
@@ -121,10 +115,13 @@ def smoothing_loss(relative: Tensor, log_std: Tensor, truth: Tensor, step_std: T
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
-    domain = world_named(str(arguments.world)) if recorded is None else recorded.domain
-    folder = arguments.weights / domain.name
-    local, local_description = load_local(folder, domain.name)
+    name = arguments.world or arguments.recordings.name
+    folder = arguments.weights / name
+    local, local_description = load_local(folder, name)
+    recorded: RecordedData | None = None
+    if arguments.world is None:
+        recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
+    domain = world_named(name) if recorded is None else recorded.domain
     place, place_description = load_place(folder, domain.name)
     features = arguments.runs / domain.name / "features"
     stores = training_stores(features, _STORES, domain, local_description, place_description)
@@ -178,4 +175,4 @@ def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[Odom
 
 
 if __name__ == "__main__":
-    run_script(main, Arguments, __doc__)
+    run_command(main, Arguments, __doc__)

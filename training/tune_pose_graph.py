@@ -2,8 +2,8 @@
 
     python -m training.tune_pose_graph --world maze2d
 
-From the default settings on, one group of settings after the other takes the value of its grid with the smallest mean
-position RMSE, over and over until nothing gets better. Nothing is drawn at random.
+A coordinate search: each group of settings in turn takes the value of its grid with the smallest mean position RMSE,
+until nothing gets better. Nothing is random.
 """
 
 import dataclasses
@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_place, load_smoother
@@ -24,6 +23,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.optimizer.loop_closure import LoopSearch
+from training.baselines.graph_settings import REGISTRATIONS, fit_calibration
 from training.baselines.loop_factors import (
     LoopFactors,
     MoreLoops,
@@ -35,8 +35,9 @@ from training.baselines.loop_factors import (
 )
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.common import runs
+from training.common.command_line import run_command
+from training.data.feature_store import open_store
 from training.data.worlds import world_named
-from training.featurise import open_store
 from training.scoring.metrics import trajectory_error
 
 GRID: tuple[tuple[dict[str, Any], ...], ...] = (
@@ -66,9 +67,6 @@ GRID: tuple[tuple[dict[str, Any], ...], ...] = (
 
 _ARRAYS = ("relative", "log_std", "codes", "origin_code", "truth")
 FORMS = ("loops", "registered", "smoothed")
-REGISTRATIONS = 5
-"""Steps of each registration for the pose graph, where ranges are registered: as many as for our optimizer."""
-
 _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was there first stays
 
 
@@ -83,7 +81,7 @@ class Arguments:
     form: Literal["loops", "registered", "smoothed"] = "loops"
     """Odometry of the graph: that of the local network, registered again, or as our optimizer smooths it."""
     passes: int = 2
-    """How often the search goes over all groups at most."""
+    """Largest number of passes over all groups."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
     out: Path = runs.ROOT / "training" / "results"
@@ -142,7 +140,7 @@ class Objective:
             steps = settings.calibrated(odometry[0])
             more = overlaps_of(self._pair_head, self.arrays["codes"], steps, search, settings.block)
         graphs = zip(*odometry, self.loops(settings), more, strict=True)
-        return self.error(optimize(*steps, loops, settings, overlaps) for *steps, loops, overlaps in graphs)
+        return self.error(optimize(steps, std, loops, settings, more) for steps, std, loops, more in graphs)
 
     def error(self, poses: Iterable[np.ndarray]) -> float:
         """Mean position RMSE (m) of trajectories ``(steps, 3)``."""
@@ -157,22 +155,6 @@ class Objective:
         )
 
 
-def fit_calibration(relative: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Gain and bias of each component of a step that fit the true steps best, by least squares.
-
-    Args:
-        relative: steps ``(trajectories, steps, 3)``; truth: true poses after each of them.
-    """
-    true_steps = se2.g2r(torch.from_numpy(np.array(truth))).numpy()
-    fits = []
-    for k in range(3):
-        steps = np.ravel(relative[..., k]).astype(np.float64)
-        design = np.column_stack((steps, np.ones_like(steps)))
-        fits.append(np.linalg.lstsq(design, np.ravel(true_steps[..., k]))[0].tolist())
-    gain, bias = zip(*fits, strict=True)
-    return {"odometry_gain": gain, "odometry_bias": bias}
-
-
 def tune(
     objective: Callable[[PoseGraphSettings], float],
     start: PoseGraphSettings,
@@ -181,19 +163,19 @@ def tune(
 ) -> tuple[PoseGraphSettings, float]:
     """Coordinate search for the settings with the smallest ``objective``, from ``start``; returns both."""
     groups = [list(group) for group in grid]
-    known: dict[PoseGraphSettings, float] = {}
+    tried: dict[PoseGraphSettings, float] = {}
     best, least = start, objective(start)
-    known[best] = least
+    tried[best] = least
     with tqdm(total=passes * sum(map(len, groups)), desc="tune", unit="setting") as bar:
         for _ in range(passes):
             before = best
             for group in groups:
                 for change in group:
                     candidate = replace(best, **change)
-                    if candidate not in known:
-                        known[candidate] = objective(candidate)
-                    if known[candidate] < least * (1.0 - _SMALLEST_GAIN):
-                        best, least = candidate, known[candidate]
+                    if candidate not in tried:
+                        tried[candidate] = objective(candidate)
+                    if tried[candidate] < least * (1.0 - _SMALLEST_GAIN):
+                        best, least = candidate, tried[candidate]
                     bar.update()
                     bar.set_postfix(least=f"{least:.4f}")
             if best == before:
@@ -202,19 +184,8 @@ def tune(
 
 
 def _searching(change: dict[str, Any], **how: int) -> dict[str, Any]:
-    """The change, where it is one of the search, with what all searches have in common."""
+    """The change; if it changes the search, with these common settings."""
     return {name: replace(value, **how) if name == "search" else value for name, value in change.items()}
-
-
-def load_settings(path: Path) -> PoseGraphSettings:
-    """The settings in a file that this script wrote; raises ``ValueError`` naming what is wrong with it."""
-    try:
-        values = dict(json.loads(path.read_text())["settings"])
-        search = LoopSearch(**values.pop("search"))
-        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
-        return PoseGraphSettings(**{**values, **lists, "search": search})
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}; expected what `python -m training.tune_pose_graph` writes") from error
 
 
 def main(arguments: Arguments) -> PoseGraphSettings:
@@ -271,4 +242,4 @@ def main(arguments: Arguments) -> PoseGraphSettings:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

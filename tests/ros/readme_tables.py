@@ -1,6 +1,6 @@
-"""What the four nodes say about their parameters and topics, and what README.md says about them.
+"""Parameters, topics and services of the four nodes, as they declare them and as docs/reference lists them.
 
-python -m tests.ros.readme_tables      # writes the nodes' parameters into README.md
+python -m tests.ros.readme_tables      # writes the nodes' parameters into docs/reference/parameters.md
 """
 
 import re
@@ -18,7 +18,9 @@ from rclpy.qos import ReliabilityPolicy
 
 from .processes import NodeProcess, Probe
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+PARAMETERS = REFERENCE / "parameters.md"
+TOPICS_AND_SERVICES = REFERENCE / "topics_and_services.md"
 NODES = {"maze2d": "ngo_sim", "maze3d": "ngo_sim", "local_node": "ngo_estimator", "ngo_node": "ngo_estimator"}
 BEGIN = "<!-- Written by `python -m tests.ros.readme_tables`; a test compares it with the nodes. -->\n"
 END = "<!-- End of the parameters. -->\n"
@@ -131,33 +133,30 @@ def allowed_text(descriptor: ParameterDescriptor) -> str:
 
 
 def parameter_section(facts: dict[str, NodeFacts]) -> str:
-    """The generated part of README.md."""
-    parts = [
-        f"<details>\n<summary><code>{name}</code></summary>\n\n" + "\n".join(node.parameter_rows()) + "\n\n</details>\n"
-        for name, node in facts.items()
-    ]
+    """The generated part of the page of parameters."""
+    parts = [f"## `{name}`\n\n" + "\n".join(node.parameter_rows()) + "\n" for name, node in facts.items()]
     return BEGIN + "\n" + "\n".join(parts) + "\n" + END
 
 
-def readme_part(text: str) -> tuple[int, int]:
-    """Where the generated part of README.md begins and ends."""
-    assert text.count(BEGIN) == text.count(END) == 1, "README.md has lost the marks around the parameters"
+def generated_part(text: str) -> tuple[int, int]:
+    """Where the generated part of the page of parameters begins and ends."""
+    assert text.count(BEGIN) == text.count(END) == 1, f"{PARAMETERS} has lost the marks around the parameters"
     return text.index(BEGIN), text.index(END) + len(END)
 
 
-def readme_rows(text: str, heading: str) -> list[list[str]]:
-    """The cells of the first table below a heading of README.md, without its head."""
+def table_rows(text: str, heading: str) -> list[list[str]]:
+    """The cells of the first table below a heading, without its head."""
     section = text.split(f"\n{heading}\n", 1)[1]
     match = re.search(r"(?:^\|.*\n)+", section, re.MULTILINE)
-    assert match, f"README.md has no table below {heading}"
+    assert match, f"there is no table below {heading}"
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in match.group().splitlines()]
     return rows[2:]
 
 
 def documented_endpoints(text: str) -> set[Endpoint]:
-    """What the table of topics says; only names in backticks count, so ends that exist on request are left out."""
+    """The ends in the table of topics; only names in backticks count, so ends that exist on request are left out."""
     found = set()
-    for topic, kind, publishers, subscribers, offered, asked, _ in readme_rows(text, "## Topics and services"):
+    for topic, kind, publishers, subscribers, offered, asked, _ in table_rows(text, "## Topics"):
         (name,) = re.findall(r"`(.+?)`", topic)
         for publishes, nodes, qos in ((True, publishers, offered), (False, subscribers, asked)):
             for node in re.findall(r"`(.+?)`", nodes):
@@ -168,12 +167,12 @@ def documented_endpoints(text: str) -> set[Endpoint]:
 
 
 def main() -> None:
-    """Write the nodes' parameters into README.md."""
+    """Write the nodes' parameters into their page."""
     with running_nodes() as facts:
         section = parameter_section(facts)
-    text = README.read_text()
-    begin, end = readme_part(text)
-    README.write_text(text[:begin] + section + text[end:])
+    text = PARAMETERS.read_text()
+    begin, end = generated_part(text)
+    PARAMETERS.write_text(text[:begin] + section + text[end:])
 
 
 if __name__ == "__main__":

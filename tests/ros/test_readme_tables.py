@@ -1,4 +1,4 @@
-"""README.md's tables of parameters, topics and services are what the nodes have."""
+"""The tables of parameters, topics and services in docs/reference match the nodes."""
 
 import re
 from collections.abc import Iterator
@@ -6,13 +6,14 @@ from collections.abc import Iterator
 import pytest
 
 from .readme_tables import (
-    README,
+    PARAMETERS,
+    TOPICS_AND_SERVICES,
     NodeFacts,
     documented_endpoints,
+    generated_part,
     parameter_section,
-    readme_part,
-    readme_rows,
     running_nodes,
+    table_rows,
 )
 
 pytestmark = pytest.mark.processes
@@ -25,9 +26,9 @@ def nodes() -> Iterator[dict[str, NodeFacts]]:
 
 
 def test_parameters(nodes: dict[str, NodeFacts]) -> None:
-    """Names, defaults, meanings and what is allowed: the text is that which the nodes' descriptors give."""
-    text = README.read_text()
-    begin, end = readme_part(text)
+    """Names, defaults, meanings and limits are those of the nodes' descriptors."""
+    text = PARAMETERS.read_text()
+    begin, end = generated_part(text)
     documented, declared = text[begin:end].splitlines(), parameter_section(nodes).splitlines()
     missing = [line for line in declared if line not in documented]
     wrong = [line for line in documented if line not in declared]
@@ -36,12 +37,12 @@ def test_parameters(nodes: dict[str, NodeFacts]) -> None:
 
 def test_topics(nodes: dict[str, NodeFacts]) -> None:
     declared = set().union(*(node.endpoints() for node in nodes.values()))
-    assert sorted(documented_endpoints(README.read_text())) == sorted(declared)
+    assert sorted(documented_endpoints(TOPICS_AND_SERVICES.read_text())) == sorted(declared)
 
 
 def test_services(nodes: dict[str, NodeFacts]) -> None:
     documented = set()
-    for service, kind, node, _ in readme_rows(README.read_text(), "Services:"):
+    for service, kind, node, _ in table_rows(TOPICS_AND_SERVICES.read_text(), "## Services"):
         name = re.sub("^~", "/" + node.strip("`"), service.strip("`"))
         package, short = kind.strip("`").split("/")
         documented.add((name, f"{package}/srv/{short}"))

@@ -114,7 +114,7 @@ def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
     with NodeProcess("ngo_sim", "maze2d", {"record": str(path)}) as node:
         assert node.wait() == 2
         (line,) = node.lines
-    assert "record is" in line and "which exists; allowed: a new .mcap file or a new folder" in line
+    assert "parameter 'record' is" in line and "which exists; allowed: a new .mcap file or a new folder" in line
     assert path.read_text() == "precious"
 
 

@@ -38,6 +38,7 @@ def test_two_robots_drive_at_once(tmp_path: Path) -> None:
                 local = {**shared, "image_reliability": "reliable", "image_depth": 100}
                 # At rate 0 it waits for its own two estimators, and publishes no frame that they do not take.
                 maze = {
+                    "frame_prefix": f"{name}/",
                     "seed": seed,
                     "frames": FRAMES,
                     "rate": 0.0,

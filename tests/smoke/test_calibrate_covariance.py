@@ -10,9 +10,9 @@ from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training import calibrate_covariance
 from training.calibrate_covariance import Arguments, normalized_errors
-from training.data.streams import simulate
+from training.data.episodes import simulate
+from training.data.features import features_of
 from training.data.worlds import VALIDATION_SEEDS, world_named
-from training.featurise import features_of
 
 FRAMES = 240
 

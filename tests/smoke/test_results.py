@@ -21,8 +21,8 @@ from training import (
     tune_pose_graph,
 )
 from training.data import worlds
+from training.data.feature_store import open_store
 from training.data.worlds import MazeSize, Table, world_named
-from training.featurise import open_store
 from training.scoring.metrics import trajectory_error
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
@@ -122,7 +122,7 @@ def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, di
     try:
         for path in new.iterdir():
             (old / path.name).write_bytes(path.read_bytes())
-        found = results.measured_rows(arguments(folder), sources, "cycles")["ngo_5"]
+        found = results.evaluate_rows(arguments(folder), sources, "cycles")["ngo_5"]
     finally:
         for name, content in kept.items():
             (old / name).write_bytes(content)

@@ -20,10 +20,10 @@ from training import (
     train_smoother,
     tune_pose_graph,
 )
-from training.baselines.network_odometry import open_odometry
 from training.common.runs import RunError
+from training.data.feature_store import open_store
 from training.data.worlds import world_named
-from training.featurise import open_store
+from training.scoring.network_odometry import open_odometry
 from training.scoring.oracle_rows import LIMITS
 from training.scoring.table_rows import Sources, rows_of
 
@@ -133,13 +133,13 @@ def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, An
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
     scripts = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_smoother, tune_pose_graph)
-    calls = ("training.report.prerequisites.make_odometry", "training.scoring.error_cache.scores")
+    calls = ("training.prerequisites.make_odometry", "training.scoring.error_cache.scores")
     toy.refuse(monkeypatch, scripts, *calls)
     assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result
 
 
 def test_odometry_of_another_network_is_not_mixed_in(made: tuple[Path, dict[str, Any]]) -> None:
-    from training.baselines.network_odometry import make_odometry
+    from training.scoring.network_odometry import make_odometry
 
     folder, _ = made
     store = sources(folder).of_row("deepvo", 0).store_folder("validation", "seen")

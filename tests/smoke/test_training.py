@@ -44,7 +44,7 @@ from training import (
 )
 from training.baselines.deepvo import DEEPVO
 from training.common import runs
-from training.data import worlds
+from training.data import feature_store, worlds
 
 
 class Killed(RuntimeError):
@@ -102,7 +102,8 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     OnlineTrajectory.load(weights, world=world)
     for load, script in ((load_local, "train_local"), (load_place, "train_place"), (load_optimizer, "train_optimizer")):
         _, description = load(weights, world)
-        assert description["training"]["command"].startswith(f"python -m training.{script} --world {world} ")
+        command = description["training"]["command"]
+        assert command.startswith(f"python -m training.{script} ") and f" --world {world} " in command
         assert description["training"]["arguments"]["seed"] == 0
         assert min(description["training"][name] for name in ("seconds", "datapoints_per_s", "peak_memory_mb")) > 0
         assert description["metrics"]["validation"]
@@ -143,7 +144,7 @@ def test_a_smoother_of_another_local_network_is_refused(tmp_path: Path, monkeypa
         train_optimizer.main(asked)
     # Nor does a run on the features of one network go on with those of another.
     monkeypatch.setattr(train_smoother, "load_local", lambda folder, _: (load_local(before)[0], {"sha256": "another"}))
-    monkeypatch.setattr(featurise, "check_networks", lambda *_: None)
+    monkeypatch.setattr(feature_store, "check_networks", lambda *_: None)
     with pytest.raises(runs.RunError, match="given local_pose_network_sha256 another"):
         train_smoother.main(toy.smoother("maze2d", tmp_path))
 

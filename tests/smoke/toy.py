@@ -11,6 +11,7 @@ import pytest
 from training import (
     evaluate,
     featurise,
+    prerequisites,
     results,
     throughput,
     train_deepvo,
@@ -21,17 +22,15 @@ from training import (
     train_smoother,
     tune_pose_graph,
 )
-from training.data import streams, worlds
-from training.report import prerequisites
+from training.data import episodes, streams, worlds
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:
     """Episodes of ``frames`` frames (``place_frames`` where places must be seen again), two mazes at a time."""
-    simulate = streams.simulate
+    simulate = episodes.simulate
     for script in (train_local, train_deepvo):
         monkeypatch.setattr(script, "simulate", lambda world, seeds, _: simulate(world, seeds[:2], frames))
-    monkeypatch.setattr(streams, "_GROUP", 2)
-    monkeypatch.setattr(featurise, "_GROUP", 2)
+    monkeypatch.setattr(episodes, "GROUP", 2)
     monkeypatch.setattr(streams.PairStream, "FRAMES", frames)
     monkeypatch.setattr(streams.PlaceStream, "FRAMES", place_frames)
     for name, world in worlds.WORLDS.items():

@@ -15,7 +15,8 @@ from safetensors.torch import save
 
 from tests.smoke import toy
 from training import train_local
-from training.data.streams import Batch, PairStream
+from training.data.batches import Batch
+from training.data.streams import PairStream
 
 
 def main(folder: Path) -> None:

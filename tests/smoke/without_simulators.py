@@ -34,7 +34,7 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
     from training.recordings.recording_source import RecordedArguments, open_recorded
     from training.recordings.recording_streams import RecordedSteps, track_pairs
     from training.scoring.metrics import trajectory_error
-    from training.scoring.recording_errors import with_origin
+    from training.scoring.online_estimate import with_origin
     from training.train_local import estimated, initial_network
 
     folder = Path(settings["folder"])

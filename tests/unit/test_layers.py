@@ -20,6 +20,9 @@ SHARED = ("ngo_common", "ngo_recordings")
 PARTS_OF_NODES = ("ngo_estimator.nodes.messages", "ngo_estimator.nodes.path_message")
 ROS = ("rclpy", "builtin_interfaces", "ament_index_python", "rosidl_runtime_py", "launch", "launch_ros")
 
+# In the package of this name, a module beside the folders is a command.
+COMMANDS = "training"
+
 # A module may import, directly or through others, none of a later layer. A name is a folder or a module of the package.
 LAYERS = {
     "ngo_recordings": [
@@ -49,6 +52,7 @@ LAYERS = {
         {"offline"},
         {"nodes"},
     ],
+    "training": [{"common"}, {"data"}, {"recordings", "driver", "baselines"}, {"scoring"}, {"report"}],
 }
 # Of one layer, these do not know each other: the back end takes relative poses, whoever makes them.
 APART = {("ngo_estimator.online", "ngo_estimator.odometry"), ("ngo_estimator.odometry", "ngo_estimator.online")}
@@ -123,7 +127,9 @@ def layer_of(module: str) -> int | None:
     """The layer that a module stands in by its folder or its name, or None where it has none."""
     package, _, inside = module.partition(".")
     part = inside.partition(".")[0]
-    return next((index for index, names in enumerate(LAYERS.get(package, [])) if part in names), None)
+    layers = LAYERS.get(package, [])
+    last = len(layers) if package == COMMANDS and part else None
+    return next((index for index, names in enumerate(layers) if part in names), last)
 
 
 def upward_imports(imports: Mapping[str, set[str]]) -> Iterator[str]:
@@ -142,7 +148,8 @@ def upward_imports(imports: Mapping[str, set[str]]) -> Iterator[str]:
         for name in sorted(reached):
             other = layer_of(name) if is_below(name, package) else None
             if other is not None and other > level:
-                yield f"{module} reaches {name}: it is of a later layer"
+                command = package == COMMANDS and other == len(LAYERS[package])
+                yield f"{module} reaches {name}: it is {'a command' if command else 'of a later layer'}"
             elif name == module:
                 yield f"{module} imports itself in a circle"
             elif any(is_below(module, a) and is_below(name, b) for a, b in APART):
@@ -211,6 +218,34 @@ def test_a_crossing_through_other_modules_is_caught() -> None:
 )
 def test_an_allowed_import_is_not_reported(module: str, source: str) -> None:
     assert list(crossings({module: imported_names(source, module)})) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint"),
+    [
+        ("training.data.feature_store", "from training import train_local", "a command"),
+        ("training.report.tables", "from training.results import main", "a command"),
+        ("training.report.tables", "import importlib\nimportlib.import_module('training.results')", "a command"),
+        ("training.common.runs", "from training.data import worlds", "later layer"),
+        ("training.baselines.pose_graph", "from training.scoring.metrics import trajectory_error", "later layer"),
+        ("training.scoring.metrics", "from training.report.tables import Table", "later layer"),
+    ],
+)
+def test_a_planted_crossing_in_the_training_is_caught(module: str, source: str, complaint: str) -> None:
+    known = ("train_local", "results", "data.worlds", "scoring.metrics", "report.tables")
+    imports = {**{f"training.{name}": set[str]() for name in known}, module: imported_names(source, module)}
+    (found,) = crossings(imports)
+    assert complaint in found
+
+
+def test_every_folder_of_the_training_has_a_layer() -> None:
+    folders = {path.parent.name for path in OUTSIDE["training"].glob("*/__init__.py")}
+    assert folders == set().union(*LAYERS["training"])
+
+
+def test_a_command_may_import_a_command() -> None:
+    imports = {"training.results": {"training.prerequisites"}, "training.prerequisites": set[str]()}
+    assert list(crossings(imports)) == []
 
 
 def test_relative_imports_are_resolved() -> None:

@@ -2,4 +2,4 @@
 
 
 class CommandError(Exception):
-    """What the command cannot do, as one line; the command ends with exit code 1."""
+    """An error with one line for the user; the command ends with exit code 1."""

@@ -32,10 +32,10 @@ def executable_path(package: str, executable: str) -> Path:
 def run(arguments: Sequence[str]) -> int:
     """Replace this process: the executable gets the signals, and its exit code is the command's."""
     parser = argparse.ArgumentParser("ros2 run", description="Run an executable of a package.")
-    parser.add_argument("--prefix", default="", help="what comes before the executable, e.g. 'nice -n 5'")
+    parser.add_argument("--prefix", default="", help="command in front of the executable, e.g. 'nice -n 5'")
     parser.add_argument("package_name", help="name of the package")
     parser.add_argument("executable_name", help="name of the executable")
-    parser.add_argument("argv", nargs=argparse.REMAINDER, help="what the executable gets")
+    parser.add_argument("argv", nargs=argparse.REMAINDER, help="arguments of the executable")
     options = parser.parse_args(arguments)
     path = executable_path(options.package_name, options.executable_name)
     command = [*shlex.split(options.prefix), str(path), *options.argv]

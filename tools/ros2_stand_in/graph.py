@@ -1,4 +1,4 @@
-"""The command's own hidden node, and what it finds in the graph."""
+"""The command's own hidden node, and its view of the graph."""
 
 import contextlib
 import os
@@ -83,7 +83,7 @@ def poll(find: Callable[[], Found | None], timeout_s: float = DISCOVERY_TIMEOUT_
 
 
 def settle(node: Node, look: Callable[[], Found]) -> Found:
-    """What `look` sees once every node has had time to show itself and nothing changes any more."""
+    """The result of `look` once every node has had time to appear and nothing changes any more."""
     start = changed = time.monotonic()
     seen = look()
     while running() and (now := time.monotonic()) - start < DISCOVERY_TIMEOUT_S:

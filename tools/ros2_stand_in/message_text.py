@@ -67,7 +67,7 @@ def select_field(message: Any, field: str) -> Any:
 
 
 def echo_text(message: Any, field: str | None, truncate_length: int | None) -> str:
-    """What `ros2 topic echo` prints for one message, with the separator."""
+    """The output of `ros2 topic echo` for one message, with the separator."""
     value = message if field is None else select_field(message, field)
     if is_message(value):
         return message_to_yaml(value, truncate_length) + "---"

@@ -26,7 +26,7 @@ FIELDS = {
 
 
 def value_text(value: ParameterValue, hide_type: bool = False) -> str:
-    """What `ros2 param get` prints for a value."""
+    """The output of `ros2 param get` for a value."""
     if value.type == ParameterType.PARAMETER_NOT_SET:
         return "None" if hide_type else "Parameter not set."
     if value.type not in FIELDS:

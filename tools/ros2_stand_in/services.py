@@ -26,7 +26,7 @@ def service_class(type_name: str) -> Any:
 
 
 def fill(message: Any, values: Any) -> None:
-    """Set the fields of a message from the mapping that YAML gives; CommandError for what it does not have."""
+    """Set the fields of a message from the mapping that YAML gives; CommandError for a field that it does not have."""
     if not isinstance(values, dict):
         raise CommandError(f"Failed to populate field: expected a mapping of names to values, got {values!r}")
     for name, value in values.items():

@@ -40,7 +40,7 @@ def full_topic_name(node: Node, topic: str) -> str:
 
 
 def published_type(node: Node, topic: str) -> str | None:
-    """The type of the messages on a topic, or None where nobody publishes or subscribes it."""
+    """The type of the messages on a topic, or None for a topic without publishers and subscribers."""
     types = dict(node.get_topic_names_and_types()).get(topic)
     if types is None:
         return None

@@ -1,7 +1,7 @@
 """DeepVO, the paper's baseline: Wang et al., "DeepVO: towards end-to-end visual odometry with deep recurrent
 convolutional neural networks" (2017).
 
-It belongs to the results alone, and is no part of what the estimator ships.
+It is part of the results alone; the estimator does not ship it.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ State = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class DeepVOConfig:
-    """What a DeepVO network is made of.
+    """Configuration of a DeepVO network.
 
     ``width`` scales the channels of the convolutions and the units of the LSTM layers. ``relative_mean`` and
     ``relative_std`` (m, m, rad) normalise the output, to which ``relative_bias`` is added. With ``symmetric`` the

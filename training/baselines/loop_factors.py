@@ -1,7 +1,7 @@
-"""The loops that the classical pose graph gets: found by place codes, or known from the truth.
+"""Loops for the classical pose graph: found by place codes, or known from the truth.
 
-What ``found_loops`` gives is what our own optimizer gets. True revisits, measured by the pair head or known exactly,
-tell how much of the error that remains lies in retrieval, and how much in measuring.
+``found_loops`` gives the loops of our own optimizer. True revisits show the cause of the remaining error. It is
+retrieval if they help when the pair head measures them, and measurement if they help only when known exactly.
 """
 
 import math
@@ -17,8 +17,9 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import LoopSearch, find_loops, fused_measurements
+from ngo_estimator.optimizer.loop_closure import LoopSearch, find_loops, frame_odometry
 from ngo_estimator.optimizer.overlaps import find_overlaps
+from ngo_estimator.optimizer.pair_measurement import VIEWS, PairViews, measure_pairs
 from ngo_estimator.optimizer.registered_odometry import registered_steps
 
 _TOGETHER = 8  # trajectories that go through the pair head at once
@@ -49,7 +50,7 @@ class LoopFactors:
 
 @dataclass(frozen=True)
 class Seen:
-    """What loops are found in, arrays ``(trajectories, steps, ...)``.
+    """Inputs of the search for loops, arrays ``(trajectories, steps, ...)``.
 
     ``relative`` and ``log_std`` are the steps of the odometry and the logarithm of their deviations, ``codes`` the
     place codes ``(trajectories, steps, code_length)`` of the frame after each step, ``origin_code`` ``(trajectories, 1,
@@ -93,7 +94,7 @@ def smoothed_odometry(
 
 
 def found_loops(pair_head: PairHead, seen: Seen, search: LoopSearch, block: int = 8) -> list[LoopFactors]:
-    """What ``find_loops`` gives for each trajectory, with ``block`` steps in a meta-pose."""
+    """Loops of each trajectory by ``find_loops``, with ``block`` steps in a meta-pose."""
     found: list[LoopFactors] = []
     for part in _parts(seen):
         steps, _ = part.registered(pair_head, search, block)
@@ -112,7 +113,7 @@ MoreLoops = Callable[[np.ndarray], LoopFactors]
 def overlaps_of(
     pair_head: PairHead, codes: np.ndarray, relative: np.ndarray, search: LoopSearch, block: int = 8
 ) -> list[MoreLoops]:
-    """What ``find_overlaps`` gives for each trajectory, once there are poses.
+    """A search for overlaps of each trajectory by ``find_overlaps``, once there are poses.
 
     Args:
         codes: place codes ``(trajectories, steps, code_length)``; relative: steps of the odometry ``(trajectories,
@@ -173,11 +174,9 @@ def measured_revisits(
     codes, in_blocks = _float32(seen.codes), poses_in_blocks(seen.registered(pair_head, search, block)[0], block)
     earlier, later = torch.from_numpy(frames), torch.from_numpy(ends * block + block - 1)
     with torch.inference_mode():
-        measured, log_scale, _ = fused_measurements(
-            pair_head, codes, in_blocks, earlier.unsqueeze(0), later.unsqueeze(0), search.views
-        )
-        pair = codes[:, earlier], codes[:, later]
-        measured, log_scale = pair_head.register(*pair, measured, log_scale, search.registrations)
+        pairs = earlier.unsqueeze(0), later.unsqueeze(0)
+        views = PairViews.of_trajectories(codes, frame_odometry(in_blocks), *pairs, VIEWS[: search.views])
+        (measured, log_scale, _), _ = measure_pairs(pair_head, views, search.registrations)
         measured = se2.compose(in_blocks.flatten(1, 2)[:, earlier], measured)
     return LoopFactors(frames // block, ends, measured[0].numpy(), log_scale[0].numpy(), _certain(frames))
 

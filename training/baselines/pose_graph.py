@@ -1,8 +1,7 @@
 """The classical baseline: a pose graph of the same odometry and loops as ours, optimised with GTSAM.
 
 Nodes are the ends of the meta-steps. Odometry factors are composed meta-steps with the network's own deviations, loop
-factors are what ``find_loops`` gives. A few numbers say how far either is to be believed: ``training.tune_pose_graph``
-chooses them on validation mazes.
+factors come from ``find_loops``. ``training.tune_pose_graph`` chooses the scales of both on validation mazes.
 """
 
 import math
@@ -33,7 +32,7 @@ _DRIFT_RAD_A_M = 0.2
 
 @dataclass(frozen=True)
 class PoseGraphSettings:
-    """What can be tuned in the pose graph. A scale multiplies the deviation that a network states."""
+    """Settings of the pose graph. A scale multiplies the deviation that a network states."""
 
     block: int = 8
     """Steps in a meta-pose."""
@@ -44,7 +43,7 @@ class PoseGraphSettings:
     odometry_gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of a step's x, y and turn: a constant calibration of the odometry."""
     odometry_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What is then added to each step (m, m, rad)."""
+    """Bias that is then added to each step (m, m, rad)."""
     search: LoopSearch = field(default_factory=lambda: LoopSearch(per_pose=4, most=500, views=1))
     """Which pairs of frames become loop candidates."""
     min_logit: float = 2.0
@@ -58,9 +57,9 @@ class PoseGraphSettings:
     kernel_width: float = 2.0
     """Parameter of the kernel over loops, in deviations."""
     drift_m: float = 1.0
-    """What the graph allows the odometry to have drifted at first: so much, and a fifth of it in rad, is added (in
-    squares) to each loop's deviation, then a quarter of that, and so on, in the end nothing (as in graduated
-    non-convexity). With 0 it begins with a convex kernel instead."""
+    """Drift of the odometry that the graph allows at first. It is added in squares to each loop's deviation, a fifth of
+    it in rad to that of the heading. Each stage has a quarter of it, the last one none (graduated non-convexity). With
+    0 the graph starts with a convex kernel instead."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -112,7 +111,7 @@ def optimize(
 def optimize_exact(
     relative: np.ndarray, log_std: np.ndarray, truth: np.ndarray, settings: PoseGraphSettings
 ) -> np.ndarray:
-    """What perfect loops would give: as ``optimize``, with true revisits and their true relative poses."""
+    """The poses with perfect loops: as ``optimize``, with true revisits and their true relative poses."""
     exact = replace(settings, kernel="none", drift_m=0.0, loop_position_scale=1.0, loop_heading_scale=1.0)
     return optimize(relative, log_std, exact_revisits(truth, settings.search, settings.block), exact)
 

@@ -1,1 +1,1 @@
-"""What every training shares: runs, learning curves, data modules."""
+"""Shared by all trainings: runs, learning curves, precision, losses of steps, command line."""

@@ -1,4 +1,4 @@
-"""What a training leaves beside its weights: learning curves, time, throughput and memory, over interruptions."""
+"""Learning curves, time, throughput and memory of a training, kept over interruptions."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ Batch = dict[str, Tensor]
 _SAMPLE_S = 5.0  # the memory of other processes is asked for this often: it costs milliseconds
 
 
-def rows(batch: Batch) -> int:
+def batch_size(batch: Batch) -> int:
     """Datapoints in a batch whose every row is one."""
     return len(next(iter(batch.values())))
 
@@ -31,7 +31,7 @@ class Curves(Callback):
     the start, validation included) and whatever the training logs.
     """
 
-    def __init__(self, path: Path, datapoints: Callable[[Batch], int] = rows) -> None:
+    def __init__(self, path: Path, datapoints: Callable[[Batch], int] = batch_size) -> None:
         self.path, self.datapoints_of = path, datapoints
         self.curve: list[dict[str, float]] = []
         self.seconds = 0.0

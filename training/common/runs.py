@@ -1,4 +1,4 @@
-"""What all training scripts share: the folder of a run with its record, and the trainer."""
+"""The folder of a run with its record, and its trainer, for all trainings."""
 
 import dataclasses
 import json
@@ -8,34 +8,35 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 
-from training.common.curves import Batch, Curves, rows, write_at_once
+from training.common.curves import Batch, Curves, batch_size, write_at_once
+from training.common.precision import Precision, resolved
 
 ROOT = Path(__file__).resolve().parents[2]
 WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
 
 
 class RunError(ValueError):
-    """What lies in the folder of a run, or was asked of it, does not fit: one line that says what to do."""
+    """The files of a run and its arguments do not fit together; the message is one line with the remedy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerArguments:
-    """Where and how a training computes: what the arguments of every training script begin with."""
+    """Device, processes and precision of a training."""
 
     accelerator: str = "auto"
-    """Kind of device by Lightning's name, as cpu or gpu; auto: a GPU where there is one."""
+    """Kind of device by Lightning's name, such as cpu or gpu; auto: a GPU where there is one."""
     devices: str = "auto"
     """Processes that train together, each on batches of its own; auto: one, or one a GPU."""
     strategy: str = "auto"
-    """How they do so by Lightning's name, as ddp or ddp_find_unused_parameters_true; auto: ddp if several."""
-    precision: Literal["bf16-mixed", "32-true"] = "bf16-mixed"
-    """Arithmetic of the networks; 32-true where a device has no fast bfloat16."""
+    """How processes work together, by Lightning's name, such as ddp; auto: ddp if there are several."""
+    precision: Precision = "auto"
+    """Arithmetic of the networks; auto: the faster one on this device, which the run prints when it begins."""
 
 
 def revision() -> str:
@@ -57,19 +58,13 @@ def revision() -> str:
 
 
 def record(script: str, arguments: Any) -> dict[str, Any]:
-    """How this run was made: command, arguments and revision, for the JSON beside its weights.
+    """Command, arguments and revision of a run, for the JSON beside its weights.
 
     Folders are left out: they say where a network was made, not how; of recordings, the names are kept.
     """
-    values, changed = {}, []
+    values, changed = recorded_values(arguments), []
     for field, value in _flat(arguments):
-        if isinstance(value, Path):
-            continue
-        if isinstance(value, tuple) and value and isinstance(value[0], Path):
-            values[field.name] = tuple(path.name for path in value)
-        else:
-            values[field.name] = value
-        if value != field.default:
+        if field.name in values and value != field.default:
             flag = field.name.replace("_", "-")
             if isinstance(value, bool) and field.default is not None:
                 changed.append(f"--{flag}" if value else f"--no-{flag}")
@@ -78,6 +73,17 @@ def record(script: str, arguments: Any) -> dict[str, Any]:
                 changed += [f"--{flag}", *map(str, kept if isinstance(kept, tuple) else (kept,))]
     command = shlex.join(["python", "-m", f"training.{script}", *changed])
     return {"command": command, "arguments": values, "revision": revision()}
+
+
+def recorded_values(arguments: Any) -> dict[str, Any]:
+    """Values of arguments by name, of files the names alone, and none of folders."""
+    values = {}
+    for field, value in _flat(arguments):
+        if isinstance(value, tuple) and value and isinstance(value[0], Path):
+            values[field.name] = tuple(path.name for path in value)
+        elif not isinstance(value, Path):
+            values[field.name] = value
+    return values
 
 
 def _flat(arguments: Any) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
@@ -138,12 +144,16 @@ class Run:
         arguments: TrainerArguments,
         epochs: int,
         seed: int,
-        datapoints: Callable[[Batch], int] = rows,
+        datapoints: Callable[[Batch], int] = batch_size,
         best: str | None = None,
         data: str | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         self.folder = folder
+        why = ""
+        if arguments.precision == "auto":
+            precision, why = self._precision(arguments)
+            arguments = dataclasses.replace(arguments, precision=precision)
         self.record = record(script, arguments)
         if data is not None:
             self.record["arguments"]["data_sha256"] = data
@@ -164,6 +174,16 @@ class Run:
             strategy=arguments.strategy,
         )
         self.is_first = bool(self.trainer.is_global_zero)
+        if why and self.is_first:
+            print(f"precision {arguments.precision}: {why} (--precision chooses another)", flush=True)
+
+    def _precision(self, arguments: TrainerArguments) -> tuple[Precision, str]:
+        """The precision that the run began with, or the better one here; and why."""
+        path = self.folder / "run.json"
+        if path.exists() and resume_from(self.folder) is not None:
+            begun: Precision = json.loads(path.read_text())["arguments"]["precision"]
+            return begun, "as the run began"
+        return resolved(arguments.accelerator, arguments.devices)
 
     def _check_arguments(self) -> None:
         path = self.folder / "run.json"
@@ -193,7 +213,7 @@ class Run:
             self.best.restore(training)
 
     def validate(self, training: lightning.LightningModule, data: lightning.LightningDataModule) -> dict[str, float]:
-        """What the training logs of the validation data, as it is now."""
+        """The validation figures of the present weights, by their logged names."""
         (logged,) = self.trainer.validate(training, datamodule=data, verbose=False)
         return {name: float(value) for name, value in logged.items()}
 

@@ -1,1 +1,1 @@
-"""Training data from the simulators: worlds, streams, feature stores."""
+"""Training data: worlds, episodes, streams, feature stores."""

@@ -1,4 +1,4 @@
-"""What a training must know of where its data come from, a simulated world or a robot's recordings."""
+"""The sensor, the robot and the scale of the training data, from a simulated world or from recordings."""
 
 from dataclasses import dataclass
 
@@ -13,51 +13,57 @@ OTHER_TRAIN_STORE = "train_policy"
 """The one that the optimizer learns from as well, in worlds with an ``optimizer_driver``."""
 
 MIRRORED_ACTIONS = (0, 2, 1)
-"""What the actions of ngo_msgs/DiscreteAction become in a mirror: forward stays, left and right change places."""
+"""Mirror image of each action of ngo_msgs/DiscreteAction: forward stays, left and right change places."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Domain:
-    """The sensor, the robot and the scale of its surroundings.
-
-    ``actions`` is the number of discrete actions (0: networks see images alone), ``mirrored_actions`` what each of them
-    becomes in a mirror, ``action_history`` how many of the latest ones the local network is told, ``block_m`` the
-    length that errors of positions are measured by (a corridor's width).
-    ``place_radius_m`` and ``heading_limit_rad`` say how far two frames of one place may be apart and turned against
-    each other, ``loop_views`` between how many pairs of frames a loop is measured, and ``registration`` how frames are
-    registered, where ranges are known that are good enough for it. ``reverses`` says that the robot may
-    drive backwards. With ``twist`` the networks are told the velocity of each step, which they divide by
-    ``twist_scale`` (m/s, m/s, rad/s). ``mirrors`` says that a frame seen in a mirror is a frame that could be.
-
-    What an optimizer here begins with: ``loops_per_pose`` candidates of a meta-pose are more than ``loops_apart``
-    meta-poses from each other and ``max_loops`` of a trajectory, ``overlaps`` more are looked for under its poses,
-    where ranges are registered, and ``smoothing`` says whether its odometry is smoothed. It is trained for
-    ``optimizer_epochs``, and errors count by their square below ``loss_scale``: so many corridor widths, and as many
-    fifths of a radian.
-    """
+    """The sensor, the robot and the scale of its surroundings, and the defaults of an optimizer for them."""
 
     name: str
+    """Name of the world or the robot, and of its folders."""
     image: ImageFormat
+    """Format of the frames."""
     period_s: float
+    """Time between two frames."""
     block_m: float
+    """Length by which errors of positions are measured: the width of a corridor."""
     place_radius_m: float
+    """Largest distance between two frames of one place."""
     heading_limit_rad: float
+    """Largest turn between two frames of one place."""
     loop_views: int
+    """Pairs of frames between which a loop is measured."""
     registration: RegistrationConfig | None = None
+    """Registration of frames; None where ranges are unknown or not good enough."""
     reverses: bool = False
+    """Whether the robot may drive backwards."""
     actions: int = 3
+    """Number of discrete actions; 0: networks see images alone."""
     mirrored_actions: tuple[int, ...] = MIRRORED_ACTIONS
+    """Mirror image of each action."""
     action_history: int = 1
+    """Number of latest actions that the local network is told."""
     twist: bool = False
+    """Whether networks are told the velocity of each step."""
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Velocity by which networks divide it (m/s, m/s, rad/s)."""
     mirrors: bool = True
+    """Whether the mirror image of a frame could be a frame."""
     loops_per_pose: int = LoopSearch.per_pose
+    """Loop candidates of a meta-pose."""
     max_loops: int = LoopSearch.most
+    """Loop candidates of a trajectory."""
     loops_apart: int = LoopSearch.min_apart
+    """Two candidates of one meta-pose are more than this number of meta-poses apart."""
     overlaps: int = 0
+    """Further loops that are searched under the poses, where ranges are registered."""
     smoothing: bool = False
+    """Whether the odometry is smoothed."""
     optimizer_epochs: int = 6
+    """Epochs of an optimizer's training."""
     loss_scale: float = 0.1
+    """Errors below this count by their square: in corridor widths, and in fifths of a radian."""
 
     @property
     def registers_odometry(self) -> bool:

@@ -1,6 +1,6 @@
-"""Simulated 2D lidars: mazes of drawn width and pace, seen by scanners of drawn geometry and quality.
+"""Simulated 2D lidars: mazes of random width and pace, seen by lidars of random geometry and quality.
 
-What is drawn follows from the maze's seed alone, so an episode is the same wherever it is simulated.
+Everything random follows from the maze's seed, so an episode is the same wherever it is simulated.
 """
 
 from __future__ import annotations

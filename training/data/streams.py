@@ -1,13 +1,12 @@
 """Endless training data: worker processes simulate beside the training, and each datapoint is used once.
 
-An epoch of a stream is a function of its number alone (through its maze seeds), so a resumed training meets exactly
-the data that an unbroken one would have met.
+An epoch follows from its number alone, through its maze seeds. A resumed training therefore meets the same data as one
+that was not stopped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,102 +14,25 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION
-from training.data.data_source import MIRRORED_ACTIONS
-from training.data.worlds import DRAWN, MazeSize, World
+from training.data import episodes
+from training.data.batches import (
+    ACTION_HISTORY,
+    ALL,
+    Batch,
+    Share,
+    action_histories,
+    mirrored,
+    relative_poses,
+    reversed_in_time,
+)
+from training.data.episodes import episodes_in, images_of, wall_ranges
+from training.data.worlds import DRAWN, World
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
-    from ngo_sim.mazes import Maze
-
-Batch = dict[str, Tensor]
-
-ACTION_HISTORY = 12
-"""Actions that a batch tells of each step; a network reads as many of the latest ones as it was made for."""
 
 _FORGOTTEN = 0.1  # share of the pairs in training of whose earlier actions nothing, or not all, is known
-_GROUP = 8
-"""Episodes simulated in mazes of one size before another size is drawn, and shuffled together."""
-
-
-def simulate(world: World, seeds: list[int], frames: int, size: MazeSize = DRAWN) -> Iterator[Episode]:
-    """Episodes of ``frames`` frames in the mazes of ``seeds``, all of one size; what is drawn depends on the first."""
-    return episodes_in(world, seeds, seeds, frames, size, world.driver)
-
-
-def episodes_in(
-    world: World, mazes: Sequence[int], seeds: Sequence[int], frames: int, size: MazeSize, driver: str
-) -> Iterator[Episode]:
-    """Episodes of ``frames`` frames, in the maze of each of ``mazes`` with start, noise and driver of one of ``seeds``.
-
-    All mazes are of one size, and what is drawn of it depends on the first.
-    """
-    from ngo_sim.episodes import record_episode  # training on recordings does without the simulators
-
-    env = world.make_random(np.random.default_rng(mazes[0]), size)
-    try:
-        if hasattr(env, "preload"):
-            env.preload(seeds, mazes)
-        for maze, seed in zip(mazes, seeds, strict=True):
-            yield record_episode(env, driver, frames, seed, {} if maze == seed else {"maze_seed": maze})
-    finally:
-        env.close()
-
-
-def images_of(world: World, episode: Episode) -> Tensor:
-    """An episode's observations as ``(frames, height, width, channels)``."""
-    return torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
-
-
-def action_histories(actions: np.ndarray) -> Tensor:
-    """The latest actions ``(..., steps, ACTION_HISTORY)`` of each step, its own last, of ``(..., steps)`` actions."""
-    known = torch.from_numpy(actions).long()
-    return torch.nn.functional.pad(known, (ACTION_HISTORY - 1, 0), value=NO_ACTION).unfold(-1, ACTION_HISTORY, 1)
-
-
-def relative_poses(poses_xyyaw: np.ndarray) -> Tensor:
-    """Relative poses ``(frames - 1, 3)``, float32, of ``(frames, 3)`` global poses."""
-    poses = torch.from_numpy(poses_xyyaw)
-    return se2.between(poses[:-1], poses[1:]).float()
-
-
-def mirrored(batch: Batch) -> Batch:
-    """The batch seen in a mirror: pictures flipped left to right, left and right actions and motions exchanged."""
-    result = dict(batch)
-    for name, value in batch.items():
-        if name in ("earlier", "later", "a", "b", "images"):
-            result[name] = value.flip(-2)
-        elif name == "ranges":
-            result[name] = value.flip(-1)
-        elif name in ("relative", "poses", "twist"):
-            result[name] = value * value.new_tensor([1.0, -1.0, -1.0])
-        elif name == "action":
-            result[name] = value.new_tensor((*MIRRORED_ACTIONS, NO_ACTION))[value]
-    return result
-
-
-def reversed_in_time(batch: Batch) -> Batch:
-    """Frame pairs (without actions) as a robot meets them that drives the same way backwards."""
-    origin = torch.zeros_like(batch["relative"])
-    relative = se2.between(batch["relative"], origin)
-    told = {"twist": -batch["twist"]} if "twist" in batch else {}
-    return {**batch, "earlier": batch["later"], "later": batch["earlier"], "relative": relative, **told}
-
-
-@dataclass(frozen=True)
-class Share:
-    """Which of the ``ranks`` processes that train together this is: each gets as many groups of mazes of its own."""
-
-    rank: int = 0
-    ranks: int = 1
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.rank < self.ranks:
-            raise ValueError(f"rank is {self.rank} of {self.ranks}; expected 0 to {self.ranks - 1}")
-
-
-ALL = Share()
 
 
 class _Stream(IterableDataset[Batch]):
@@ -122,12 +44,12 @@ class _Stream(IterableDataset[Batch]):
 
     def __init__(self, world: World, seeds: range, epoch: int, groups: int, frames: int, share: Share = ALL) -> None:
         self.world, self.frames = world, frames
-        mazes = -(-groups // share.ranks) * share.ranks * _GROUP
+        mazes = -(-groups // share.ranks) * share.ranks * episodes.GROUP
         first = epoch * mazes
         if first + mazes > len(seeds):
             raise ValueError(f"epoch {epoch} asks for more than the {len(seeds)} maze seeds")
         self.first_seed = seeds[0]
-        dealt = [list(seeds[i : i + _GROUP]) for i in range(first, first + mazes, _GROUP)]
+        dealt = [list(seeds[i : i + episodes.GROUP]) for i in range(first, first + mazes, episodes.GROUP)]
         self.groups = dealt[share.rank :: share.ranks]
 
     def __iter__(self) -> Iterator[Batch]:
@@ -136,9 +58,9 @@ class _Stream(IterableDataset[Batch]):
         for seeds in mine:
             rng = np.random.default_rng([seeds[0], 1])
             drivers = self.world.stream_drivers
-            driver = drivers[(seeds[0] - self.first_seed) // _GROUP % len(drivers)]
-            episodes = episodes_in(self.world, seeds, seeds, self.frames, DRAWN, driver)
-            yield from self.batches(list(episodes), rng)
+            driver = drivers[(seeds[0] - self.first_seed) // episodes.GROUP % len(drivers)]
+            drives = episodes_in(self.world, seeds, seeds, self.frames, DRAWN, driver)
+            yield from self.batches(list(drives), rng)
 
     def __len__(self) -> int:
         return len(self.groups) * self.batches_a_group
@@ -169,13 +91,13 @@ class PairStream(_Stream):
         self, world: World, seeds: range, epoch: int, datapoints: int, batch_size: int, share: Share = ALL
     ) -> None:
         self.stretch = self.stretch_of(world)
-        pairs = _GROUP * ((self.FRAMES - 1) // self.stretch) * self.stretch
+        pairs = episodes.GROUP * ((self.FRAMES - 1) // self.stretch) * self.stretch
         if not self.stretch <= batch_size <= pairs or batch_size % self.stretch:
             raise ValueError(
                 f"batch_size is {batch_size}; expected {self.stretch} to {pairs}, the frame pairs of a group of mazes"
                 + (f", in stretches of {self.stretch}" if self.stretch > 1 else "")
             )
-        groups = max(1, round(datapoints / (_GROUP * (self.FRAMES - 1))))
+        groups = max(1, round(datapoints / (episodes.GROUP * (self.FRAMES - 1))))
         super().__init__(world, seeds, epoch, groups, self.FRAMES, share)
         self.batch_size = batch_size
 
@@ -186,7 +108,7 @@ class PairStream(_Stream):
 
     @property
     def batches_a_group(self) -> int:
-        return _GROUP * ((self.FRAMES - 1) // self.stretch) // (self.batch_size // self.stretch)
+        return episodes.GROUP * ((self.FRAMES - 1) // self.stretch) // (self.batch_size // self.stretch)
 
     def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
         images = torch.stack([images_of(self.world, episode) for episode in episodes])
@@ -291,14 +213,14 @@ class TrajectoryStream(_Stream):
     def __init__(
         self, world: World, seeds: range, epoch: int, batches: int, batch_size: int, steps: int, share: Share = ALL
     ) -> None:
-        if not 1 <= batch_size <= _GROUP:
-            raise ValueError(f"batch_size is {batch_size}; expected 1 to {_GROUP}, the mazes of one size")
+        if not 1 <= batch_size <= episodes.GROUP:
+            raise ValueError(f"batch_size is {batch_size}; expected 1 to {episodes.GROUP}, the mazes of one size")
         self.batch_size = batch_size
         super().__init__(world, seeds, epoch, max(1, round(batches / self.batches_a_group)), steps + 1, share)
 
     @property
     def batches_a_group(self) -> int:
-        return _GROUP // self.batch_size
+        return episodes.GROUP // self.batch_size
 
     def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
         for count in range(self.batches_a_group):
@@ -309,19 +231,6 @@ class TrajectoryStream(_Stream):
                 "relative": torch.stack([relative_poses(episode.poses_xyyaw) for episode in chosen]),
             }
             yield mirrored(batch) if count % 2 else batch
-
-
-def wall_ranges(maze: Maze, poses_xyyaw: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """True distances ``(..., rays)`` in m, float32, of the first walls along rays from poses ``(..., 3)``."""
-    from ngo_sim.raycast import cast_rays  # training on recordings does without the simulators
-
-    poses = poses_xyyaw.reshape(-1, 3)
-    scans = np.empty((len(poses), len(angles_rad), 4), dtype=np.float32)  # colour, not asked for, and distance
-    colours = np.zeros((*maze.walls.shape, 3), dtype=np.float32)
-    rays = np.cos(angles_rad), np.sin(angles_rad)
-    for (x, y, yaw), scan in zip(poses.tolist(), scans, strict=True):
-        cast_rays(maze.walls, maze.block_m, x, y, yaw, *rays, colours, scan)
-    return scans[..., 3].reshape(*poses_xyyaw.shape[:-1], len(angles_rad))
 
 
 def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What the optimizer trains on: stretches of the stored trajectories, with their loop candidates."""
+"""Stretches of stored trajectories with their loop candidates, for smoother and optimizer."""
 
 import contextlib
 import dataclasses
@@ -17,8 +17,8 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import poses_in_blocks
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.registered_odometry import registered_steps
-from training.data.streams import ALL, Batch, Share
-from training.featurise import open_store
+from training.data.batches import ALL, Batch, Share
+from training.data.feature_store import open_store
 
 _LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
 _TOGETHER = 8  # trajectories that are searched for loops, or measured, at once

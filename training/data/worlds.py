@@ -1,6 +1,6 @@
-"""The simulated worlds as training data: which mazes, which seeds, which driver.
+"""The simulated worlds as training data: their mazes, seeds and drivers.
 
-The simulators are loaded where an environment is made: training on recordings does without them.
+The simulators are imported where an environment is made: training on recordings works without them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 WorldName = Literal["maze2d", "maze3d", "scan"]
 
-# A maze is a function of its seed and size: these ranges never meet (tests/unit/training/test_worlds.py).
+# A maze is a function of its seed and size: these ranges never meet (tests/unit/training/data/test_worlds.py).
 TEST_SEEDS = range(0, 1_000)
 VALIDATION_SEEDS = range(1_000, 2_000)
 DEMO_SEEDS = range(2_000, 3_000)
@@ -66,28 +66,28 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class World(Domain):
-    """A simulated world.
-
-    ``driver`` drives wherever no other is named, ``training_drivers`` take turns in the streams of training data, from
-    which all but smoother and optimizer learn (none: ``driver``). These two learn from trajectories of ``driver``, and
-    the optimizer from one more of ``optimizer_driver`` (None: nobody) for every five of them. ``block_m`` is the
-    corridor width, ``episode_frames`` the length of the paper's trajectories, ``rows`` and ``extra_openings`` the
-    ranges (both ends included) that training mazes are drawn from. ``tables`` names the kinds of trajectories that
-    results are given for, ``table_trajectories`` says how many a table has and ``prefixes`` after how many steps their
-    errors are given. In training, errors of odometry are summed over windows of ``error_windows`` steps: errors that
-    last make the sum drift. No driver here drives backwards, whether the world ``reverses`` or not.
-    """
+    """A simulated world. No driver here drives backwards, whether the world ``reverses`` or not."""
 
     driver: str
+    """Name of the driver wherever no other is named; smoother and optimizer learn from its trajectories."""
     training_drivers: tuple[str, ...] = ()
+    """Drivers that take turns in the streams, from which all other networks learn; none: ``driver``."""
     optimizer_driver: str | None = None
+    """Driver of one more trajectory for every five of ``driver``, for the optimizer alone; None: nobody."""
     episode_frames: int
+    """Length of the paper's trajectories."""
     rows: tuple[int, int]
+    """Range of the rows of training mazes, both ends included."""
     extra_openings: tuple[int, int]
+    """Range of the extra openings of training mazes, both ends included."""
     tables: dict[str, Table]
+    """The tables of results."""
     table_trajectories: int = 64
+    """Trajectories of a table."""
     prefixes: tuple[int, ...] = (250, 500, 750, 1000)
+    """Numbers of steps after which a table gives errors."""
     error_windows: tuple[int, ...] = (1,)
+    """Lengths of the windows of steps over which losses sum errors: errors that last make the sum drift."""
 
     @property
     def stream_drivers(self) -> tuple[str, ...]:
@@ -96,7 +96,7 @@ class World(Domain):
 
     @property
     def stream_settings(self) -> dict[str, Any]:
-        """What a training on a stream depends on beside its arguments, for its record."""
+        """Settings of the world that a training on a stream depends on, for its record."""
         return {"training_drivers": list(self.stream_drivers)}
 
     @property

@@ -1,4 +1,4 @@
-"""The learned driver's network as stable-baselines3 trains it, and the way from there to the simulator's file."""
+"""The learned driver's network for stable-baselines3, and its export to the simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Driving as a task for reinforcement learning: look, decide for the next few frames, be paid for the way covered."""
+"""Driving as a task for reinforcement learning: look, decide for the next few frames, earn the way covered."""
 
 from __future__ import annotations
 

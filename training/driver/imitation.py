@@ -1,8 +1,8 @@
-"""Imitation of a teacher where the pupil gets to, not only where the teacher would have been (DAgger).
+"""Imitation of a teacher along the pupil's own way (DAgger).
 
-Ross et al., "A reduction of imitation learning and structured prediction to no-regret online learning" (2011): the
-pupil drives ever more of the way itself, the teacher says at every decision what it would have done, and the pupil
-learns from all that was said so far. From what the pupil earns its critic learns meanwhile.
+Ross et al., "A reduction of imitation learning and structured prediction to no-regret online learning" (2011).
+The pupil drives a growing share of the way. The teacher says at every decision what it would do, and the pupil learns
+from all answers so far. The critic learns from the rewards of the pupil.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Lessons:
 
 
 class Memory:
-    """What was seen, what the teacher said and what was earned from there on (nan: not known), decision by decision."""
+    """Pictures, answers of the teacher and later rewards (nan: not known) of each decision."""
 
     def __init__(self, capacity: int, look: Look) -> None:
         self.pictures = np.zeros((capacity, *look["pictures"].shape), np.uint8)

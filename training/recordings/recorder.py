@@ -1,4 +1,4 @@
-"""Records topics of a running graph into one MCAP file, byte by byte as they came over DDS."""
+"""A recorder of topics of a running graph into one MCAP file, byte for byte as they came over DDS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a recording: where it went, what it saw, when its messages came and how it moved."""
+"""The picture of a recording: its path, sample images, the times of its messages and its motion."""
 
 from __future__ import annotations
 

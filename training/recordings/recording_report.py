@@ -1,4 +1,4 @@
-"""What a recording holds, how good it is, and what it can be used for: the numbers behind inspect_recording."""
+"""The numbers behind inspect_recording: content of a recording, its quality and its faults."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ SAMPLES = 6
 """How many images of a recording are kept to be shown."""
 _REVISIT_FRAMES = 5000
 _GAP = 3.0
+_LONGEST_SIMULATION_S = 365.0 * 24.0 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class TopicTimes:
     skew_spread_s: float  # from the first to the last percentile
     frame_ids: tuple[str, ...]
     without_header: bool
+    simulated: bool  # stamps of a simulator's clock, which began near 0, logged by the clock of the day
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Report:
     samples: tuple[np.ndarray, ...] = field(repr=False)
 
     def numbers(self) -> dict[str, Any]:
-        """What fits into JSON."""
+        """The numbers as JSON takes them."""
         plain = {
             name: getattr(self, name)
             for name in ("files", "topics", "uses", "frames", "image", "with_pose", "with_action", "with_twist")
@@ -144,7 +146,7 @@ def topic_row(recording: Recording, name: str) -> dict[str, Any]:
 
 
 def topic_uses(recording: Recording, topics: RecordingTopics) -> dict[str, str]:
-    """What each topic (or file) is used for."""
+    """The use of each topic or file."""
     uses: dict[str, str] = {}
 
     def use(name: str | None, what: str) -> None:
@@ -208,6 +210,7 @@ def _times(logs: list[int], stamps: list[int], frame_ids: set[str]) -> TopicTime
         skew_spread_s=high - low,
         frame_ids=tuple(sorted(frame_ids)),
         without_header=not stamps,
+        simulated=middle < -_LONGEST_SIMULATION_S,
     )
 
 
@@ -265,7 +268,7 @@ def _spread(values: np.ndarray) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Findings:
-    """What a person should know before training on the recording, each in one line with its remedy."""
+    """The faults of a recording, each in one line with its remedy."""
 
     recording: Recording
     topics: RecordingTopics
@@ -303,7 +306,8 @@ class _Findings:
                     f"{name} has {times.gaps} gaps of up to {times.longest_gap_s:.2f} s: frames were lost; record with "
                     "less load, or cut the recording there"
                 )
-            if times.skew_spread_s > 0.5:
+            # Simulated time passes at a pace of its own.
+            if times.skew_spread_s > 0.5 and not times.simulated:
                 yield (
                     f"stamps of {name} drift by {times.skew_spread_s:.2f} s against when they were logged: "
                     "check the driver's clock"
@@ -311,7 +315,8 @@ class _Findings:
         image = self.times[self.topics.image]
         for name, times in self.times.items():
             apart_s = times.skew_median_s - image.skew_median_s
-            if name != self.topics.image and not times.without_header and abs(apart_s) > 0.5:
+            both_simulated = times.simulated and image.simulated
+            if name != self.topics.image and not (times.without_header or both_simulated) and abs(apart_s) > 0.5:
                 yield (
                     f"{name} is stamped {apart_s:+.2f} s from {self.topics.image}: the clocks differ; let both "
                     "machines keep time (chrony, PTP)"

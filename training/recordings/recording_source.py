@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -14,14 +14,15 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from ngo_estimator.checkpoint import CheckpointError, load_local
+from ngo_estimator.checkpoint import LOCAL, load_local
 from ngo_estimator.data.images import ImageFormat
-from ngo_estimator.networks.local_pose_network import LocalPoseConfig
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
-from training.common.runs import RunError
+from training.common.runs import TrainerArguments, recorded_values
+from training.data.batches import ACTION_HISTORY, relative_poses
 from training.data.data_source import MIRRORED_ACTIONS, Domain
-from training.data.streams import ACTION_HISTORY, relative_poses
+from training.data.worlds import WorldName
 from training.recordings.recording_store import StoredRecording, make_store
 from training.recordings.recording_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
 
@@ -35,26 +36,26 @@ _NARROW = math.radians(35.0)
 
 @dataclass(frozen=True)
 class RecordedArguments:
-    """Recordings instead of a simulated world, and what is made of them."""
+    """Recordings in place of a simulated world, and their use."""
 
     data: tuple[Path, ...] = ()
-    """Recordings with ground truth to learn from: .mcap files or rosbag2 folders, each one a recording."""
+    """Recordings with ground truth: .mcap files or rosbag2 folders."""
     name: str = "my_robot"
-    """Name of what is trained on recordings: of the folders of its weights and of its run."""
+    """Name of the robot: of the folders of its weights and of its run."""
     holdout: tuple[Path, ...] = ()
-    """Those of the recordings that nothing is learned from; not given: the last of several, the end of a single one."""
+    """Recordings that are kept for the evaluation; none: the last of several, or the end of a single one."""
     reduction: int | None = None
-    """How many times smaller pictures are made; not given: the least that leaves at most 96 columns."""
+    """Factor by which pictures are made smaller; none: the least that leaves at most 96 columns."""
     place_radius_m: float | None = None
-    """How far two frames of one place may be apart; not given: four fast steps, 0.3 to 1 m."""
+    """Largest distance between two frames of one place; none: four fast steps, 0.3 to 1 m."""
     heading_limit_deg: float | None = None
-    """How far they may be turned against each other; not given: 35, or 180 for scanners that look around."""
+    """Largest turn between two frames of one place; none: 35, or 180 for scanners that look around."""
     scan_yaw_deg: float = 0.0
-    """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead; to be given live, too."""
+    """Direction of a scanner's angle 0, counter-clockwise from straight ahead; give the same to the live estimator."""
     mirror: bool = True
-    """Whether to learn from the frames' mirror images, too; not for sensors that sit far to one side."""
+    """Whether to learn also from mirror images; not for sensors that sit far to one side."""
     from_weights: Path | None = None
-    """Folder of weights to begin with, of the same sensor; their sizes and search for loops stay."""
+    """Folder of weights of the same sensor to start from; their sizes and search for loops stay."""
     topics: Annotated[TopicArguments, tyro.conf.arg(name="")] = field(default_factory=TopicArguments)
 
     def __post_init__(self) -> None:
@@ -72,12 +73,17 @@ class RecordedArguments:
             raise ValueError(f"name is {self.name!r}; expected one that a folder can have")
 
 
-def run_script(main: Callable[[Any], object], arguments: type[Any], description: str | None) -> None:
-    """Run a script with the command line's arguments; what recordings, weights or runs lack ends it with one line."""
-    try:
-        main(tyro.cli(arguments, description=description))
-    except (RecordingError, CheckpointError, RunError) as error:
-        sys.exit(f"unusable: {error}")
+@dataclass(frozen=True)
+class SourceArguments(TrainerArguments):
+    """Arguments of a training on a simulated world or on recordings."""
+
+    world: WorldName | None = None
+    """World to train for."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings to train on instead."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
 
 
 def check_source(world: str | None, recordings: RecordedArguments) -> None:
@@ -88,7 +94,7 @@ def check_source(world: str | None, recordings: RecordedArguments) -> None:
 
 @dataclass(frozen=True)
 class RecordedData:
-    """What there is to learn from: the domain, and tracks by what they are for; ``sha256`` tells it from other data."""
+    """Recordings as training data: their domain, and tracks by part; ``sha256`` identifies the data."""
 
     domain: Domain
     recordings: list[StoredRecording]
@@ -99,15 +105,6 @@ class RecordedData:
     def tracks(self, *parts: Part) -> list[Track]:
         """The tracks of some parts."""
         return [track for part in parts for track in self.parts.tracks[part]]
-
-    def check_trained(self, config: LocalPoseConfig) -> None:
-        """Raise ``RecordingError`` unless a network was trained on what the recordings give with these settings."""
-        domain = self.domain
-        if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
-            raise RecordingError(
-                f"the weights of {domain.name} were trained on these recordings with other settings: give the same "
-                "--data, topics, --reduction and --from-weights as to train_local, or train anew"
-            )
 
     @property
     def about(self) -> dict[str, Any]:
@@ -123,7 +120,7 @@ class RecordedData:
 
     @property
     def residual(self) -> dict[str, float]:
-        """What the projection of the true poses to the plane leaves out: range of heights, and the largest tilt."""
+        """Loss by the projection of the true poses to the plane: range of heights, and the largest tilt."""
         residuals = np.concatenate([recording.residuals for recording in self.recordings])
         known = np.isfinite(residuals).all(axis=1)
         heights = [r.residuals[np.isfinite(r.residuals[:, 0]), 0] for r in self.recordings]
@@ -133,13 +130,81 @@ class RecordedData:
         }
 
 
-def open_recorded(arguments: RecordedArguments, runs: Path) -> RecordedData:
+TrainedLocal = tuple[LocalPoseNetwork, dict[str, Any]]
+"""A local network and its description, as ``load_local`` gives them."""
+
+_ANEW = "give every script of one training the same, or train the local network anew"
+
+
+def trained_local(weights: Path, name: str) -> TrainedLocal | None:
+    """The local network of this name, None where there is none yet."""
+    folder = weights / name
+    return load_local(folder, name) if (folder / f"{LOCAL}.safetensors").exists() else None
+
+
+def open_recorded(arguments: RecordedArguments, runs: Path, local: TrainedLocal | None = None) -> RecordedData:
     """Read the recordings into ``runs/NAME/data`` (once), split them, and print how.
 
+    Args:
+        local: network that must have learned from the same, if there is one; arguments are compared before reading.
+
     Raises:
-        RecordingError: of one line, about what is missing in them.
+        RecordingError: of one line, about what is missing in the recordings, or differs from those of ``local``.
     """
-    return _opened(arguments, runs)
+    if local is not None:
+        check_same_arguments(arguments, local[1])
+    data = _opened(arguments, runs)
+    if local is not None:
+        check_same_data(data, local)
+    return data
+
+
+def check_same_arguments(arguments: RecordedArguments, description: dict[str, Any]) -> None:
+    """Raise ``RecordingError`` where arguments choose other recordings or topics than a network was trained with."""
+    then = description.get("training", {}).get("arguments", {})
+    if "data_sha256" not in then:
+        raise RecordingError(f"the local network of {arguments.name} was not trained on recordings; {_ANEW}")
+    defaults = {**recorded_values(RecordedArguments()), **recorded_values(TopicArguments())}
+    now = {**defaults, **recorded_values(arguments), **recorded_values(arguments.topics)}
+    names = ("data", "holdout", "reduction", "scan_yaw_deg", *recorded_values(TopicArguments()))
+    expected = {name: then.get(name, defaults[name]) for name in names}
+    given = json.loads(json.dumps({name: now[name] for name in names}))
+    expected = json.loads(json.dumps(expected))
+    if differing := [name for name in names if given[name] != expected[name]]:
+        raise RecordingError(
+            f"the local network of {arguments.name} learned from other data: given {_flags(given, differing)}; "
+            f"expected {_flags(expected, differing)}: {_ANEW}"
+        )
+
+
+def check_same_data(data: RecordedData, local: TrainedLocal) -> None:
+    """Raise ``RecordingError`` where a network learned from another sensor, other side information or other files."""
+    network, description = local
+    config, domain = network.config, data.domain
+    if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
+        raise RecordingError(
+            f"the local network of {domain.name} takes {config.image} and {told_to(config)}; these recordings give "
+            f"{domain.image} and {told_to(domain)}: {_ANEW}"
+        )
+    if description["training"]["arguments"]["data_sha256"] != data.sha256:
+        raise RecordingError(
+            f"the recordings of {domain.name} are not those that its local network learned from: files, their folders "
+            f"or --from-weights have changed: {_ANEW}"
+        )
+
+
+def told_to(network: Domain | LocalPoseConfig) -> str:
+    """The side information that a network takes of each step beside its two frames, in words."""
+    return "actions" if network.actions else "velocities" if network.twist else "images alone"
+
+
+def _flags(values: dict[str, Any], names: Sequence[str]) -> str:
+    def words(value: Any) -> str:
+        if value is None or value == []:
+            return "left out"
+        return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+    return ", ".join(f"--{name.replace('_', '-')} {words(values[name])}" for name in names)
 
 
 @lru_cache(maxsize=2)  # one script after another in one process asks for the same
@@ -241,7 +306,7 @@ def _print(data: RecordedData) -> None:
     made = f", made {image.reduction} times smaller" if image.reduction > 1 else ""
     made += f", {image.field_of_view_deg:g} deg" if image.field_of_view_deg is not None else ""
     print(f"frames: {size}{made}, one each {domain.period_s:.4f} s")
-    told = "actions" if domain.actions else "velocities" if domain.twist else "images alone"
+    told = told_to(domain)
     print(f"each step is estimated from the two frames and: {told}" if told != "images alone" else f"steps from {told}")
     print(f"places: within {domain.place_radius_m:.2f} m and {math.degrees(domain.heading_limit_rad):.0f} deg")
     print(

@@ -1,4 +1,4 @@
-"""Recordings as arrays on disk: every frame as it enters the networks, made once for all scripts of a training."""
+"""Recordings as arrays on disk: every frame as networks take it, made once for all commands of a training."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import config_from_dict
+from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.observations import observation
 from ngo_recordings.errors import RecordingError
@@ -102,7 +102,7 @@ def _identity(
     reduction: int | None,
     scan_yaw_rad: float,
 ) -> Any:
-    """What the content of a store depends on, as JSON gives it back."""
+    """Everything that the content of a store depends on, as JSON gives it back."""
     settings = [dataclasses.asdict(given), image and dataclasses.asdict(image), reduction, scan_yaw_rad]
     found: list[Any] = [_VERSION, *settings]
     for path in files:

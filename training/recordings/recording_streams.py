@@ -1,4 +1,4 @@
-"""Batches from recordings, of the same form as those of `streams` from simulators; an epoch follows from its number."""
+"""Batches from recordings in the form of ``training.data.streams``; an epoch follows from its number."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ngo_recordings.errors import RecordingError
+from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, reversed_in_time
 from training.data.data_source import Domain
-from training.data.streams import ALL, Batch, Share, mirrored, relative_poses, reversed_in_time
 from training.recordings.recording_source import RecordedData
 from training.recordings.recording_tracks import Track
 
@@ -30,7 +30,7 @@ _EACH_RADIUS = 8.0  # frames that count as different ones are a radius divided b
 _EACH_RAD = math.radians(5.0)
 
 
-def told(track: Track, index: np.ndarray | slice) -> Batch:
+def side_information(track: Track, index: np.ndarray | slice) -> Batch:
     """Actions, with those before them, or velocities of some steps."""
     result = {}
     if track.histories is not None:
@@ -40,7 +40,7 @@ def told(track: Track, index: np.ndarray | slice) -> Batch:
     return result
 
 
-def known_to(domain: Domain, batch: Batch) -> Batch:
+def known_side_information(domain: Domain, batch: Batch) -> Batch:
     """A batch without what the domain's networks are not told."""
     unknown = {name for name, used in (("action", domain.actions > 0), ("twist", domain.twist)) if not used}
     return {name: value for name, value in batch.items() if name not in unknown}
@@ -73,7 +73,9 @@ class RecordedPairs(IterableDataset[Batch]):
 
     def _batch(self, index: np.ndarray, count: int) -> Batch:
         parts = [pairs_at(self.tracks[k], np.sort(index[index[:, 0] == k, 1])) for k in np.unique(index[:, 0])]
-        batch = known_to(self.domain, {name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+        batch = known_side_information(
+            self.domain, {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        )
         if self.domain.reverses and count % 8 in (2, 5):
             batch = reversed_in_time(batch)
         return mirrored(batch) if self.domain.mirrors and count % 2 else batch
@@ -86,18 +88,18 @@ def pairs_at(track: Track, steps: np.ndarray) -> Batch:
         "earlier": track.frames(steps),
         "later": track.frames(steps + 1),
         "relative": relative,
-        **told(track, steps),
+        **side_information(track, steps),
     }
 
 
 def track_pairs(domain: Domain, track: Track) -> list[Batch]:
     """All steps of a track in order, in batches."""
     parts = np.array_split(np.arange(len(track) - 1), -(-len(track) // 256))
-    return [known_to(domain, pairs_at(track, steps)) for steps in parts]
+    return [known_side_information(domain, pairs_at(track, steps)) for steps in parts]
 
 
 class RecordedSteps:
-    """What the local pose network learns from."""
+    """The data of the local pose network."""
 
     def __init__(self, data: RecordedData, datapoints: int, batch_size: int) -> None:
         self.data, self.domain, self.datapoints, self.batch_size = data, data.domain, datapoints, batch_size
@@ -218,7 +220,7 @@ def _places(tracks: Sequence[Track], pairs: np.ndarray) -> Batch:
 
 
 class RecordedPlaces:
-    """What the place encoder learns from."""
+    """The data of the place encoder."""
 
     def __init__(self, data: RecordedData, batches: int, batch_size: int, validation_batches: int) -> None:
         self.domain, self.batch_size, self.validation_batches = data.domain, batch_size, validation_batches

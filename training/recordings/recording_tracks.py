@@ -1,4 +1,4 @@
-"""Stretches of recordings that can be learned from, and which of them are for what: parts that never meet."""
+"""Tracks of recordings without gaps, and their split into parts that never meet."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.data.streams import action_histories
+from training.data.batches import action_histories
 from training.recordings.recording_store import StoredRecording
 
 Part = Literal["train", "optimizer", "validation", "test"]

@@ -1,4 +1,4 @@
-"""What an optimizer's attention does: where it looks, and how much of it falls on true revisits."""
+"""The attention of an optimizer: its entropy, and its share on true revisits."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class Attention:
 
     @property
     def relative_entropy(self) -> np.ndarray:
-        """Mean entropy ``(iterations,)`` in units of that of looking everywhere alike (1)."""
+        """Mean entropy ``(iterations,)`` in units of that of a uniform attention."""
         entropy = -(self.weights * np.log(np.maximum(self.weights, 1e-30))).sum(axis=-1)
         return entropy.mean(axis=-1) / np.log(self.weights.shape[-1])
 
@@ -48,7 +48,7 @@ class Attention:
 
     @property
     def uniform_share(self) -> float:
-        """What ``revisit_mass`` would be of an attention that looks everywhere alike."""
+        """The ``revisit_mass`` of a uniform attention."""
         return float(self.revisits.mean(axis=-1)[self._have_any].mean())
 
     @property

@@ -1,4 +1,4 @@
-"""A picture of where the optimizers' attention looks, over the maze and over time, with the loops of the same pose."""
+"""A picture of the attention of one meta-pose, over the maze and over time, with its loops."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from training.baselines.deepvo import DEEPVO
 from training.report import attention_map
 from training.report.maze_views import in_maze, maze_and_start
 from training.report.training_records import learning_curve, run_folder
-from training.scoring.error_cache import Measured
+from training.scoring.error_cache import Evaluation
 from training.scoring.row_estimators import Arrays
 from training.scoring.scores import METRICS, Metric, in_sentence
 from training.scoring.table_rows import ROWS, Sources, rows_of
@@ -62,11 +62,11 @@ MAIN_ROWS = (
 )
 CORRECTED_ROW = "ngo_5"
 
-Tables = dict[str, dict[str, list[Measured]]]
+Tables = dict[str, dict[str, list[Evaluation]]]
 
 
 def draw_all(
-    folder: Path, sources: Sources, split: str, stores: dict[str, Arrays], measured: Tables, result: dict[str, Any]
+    folder: Path, sources: Sources, split: str, stores: dict[str, Arrays], evaluations: Tables, result: dict[str, Any]
 ) -> dict[str, str]:
     """Write every figure into ``folder``; returns the name of each file and what it shows."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ def draw_all(
         "trajectories",
         f"Trajectories with the median and the largest {in_sentence(metric.title)} of `{CORRECTED_ROW}` in each table: "
         "odometry green, corrected orange, truth blue; the first training seed.",
-        trajectories(sources, split, stores, measured),
+        trajectories(sources, split, stores, evaluations),
     )
     save(
         "error_by_frames",
@@ -115,14 +115,14 @@ def draw_all(
     return images
 
 
-def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], measured: Tables) -> Figure:
+def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], evaluations: Tables) -> Figure:
     """For each table the trajectories with the median and the largest error of the corrected row."""
     metric = METRICS[sources.world.name][0]
     figure, panels = plt.subplots(
         len(stores), 2, figsize=(13.0, 6.8 * len(stores)), squeeze=False, layout="constrained"
     )
     for row, (table, arrays) in zip(panels, stores.items(), strict=True):
-        found = measured[table]
+        found = evaluations[table]
         steps = arrays["truth"].shape[1]
         corrected, odometry = (found[name][0].scores[steps][metric.key] for name in (CORRECTED_ROW, "local"))
         order = np.argsort(corrected)

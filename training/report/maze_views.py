@@ -1,18 +1,18 @@
-"""The mazes of a table's trajectories, to draw them."""
+"""The mazes of a table's trajectories, for figures."""
 
 import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
 from ngo_sim.mazes import Maze
-from training import featurise
+from training.data import episodes
 from training.data.worlds import World
 
 
 def maze_and_start(world: World, table: str, split: str, index: int) -> tuple[Maze, np.ndarray]:
     """The maze of a trajectory of a table's feature store, and its first pose ``(3,)`` in the maze."""
     mazes, seeds = world.table_mazes(table, split), world.table_seeds(table, split)
-    first = mazes[index // featurise._GROUP * featurise._GROUP]
+    first = mazes[index // episodes.GROUP * episodes.GROUP]
     env = world.make_random(np.random.default_rng(first), world.tables[table].size)
     options = {} if mazes[index] == seeds[index] else {"maze_seed": mazes[index]}
     try:

@@ -1,4 +1,4 @@
-"""The page of a world's results in Markdown, made whole from the JSON."""
+"""The page of a world's results in Markdown, made from the JSON alone."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
     metrics = METRICS[world.name]
     several = len(result["seeds"]) > 1
     parts = [
-        f"<!-- Made by `{result['command']}`; changes belong into training/results_page.py. -->",
+        f"<!-- Made by `{result['command']}`; changes belong into training/report/results_page.py. -->",
         f"# Results in {world.name}",
         f"`{result['command']}` at revision `{result['revision']}`: {result['trajectories']} trajectories of "
         f"{result['steps']} steps a table, {result['split']} split. In brackets are 95 % bootstrap intervals over "

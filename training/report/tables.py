@@ -1,4 +1,4 @@
-"""The numbers of the results as one JSON object, from what was measured on each trajectory."""
+"""The numbers of the results as one JSON object, from each trajectory's errors."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,12 +8,12 @@ import torch
 
 from ngo_estimator.geometry import se2
 from training.data.worlds import World
-from training.scoring.error_cache import Measured
+from training.scoring.error_cache import Evaluation
 from training.scoring.scores import METRICS
 from training.scoring.statistics import compare, mean_interval
 
-Table = Mapping[str, Sequence[Measured]]
-"""What was measured for each row, one for each training seed."""
+Table = Mapping[str, Sequence[Evaluation]]
+"""The evaluations of each row, one for each training seed."""
 
 PAIRS = (
     ("local", "local_calibrated"),
@@ -41,9 +41,9 @@ PAIRS = (
 """Rows that are compared on the same trajectories."""
 
 
-def stacked(row: Sequence[Measured], steps: int, metric: str) -> np.ndarray:
+def stacked(row: Sequence[Evaluation], steps: int, metric: str) -> np.ndarray:
     """A metric of a row ``(seeds, trajectories)`` after so many steps."""
-    return np.stack([measured.scores[steps][metric] for measured in row])
+    return np.stack([evaluation.scores[steps][metric] for evaluation in row])
 
 
 def table_json(table: Table, prefixes: Sequence[int], steps: int, world: World) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def rows_json(table: Table, steps: int, world: World) -> dict[str, Any]:
     return {row: _metrics(found, steps, world) for row, found in table.items()}
 
 
-def _metrics(row: Sequence[Measured], steps: int, world: World) -> dict[str, Any]:
+def _metrics(row: Sequence[Evaluation], steps: int, world: World) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for metric in METRICS[world.name]:
         values = stacked(row, steps, metric.key)
@@ -96,5 +96,5 @@ def heading_bias_json(relative: np.ndarray, truth: np.ndarray) -> dict[str, Any]
 def path_json(truth: np.ndarray, prefixes: Sequence[int]) -> dict[str, float]:
     """Mean length (m) of the path through true poses ``(trajectories, steps, 3)`` after so many steps."""
     xy = np.concatenate((np.zeros_like(truth[:, :1, :2]), truth[..., :2]), axis=1)
-    driven = np.linalg.norm(np.diff(xy, axis=1), axis=2).cumsum(axis=1).mean(axis=0)
-    return {str(length): float(driven[length - 1]) for length in prefixes}
+    path_m = np.linalg.norm(np.diff(xy, axis=1), axis=2).cumsum(axis=1).mean(axis=0)
+    return {str(length): float(path_m[length - 1]) for length in prefixes}

@@ -1,4 +1,4 @@
-"""What is known of the trainings behind the results: from the JSON beside the weights, and from the learning curves."""
+"""Records and learning curves of the trainings behind the results."""
 
 import csv
 from pathlib import Path

@@ -20,8 +20,8 @@ _MADE_BY = ("baselines", "data", "scoring")
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What one estimator makes of the trajectories of a table.
+class Evaluation:
+    """Poses and scores of one estimator on the trajectories of a table.
 
     ``poses`` ``(trajectories, steps, 3)``, float32, of whole trajectories; ``scores``: for each number of steps the
     metrics ``(trajectories,)`` by their key, the estimator having seen these steps alone, as in use.
@@ -31,9 +31,9 @@ class Measured:
     scores: dict[int, dict[str, np.ndarray]]
 
 
-def measure(
+def evaluate_row(
     estimator: Estimator, arrays: Arrays, data: str, prefixes: Sequence[int], world: World, cache: Path
-) -> Measured:
+) -> Evaluation:
     """Run an estimator over whole trajectories and over prefixes of them, or read what came out last time.
 
     Args:
@@ -46,16 +46,16 @@ def measure(
     if lengths[0] < 1 or lengths[-1] > steps:
         raise ValueError(f"prefixes are {list(prefixes)}; expected 1 to {steps}, the steps of a trajectory")
     identity = json.dumps([estimator.identity, data, trajectories, lengths, _code()])
-    if (known := _read(cache, identity)) is not None:
-        return known
+    if (stored := _read(cache, identity)) is not None:
+        return stored
     found: dict[int, dict[str, np.ndarray]] = {}
     for length in lengths:
         seen = prefix(arrays, length)
         poses = estimator.poses(seen)
         found[length] = scores(poses, np.asarray(seen["truth"], dtype=np.float64), world)
-    measured = Measured(poses.astype(np.float32), found)
-    _write(cache, identity, measured)
-    return measured
+    evaluation = Evaluation(poses.astype(np.float32), found)
+    _write(cache, identity, evaluation)
+    return evaluation
 
 
 def _code() -> str:
@@ -66,26 +66,26 @@ def _code() -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
-def _read(cache: Path, identity: str) -> Measured | None:
+def _read(cache: Path, identity: str) -> Evaluation | None:
     if not cache.exists():
         return None
-    with np.load(cache) as stored:
-        if str(stored["identity"]) != identity:
+    with np.load(cache) as file:
+        if str(file["identity"]) != identity:
             return None
         found: dict[int, dict[str, np.ndarray]] = {}
-        for name in stored.files:
+        for name in file.files:
             length, _, metric = name.partition(":")
             if metric:
-                found.setdefault(int(length), {})[metric] = stored[name]
-        return Measured(stored["poses"], found)
+                found.setdefault(int(length), {})[metric] = file[name]
+        return Evaluation(file["poses"], found)
 
 
-def _write(cache: Path, identity: str, measured: Measured) -> None:
+def _write(cache: Path, identity: str, evaluation: Evaluation) -> None:
     cache.parent.mkdir(parents=True, exist_ok=True)
     partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
-    columns = {f"{length}:{name}": v for length, values in measured.scores.items() for name, v in values.items()}
+    columns = {f"{length}:{name}": v for length, values in evaluation.scores.items() for name, v in values.items()}
     try:
-        np.savez(partial, identity=np.array(identity), poses=measured.poses, **columns)  # type: ignore[arg-type]
+        np.savez(partial, identity=np.array(identity), poses=evaluation.poses, **columns)  # type: ignore[arg-type]
         os.replace(partial, cache)
     finally:
         with contextlib.suppress(FileNotFoundError):

@@ -1,4 +1,4 @@
-"""Compare estimated trajectories with the truth, all of them files in the TUM format."""
+"""The errors of estimated trajectories against the truth, all of them TUM files."""
 
 import json
 from collections.abc import Sequence

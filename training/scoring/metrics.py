@@ -1,11 +1,10 @@
-"""How far an estimated trajectory is from the truth."""
+"""The error of an estimated trajectory against the truth."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from ngo_estimator.geometry import se2
+from training.data.batches import seen_from_first
 
 
 @dataclass(frozen=True)
@@ -24,12 +23,6 @@ class TrajectoryError:
 def path_length_m(poses_xyyaw: np.ndarray) -> float:
     """Length of the path through ``(frames, 3)`` poses."""
     return float(np.linalg.norm(np.diff(poses_xyyaw[:, :2], axis=0), axis=1).sum())
-
-
-def seen_from_first(poses_xyyaw: np.ndarray) -> np.ndarray:
-    """Poses ``(frames, 3)`` in the frame of the first one."""
-    poses = torch.from_numpy(np.asarray(poses_xyyaw, dtype=np.float64))
-    return se2.between(poses[:1], poses).numpy()
 
 
 def trajectory_error(estimate_xyyaw: np.ndarray, truth_xyyaw: np.ndarray) -> TrajectoryError:

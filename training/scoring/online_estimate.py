@@ -1,4 +1,4 @@
-"""What a robot would have known at the time: each pose as the online estimator first gives it."""
+"""The online estimate: each pose as it was when its frame was the newest."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,8 @@ import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory, Trajectory
+from ngo_estimator.online.corrected_trajectory import Trajectory
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 
 
 def run_online(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> Trajectory:

@@ -17,11 +17,11 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from training.baselines.graph_settings import load_settings
 from training.baselines.loop_factors import LoopFactors, smoothed_odometry
 from training.baselines.pose_graph import PoseGraphSettings
 from training.scoring.row_estimators import Arrays, Estimator, estimators, optimized_by, pose_graph
 from training.scoring.table_rows import Sources
-from training.tune_pose_graph import load_settings
 
 LIMITED_WORLDS = ("maze3d",)
 """Worlds whose results say what limits them."""

@@ -1,4 +1,4 @@
-"""What makes trajectories out of features, for every row of the tables of results."""
+"""The estimators of the rows of the tables: from features to trajectories."""
 
 import dataclasses
 import json
@@ -20,11 +20,11 @@ from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines import loop_factors
+from training.baselines.graph_settings import REGISTRATIONS, fit_calibration, load_settings
 from training.baselines.loop_factors import LoopFactors, MoreLoops, Seen
 from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
-from training.featurise import open_store
+from training.data.feature_store import open_store
 from training.scoring.table_rows import ROWS, Sources
-from training.tune_pose_graph import REGISTRATIONS, fit_calibration, load_settings
 
 Arrays = dict[str, np.ndarray]
 """Arrays of a feature store ``(trajectories, steps, ...)``."""
@@ -86,7 +86,7 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
 
 
 def prefix(arrays: dict[str, Array], steps: int) -> dict[str, Array]:
-    """What there was after so many steps; the first frame's place code stays."""
+    """The arrays after this number of steps; the first frame's place code stays."""
     return {name: array[:, :steps] for name, array in arrays.items()}
 
 
@@ -110,7 +110,7 @@ def smoothed(smoother: OdometrySmoother, arrays: Arrays) -> np.ndarray:
 
 
 def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
-    """What loops are found in, with the odometry of the arrays, or another one."""
+    """Inputs of the search for loops, with the odometry of the arrays or another one."""
     steps = arrays["relative"] if relative is None else relative
     return Seen(steps, arrays["log_std"], arrays["codes"], arrays["origin_code"])
 
@@ -151,7 +151,7 @@ def optimized_by(
     prepared: Prepared | None = None,
     informed: Callable[[NeuralGraphOptimizer, Tensor], NeuralGraphOptimizer] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """What ``optimize_offline`` does, for many trajectories at once.
+    """``optimize_offline`` for many trajectories at once.
 
     ``prepared`` is of the same trajectories and the same pair head.
     ``informed`` makes an optimizer that knows the true poses ``(batch, steps, 3)`` of the trajectories it is given.

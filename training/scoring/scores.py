@@ -1,4 +1,4 @@
-"""What the tables of results measure on each trajectory of a world."""
+"""The metrics of the tables of results, for each trajectory of a world."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The rows of the tables of results, and where what they need lies."""
+"""The rows of the tables of results, and the places of their networks, features and settings."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,6 +104,6 @@ class Sources:
         return self.runs / self.world.name / "results" / "throughput.json"
 
     def of_row(self, row: str, seed: int) -> "Sources":
-        """The same for a row that has networks and features of its own."""
+        """The sources of a row with networks and features of its own."""
         folder = self.row_folder(row, seed)
         return replace(self, weights=folder, runs=folder)

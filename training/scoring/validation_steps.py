@@ -1,4 +1,4 @@
-"""Episodes in validation mazes, and what a local network makes of their steps."""
+"""Episodes in validation mazes, and the errors of local networks on their steps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
-from training.data import streams
+from training.data import episodes
+from training.data.batches import action_histories
 from training.data.worlds import VALIDATION_SEEDS, World
 from training.scoring.metrics import TrajectoryError, trajectory_error
 from training.scoring.online_estimate import with_origin
@@ -27,15 +28,15 @@ def validation_episodes(world: World, mazes: int, frames: int) -> Iterator[Episo
     if not 2 <= mazes <= len(VALIDATION_SEEDS):
         raise ValueError(f"mazes is {mazes}; expected 2 to {len(VALIDATION_SEEDS)}")
     seeds = list(VALIDATION_SEEDS[:mazes])
-    for first in range(0, mazes, streams._GROUP):
-        yield from streams.simulate(world, seeds[first : first + streams._GROUP], frames)
+    for first in range(0, mazes, episodes.GROUP):
+        yield from episodes.simulate(world, seeds[first : first + episodes.GROUP], frames)
 
 
 @torch.inference_mode()
 def estimated_steps(network: LocalPoseNetwork, world: World, episode: Episode) -> np.ndarray:
     """Relative poses ``(frames - 1, 3)``, float64, that a network of the world estimates along an episode."""
-    images = streams.images_of(world, episode)
-    actions = streams.action_histories(episode.actions).split(_TOGETHER)
+    images = episodes.images_of(world, episode)
+    actions = action_histories(episode.actions).split(_TOGETHER)
     pairs = zip(images[:-1].split(_TOGETHER), images[1:].split(_TOGETHER), actions, strict=True)
     told = bool(network.config.actions)
     steps = [network(earlier, later, action if told else None)[0] for earlier, later, action in pairs]
@@ -60,7 +61,7 @@ def odometry_error(steps: np.ndarray, true: np.ndarray) -> TrajectoryError:
     return trajectory_error(estimate, truth)
 
 
-def measured(
+def odometry_errors(
     network: LocalPoseNetwork, world: World, mazes: int, frames: int, rpe_steps: int | None = None
 ) -> dict[str, Any]:
     """Errors of a local network's odometry on validation mazes, with intervals over them.

@@ -232,6 +232,17 @@ def test_a_wrong_configuration_is_refused(where: tuple[str, ...], value: object,
     assert_one_line(error.value, f"{LOCAL}.json")
 
 
+def test_a_description_from_before_the_compass_went_loads(weights: Path) -> None:
+    beside = weights / f"{OPTIMIZER}.json"
+    expected = load_optimizer(weights)[0]
+    edit(beside, lambda description: description["config"].update(compass=False))
+    assert load_optimizer(weights)[0].config == expected.config
+    edit(beside, lambda description: description["config"].update(compass=True))
+    with pytest.raises(CheckpointError, match="compass is True, which this version no longer has") as error:
+        load_optimizer(weights)
+    assert_one_line(error.value, beside.name)
+
+
 def test_a_configuration_that_is_missing_is_refused(weights: Path) -> None:
     edit(weights / f"{OPTIMIZER}.json", lambda description: description.pop("config"))
     with pytest.raises(CheckpointError, match="expected an object") as error:

@@ -15,7 +15,7 @@ import torch
 from ngo_estimator.checkpoint import PlaceNetworks, load_local, load_optimizer, load_place, write_untrained
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from training import train_end_to_end, train_local, train_place
-from training.data.streams import Batch, mirrored
+from training.data.batches import Batch, mirrored
 from training.data.worlds import WORLDS
 
 WORLD = WORLDS["maze3d"]  # its pictures are made brighter and darker at random

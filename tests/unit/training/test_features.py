@@ -11,11 +11,14 @@ import torch
 from ngo_estimator.checkpoint import load_local, load_place, write_untrained
 from ngo_estimator.geometry import se2
 from training import featurise
+from training.data import feature_store
 from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE
-from training.data.drive_plan import driven_in_table
-from training.data.streams import simulate
+from training.data.drive_plan import drives_of_table
+from training.data.episodes import simulate
+from training.data.feature_store import check_networks, open_store
+from training.data.features import features_of
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, WORLDS
-from training.featurise import check_networks, driven_in, features_of, open_store
+from training.featurise import planned_drives
 
 from .stores import SHAPES
 
@@ -41,11 +44,11 @@ def test_features_of_other_networks_are_refused(store: Path) -> None:
 
 def test_arrays_are_made_once_and_their_size_is_checked(tmp_path: Path) -> None:
     path = tmp_path / "relative.npy"
-    featurise._array(path, (3, 4), np.dtype(np.float32))[1] = 7.0
-    again = featurise._array(path, (3, 4), np.dtype(np.float32))
+    feature_store.stored_array(path, (3, 4), np.dtype(np.float32))[1] = 7.0
+    again = feature_store.stored_array(path, (3, 4), np.dtype(np.float32))
     assert again[1].tolist() == [7.0] * 4 and not again[0].any()
     with pytest.raises(ValueError, match="expected"):
-        featurise._array(path, (4, 4), np.dtype(np.float32))
+        feature_store.stored_array(path, (4, 4), np.dtype(np.float32))
     assert [entry.name for entry in tmp_path.iterdir()] == ["relative.npy"]
 
 
@@ -62,13 +65,13 @@ def test_a_store_begun_with_another_number_of_trajectories_is_refused_before_any
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
 def test_parts_share_the_groups_without_overlap(parts: int) -> None:
-    groups = [first for part in range(parts) for first in featurise._groups(45, part, parts)]
+    groups = [first for part in range(parts) for first in feature_store.groups_of(45, part, parts)]
     assert sorted(groups) == list(range(0, 45, 8))
 
 
 def test_a_group_of_a_store_is_driven_as_its_seeds_say() -> None:
     world = dataclasses.replace(WORLDS["maze2d"], episode_frames=20)
-    driven = driven_in_table(world, "cycles", "validation", 10)
+    driven = drives_of_table(world, "cycles", "validation", 10)
     assert driven.mazes == driven.seeds == list(world.table_seeds("cycles", "validation")[:10])
     second = list(driven.episodes(world, slice(8, 16)))
     assert len(second) == 2
@@ -80,15 +83,15 @@ def test_a_group_of_a_store_is_driven_as_its_seeds_say() -> None:
 def test_another_driver_drives_a_fifth_as_many_more_mazes_for_the_optimizer_alone() -> None:
     counts = {"validation_trajectories": 0, "test_trajectories": 0}
     world = WORLDS["maze3d"]
-    driven = driven_in(featurise.Arguments("maze3d", trajectories=42, **counts), world)
+    driven = planned_drives(featurise.Arguments("maze3d", trajectories=42, **counts), world)
     ours, others = (driven[name] for name in world.optimizer_stores)
     assert (ours.driver, others.driver) == ("random_goals", "learned")
     assert (len(ours.seeds), len(others.seeds)) == (42, 9) and others.mazes == others.seeds
     assert not {*ours.seeds} & {*others.seeds} and all(seed in OPTIMIZER_TRAIN_SEEDS for seed in others.seeds)
-    assert not driven_in(featurise.Arguments("maze3d", trajectories=0, **counts), world)[OTHER_TRAIN_STORE].seeds
+    assert not planned_drives(featurise.Arguments("maze3d", trajectories=0, **counts), world)[OTHER_TRAIN_STORE].seeds
     world = WORLDS["maze2d"]
     assert world.optimizer_stores == (TRAIN_STORE,)
-    assert OTHER_TRAIN_STORE not in driven_in(featurise.Arguments("maze2d", **counts), world)
+    assert OTHER_TRAIN_STORE not in planned_drives(featurise.Arguments("maze2d", **counts), world)
 
 
 def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> None:

@@ -161,6 +161,23 @@ def test_the_script_prints_a_report_draws_a_picture_and_speaks_json(
     assert numbers["picture"] == str(tmp_path / "b.png") and (tmp_path / "b.png").exists()
 
 
+def test_simulated_time_that_passes_at_a_pace_of_its_own_is_no_fault(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    began_ns = 1_700_000_000 * S
+    # A tenth of the pace of the clock of the day, by which it was logged.
+    entries = [(topic, began_ns + 10 * (time_ns - 10 * S), message) for topic, time_ns, message in drive(square())]
+    path = m.write_mcap(tmp_path / "a.mcap", entries)
+    report = main(Arguments((path,)))
+    assert report.problems == ()
+    assert report.times["/image"].skew_spread_s > 100.0
+    assert capsys.readouterr().out.count("stamps of simulated time") == 3
+    # The same of a driver's clock: it began on the same day.
+    late = [(topic, 20 * S + 10 * time_ns, message) for topic, time_ns, message in drive(square())]
+    report = report_of(m.write_mcap(tmp_path / "b.mcap", late))
+    assert any("stamps of /image drift" in line for line in report.problems)
+
+
 def test_scans_and_recordings_without_truth_are_drawn(tmp_path: Path) -> None:
     entries = [("/scan", k * S // 10, m.scan(k * S // 10 + S, np.full(9, 1.0 + k))) for k in range(5)]
     path = m.write_mcap(tmp_path / "a.mcap", entries)

@@ -3,31 +3,32 @@
 import numpy as np
 import pytest
 
-from training.data.streams import simulate
+from training.data.batches import seen_from_first
+from training.data.episodes import GROUP, simulate
 from training.data.worlds import world_named
-from training.featurise import _GROUP
 from training.report import results_page, tables
 from training.report.maze_views import in_maze, maze_and_start
 from training.report.results_page import number, page
 from training.results import Arguments
-from training.scoring.error_cache import Measured
-from training.scoring.metrics import seen_from_first
+from training.scoring.error_cache import Evaluation
 from training.scoring.scores import METRICS
 
 WORLD = world_named("maze2d")
 KEYS = [metric.key for metric in METRICS["maze2d"]]
 
 
-def measured(errors: list[float]) -> Measured:
+def evaluation(errors: list[float]) -> Evaluation:
     values = {key: np.array(errors) for key in KEYS}
-    return Measured(np.zeros((len(errors), 8, 3), np.float32), {4: {k: 0.5 * v for k, v in values.items()}, 8: values})
+    return Evaluation(
+        np.zeros((len(errors), 8, 3), np.float32), {4: {k: 0.5 * v for k, v in values.items()}, 8: values}
+    )
 
 
 TABLE = {
-    "local": [measured([1.0, 2.0, 3.0, 4.0])],
-    "ngo_1": [measured([0.5, 1.0, 1.5, 2.0])] * 2,
-    "ngo_5": [measured([0.1, 0.2, 0.3, 0.4]), measured([0.3, 0.4, 0.5, 0.6])],
-    "gtsam": [measured([0.4, 0.6, 0.8, 1.0])],
+    "local": [evaluation([1.0, 2.0, 3.0, 4.0])],
+    "ngo_1": [evaluation([0.5, 1.0, 1.5, 2.0])] * 2,
+    "ngo_5": [evaluation([0.1, 0.2, 0.3, 0.4]), evaluation([0.3, 0.4, 0.5, 0.6])],
+    "gtsam": [evaluation([0.4, 0.6, 0.8, 1.0])],
 }
 
 
@@ -132,10 +133,10 @@ def test_joined_words() -> None:
     assert results_page._joined([0, 1, 2]) == "0, 1 and 2"
 
 
-@pytest.mark.parametrize("index", [1, _GROUP + 1])
+@pytest.mark.parametrize("index", [1, GROUP + 1])
 def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
     seeds = WORLD.table_seeds("cycles", "validation")
-    first = index // _GROUP * _GROUP
+    first = index // GROUP * GROUP
     episodes = list(simulate(WORLD, list(seeds[first : index + 1]), 60, WORLD.tables["cycles"].size))
     episode = episodes[index - first]
     maze, start = maze_and_start(WORLD, "cycles", "validation", index)

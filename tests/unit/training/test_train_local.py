@@ -12,20 +12,17 @@ from torch import Tensor
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
-from training.data.streams import Batch
+from training.common.step_losses import HEADING_WEIGHT, step_losses, step_metrics, windows_within
+from training.data.batches import Batch
 from training.data.worlds import WORLDS
 from training.recordings.recording_source import RecordedArguments
 from training.train_local import (
-    HEADING_WEIGHT,
     Arguments,
     SimulatedSteps,
     calibrated,
     initial_network,
     measure,
-    step_losses,
-    step_metrics,
     stretch_losses,
-    windows_within,
 )
 
 

@@ -16,20 +16,13 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.samples import small_pair_head
+from training.baselines.graph_settings import fit_calibration, load_settings
 from training.baselines.pose_graph import PoseGraphSettings
 from training.common.runs import WEIGHTS
 from training.data.worlds import world_named
-from training.report.prerequisites import is_tuned
+from training.prerequisites import is_tuned
 from training.scoring.table_rows import Sources
-from training.tune_pose_graph import (
-    GRID,
-    Arguments,
-    Objective,
-    fit_calibration,
-    load_settings,
-    main,
-    tune,
-)
+from training.tune_pose_graph import GRID, Arguments, Objective, main, tune
 
 START = PoseGraphSettings(odometry_position_scale=1.0, loop_position_scale=1.0, kernel="dcs")
 

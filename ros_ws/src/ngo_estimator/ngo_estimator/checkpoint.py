@@ -18,6 +18,7 @@ from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPose
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.networks.step_deviation import StepDeviation, StepDeviationConfig
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 
 FORMAT = 1
@@ -27,6 +28,7 @@ LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "odometry_smoother",
     "neural_graph_optimizer",
 )
+STEP_DEVIATION = "step_deviation"
 RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
 """Settings of earlier versions, by the kind of network, with the only value that still means the same."""
 WORLD_IMAGES = {
@@ -190,6 +192,12 @@ def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraph
     """The Neural Graph Optimizer in the folder ``weights``."""
     path = weights / f"{OPTIMIZER}.safetensors"
     return load_network(path, OPTIMIZER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig, world)
+
+
+def load_step_deviation(weights: Path, world: str | None = None) -> StepDeviation:
+    """The network in the folder ``weights`` that scales deviations of a lidar's steps."""
+    path = weights / f"{STEP_DEVIATION}.safetensors"
+    return load_network(path, STEP_DEVIATION, StepDeviation, StepDeviationConfig, world)[0]
 
 
 def write_untrained(weights: Path, world: str, image: ImageFormat | None = None) -> None:

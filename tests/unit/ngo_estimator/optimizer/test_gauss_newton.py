@@ -1,5 +1,8 @@
 """Gauss-Newton steps against automatic derivatives, dense least squares, inverses and graphs solved by hand."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -167,3 +170,96 @@ def test_a_nodes_covariance_is_its_block_of_the_inverse_of_the_information_matri
     # Less is known without the loops.
     alone = node_covariance(factors[:1], BLOCKS + 1, BLOCKS)[0]
     assert torch.linalg.eigvalsh(alone - node_covariance(factors, BLOCKS + 1, BLOCKS)[0]).min() > 0.0
+
+
+# ---- whole information matrices
+
+
+def whole_information(count: int, seed: int = 5) -> Tensor:
+    """Random positive definite matrices ``(1, count, 3, 3)``, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(1, count, 3, 3, generator=generator, dtype=DOUBLE)
+    return 20.0 * root @ root.mT + torch.eye(3, dtype=DOUBLE)
+
+
+def with_whole_information(factors: list[Factors]) -> list[Factors]:
+    return [replace(f, information=whole_information(f.nodes.shape[1], k)) for k, f in enumerate(factors)]
+
+
+def test_diagonal_matrices_are_their_diagonals() -> None:
+    _, factors = random_graph()
+    whole = [replace(f, information=torch.diag_embed(f.information)) for f in factors]
+    expected = gauss_newton_step(factors, BLOCKS + 1)
+    torch.testing.assert_close(gauss_newton_step(whole, BLOCKS + 1), expected, rtol=1e-10, atol=1e-12)
+    # One kind of factors may have matrices while the other has diagonals.
+    torch.testing.assert_close(gauss_newton_step([whole[0], factors[1]], BLOCKS + 1), expected, rtol=1e-10, atol=1e-12)
+
+
+def test_a_step_with_whole_information_is_the_solution_of_dense_least_squares() -> None:
+    _, factors = random_graph()
+    factors = with_whole_information(factors)
+    rows, right = [], []
+    for f in factors:
+        for k in range(f.nodes.shape[1]):
+            row = torch.zeros(3, 3 * (BLOCKS + 1), dtype=DOUBLE)
+            for which in (0, 1):
+                first = 3 * int(f.nodes[0, k, which])
+                row[:, first : first + 3] = f.jacobian[0, k, :, 3 * which : 3 * which + 3]
+            root = torch.linalg.cholesky(f.information[0, k]).mT
+            rows.append(root @ row[:, 3:])
+            right.append(root @ f.residual[0, k])
+    matrix = torch.cat(rows)
+    expected = torch.linalg.lstsq(matrix, torch.cat(right)[:, None]).solution.unflatten(0, (-1, 3))[..., 0]
+    torch.testing.assert_close(gauss_newton_step(factors, BLOCKS + 1)[0, 1:], expected, rtol=1e-6, atol=1e-9)
+    covariance = torch.linalg.inv(matrix.mT @ matrix)[-3:, -3:]
+    torch.testing.assert_close(node_covariance(factors, BLOCKS + 1, BLOCKS)[0], covariance, rtol=1e-6, atol=0.0)
+
+
+def test_a_loop_that_knows_nothing_along_a_corridor_moves_nothing_along_it() -> None:
+    # One step of 1 m; the loop tells where its end lies across a corridor of 45 degrees, and no more.
+    poses = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]], dtype=DOUBLE)
+    across = torch.tensor([-math.sqrt(0.5), math.sqrt(0.5), 0.0], dtype=DOUBLE)
+    residual = torch.tensor([[[0.3, 0.7, 0.0]]], dtype=DOUBLE)
+    nodes = torch.tensor([[[0, 1]]])
+    factors = [
+        chain_factors(poses, torch.zeros_like(poses[:, 1:]), torch.ones(1, 1, 3, dtype=DOUBLE)),
+        pair_factors(nodes, poses, residual, 1e9 * torch.outer(across, across)[None, None]),
+    ]
+    step = gauss_newton_step(factors, 2)[0, 1]
+    torch.testing.assert_close(step @ across, residual[0, 0] @ across, rtol=1e-6, atol=1e-6)
+    along = torch.tensor([math.sqrt(0.5), math.sqrt(0.5), 0.0], dtype=DOUBLE)
+    assert abs((step @ along).item()) < 1e-6
+
+
+def test_gradients_of_whole_information_are_those_of_finite_differences() -> None:
+    poses, factors = random_graph()
+    roots = [torch.linalg.cholesky(whole_information(f.nodes.shape[1], k)) for k, f in enumerate(factors)]
+    residuals = [f.residual.clone() for f in factors]
+    loops = factors[1].nodes
+
+    def step(poses: Tensor, deviation: Tensor, residual: Tensor, chain_root: Tensor, loop_root: Tensor) -> Tensor:
+        parts = [
+            chain_factors(poses, deviation, chain_root @ chain_root.mT),
+            pair_factors(loops, poses, residual, loop_root @ loop_root.mT),
+        ]
+        return gauss_newton_step(parts, BLOCKS + 1)
+
+    inputs = tuple(value.requires_grad_() for value in (poses, -residuals[0], residuals[1], *roots))
+    assert torch.autograd.gradcheck(step, inputs)
+
+
+def test_correlated_steps_have_the_inverse_of_their_covariance_as_information() -> None:
+    covariance = torch.linalg.inv(whole_information(4))
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    correlation = covariance / (std.unsqueeze(-1) * std.unsqueeze(-2))
+    expected = torch.linalg.inv(covariance)
+    torch.testing.assert_close(step_information(std, correlation), expected, rtol=1e-9, atol=1e-9)
+    identity = torch.eye(3, dtype=DOUBLE).expand(1, 4, 3, 3)
+    torch.testing.assert_close(step_information(std, identity), torch.diag_embed(step_information(std)))
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 1), (1, 4, 3, 1), (1, 3, 3), (1, 3, 3, 3)])
+def test_information_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    _, (_, pairs) = random_graph()
+    with pytest.raises(ValueError, match=r"information is of shape .*; expected \(1, 4, 3\) or \(1, 4, 3, 3\)"):
+        replace(pairs, information=torch.zeros(shape))

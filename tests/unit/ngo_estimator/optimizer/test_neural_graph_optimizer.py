@@ -1,12 +1,14 @@
 """The Neural Graph Optimizer: fresh it is the identity, the paper's form is the paper's, gradients reach everything."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizerConfig
 from tests.unit.ngo_estimator.samples import optimized, small_optimizer, small_pair_head, trajectory_inputs
 
@@ -128,6 +130,57 @@ def test_gradients_are_finite_and_reach_every_parameter(form: str, steps: int) -
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.any(), name
+
+
+def in_double(loops: Loops | None) -> Loops | None:
+    if loops is None:
+        return None
+    values = {name: value for name, value in vars(loops).items() if name in Loops.__dataclass_fields__}
+    floating = {n: v.double() for n, v in values.items() if isinstance(v, torch.Tensor) and v.is_floating_point()}
+    return replace(loops, **floating)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+@pytest.mark.parametrize("form", ["loops", "gauss_newton", "paper"])
+def test_gradients_through_one_iteration_are_those_of_finite_differences(form: str, correlated: bool) -> None:
+    relative, log_std, motion, codes = trajectory_inputs(1, 48)
+    optimizer = small_optimizer(form, trained=True, iterations=1)
+    loops = in_double(optimizer.find_loops(relative, codes, small_pair_head()) if optimizer.config.loops else None)
+    optimizer = optimizer.double().requires_grad_(True)
+    made = optimizer.aggregate(relative.double(), log_std.double(), motion.double())
+    # An error along x that is not independent of the others.
+    correlation = torch.eye(3, dtype=torch.float64) + 0.5 * torch.tensor([[0.0, 1, 0], [1, 0, 1], [0, 1, 0]])
+    steps = replace(made, correlation=correlation.expand(1, made.blocks, 3, 3) if correlated else None)
+    names = ["relative", "std", *(["features"] if steps.features is not None else [])]
+    measured = [] if loops is None else [loops.measured, loops.log_scale]
+    inputs = [getattr(steps, name).detach().requires_grad_() for name in names]
+    inputs += [value.detach().requires_grad_() for value in measured]
+
+    def corrected(*values: torch.Tensor) -> torch.Tensor:
+        changed = replace(steps, **dict(zip(names, values, strict=False)))  # type: ignore[arg-type]
+        *_, a, b = (*values, *values)
+        seen = None if loops is None else replace(loops, measured=a, log_scale=b)
+        return optimizer.optimize(changed, seen).meta_relative[-1]
+
+    assert torch.autograd.gradcheck(corrected, tuple(inputs), rtol=1e-3, atol=1e-6)
+
+    # Of all parameters, the derivative along a random direction.
+    parameters = [p for name, p in optimizer.named_parameters() if not name.startswith("aggregation.")]
+    generator = torch.Generator().manual_seed(1)
+    direction = [torch.randn(p.shape, generator=generator, dtype=torch.float64) for p in parameters]
+    weights = torch.randn(inputs[0].shape, generator=generator, dtype=torch.float64)
+
+    def loss(length: float) -> torch.Tensor:
+        with torch.no_grad():
+            for parameter, along in zip(parameters, direction, strict=True):
+                parameter.add_(along, alpha=length)
+        return (weights * corrected(*(value.detach() for value in inputs))).sum()
+
+    gradients = torch.autograd.grad(loss(0.0), parameters, allow_unused=True)
+    exact = sum(float((g * d).sum()) for g, d in zip(gradients, direction, strict=True) if g is not None)
+    ahead, behind = loss(1e-6).item(), loss(-2e-6).item()
+    assert abs(exact) > 1e-6
+    assert exact == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
 
 
 def test_even_a_fresh_optimizer_has_gradients_to_start_from() -> None:

@@ -6,7 +6,7 @@ import torch
 
 from ngo_estimator.optimizer.gauss_newton import Factors, gauss_newton_step, node_covariance
 from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
-from tests.unit.ngo_estimator.optimizer.test_gauss_newton import BLOCKS, random_graph
+from tests.unit.ngo_estimator.optimizer.test_gauss_newton import BLOCKS, random_graph, with_whole_information
 from tests.unit.ngo_estimator.samples import optimized, small_optimizer, trajectory_inputs
 
 
@@ -23,6 +23,16 @@ def test_steps_and_covariances_are_the_dense_ones(seed: int) -> None:
     for node in (1, 5, BLOCKS):
         expected = node_covariance(factors, BLOCKS + 1, node)[0].numpy()
         np.testing.assert_allclose(sparse.covariance([node]), expected, rtol=1e-8, atol=1e-14)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_whole_information_is_solved_as_by_the_dense_solver(seed: int) -> None:
+    _, factors = random_graph(seed)
+    factors = with_whole_information(factors)
+    sparse = equations(factors)
+    assert torch.allclose(sparse.step(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
+    expected = node_covariance(factors, BLOCKS + 1, BLOCKS)[0].numpy()
+    np.testing.assert_allclose(sparse.covariance([BLOCKS]), expected, rtol=1e-8, atol=1e-14)
 
 
 def test_the_joint_covariance_holds_those_of_single_poses_in_the_order_asked_for() -> None:

@@ -14,7 +14,8 @@ from ngo_estimator.geometry.scan_registration import Scans
 from ngo_estimator.networks.pose_aggregation import poses_in_blocks
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer.loop_closure import LoopSearch
-from ngo_estimator.optimizer.overlaps import OVERLAP_LOGIT, find_overlaps, measure_overlaps, shared_views
+from ngo_estimator.optimizer.overlaps import OVERLAP_LOGIT, find_overlaps, shared_views
+from ngo_estimator.optimizer.pair_measurement import PairViews, measure_overlaps
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera, seen_by_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, with_origin
 
@@ -62,7 +63,7 @@ def test_frames_that_face_each_other_are_measured_by_the_walls_between_them() ->
     ranges = [torch.stack([seen_by_camera(x), seen_by_camera(y)]) for x, y in ((a, near_a), (b, near_b))]
     from_a = torch.stack([se2.between(a, x) for x in (a, near_a)]).float()
     to_b = torch.stack([se2.between(x, b) for x in (b, near_b)]).float()
-    measured, log_scale, spread, found = measure_overlaps(CAMERA, *ranges, from_a, to_b, start, 6)
+    (measured, log_scale, spread), found = measure_overlaps(CAMERA, PairViews(*ranges, from_a, to_b), start, 6)
     assert found.all()
     # Where along the corridor they are, its walls do not say.
     along, across, turned = (measured - truth)[0].abs().tolist()
@@ -70,7 +71,7 @@ def test_frames_that_face_each_other_are_measured_by_the_walls_between_them() ->
     assert log_scale[0, 0].exp() > 0.2 and log_scale[0, 1].exp() < math.radians(1.0) and (spread.exp() < 0.05).all()
     # Of frames that cannot be registered nothing is found.
     nothing = [torch.zeros_like(x) for x in ranges]
-    *_, found = measure_overlaps(CAMERA, *nothing, from_a, to_b, start, 6)
+    _, found = measure_overlaps(CAMERA, PairViews(*nothing, from_a, to_b), start, 6)
     assert not found.any()
 
 

@@ -9,7 +9,9 @@ import torch
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from training import train_deepvo
 from training.baselines.deepvo import DeepVO, DeepVOConfig, trajectory_steps
-from training.data.streams import PairStream, images_of, mirrored, relative_poses, simulate
+from training.data.batches import mirrored, relative_poses
+from training.data.episodes import images_of, simulate
+from training.data.streams import PairStream
 from training.data.worlds import TRAIN_SEEDS, world_named
 from training.train_deepvo import StretchStream
 

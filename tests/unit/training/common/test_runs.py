@@ -19,7 +19,7 @@ class Arguments(runs.TrainerArguments):
 
 
 def begin(folder: Path, **changes: object) -> runs.Run:
-    arguments = Arguments("maze2d", accelerator="cpu", **changes)  # type: ignore[arg-type]
+    arguments = Arguments("maze2d", accelerator="cpu", precision="32-true", **changes)  # type: ignore[arg-type]
     return runs.Run(folder, "train_local", arguments, epochs=2, seed=0)
 
 
@@ -27,7 +27,7 @@ def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
     record = runs.record("train_local", Arguments("maze2d", batch_size=4, out=Path("/elsewhere"), devices="2"))
     assert record["command"] == "python -m training.train_local --devices 2 --world maze2d --batch-size 4"
     expected = {"world": "maze2d", "learning_rate": 1e-3, "batch_size": 4}
-    trainer = {"accelerator": "auto", "devices": "2", "strategy": "auto", "precision": "bf16-mixed"}
+    trainer = {"accelerator": "auto", "devices": "2", "strategy": "auto", "precision": "auto"}
     assert record["arguments"] == {**trainer, **expected}
     assert record["revision"]
 
@@ -85,7 +85,14 @@ def test_a_run_does_not_go_on_with_other_arguments(tmp_path: Path) -> None:
 
 def test_a_run_does_not_go_on_with_other_settings_of_its_world(tmp_path: Path) -> None:
     def begin(**settings: object) -> runs.Run:
-        return runs.Run(tmp_path, "train_local", Arguments("maze2d", accelerator="cpu"), 2, 0, settings=settings)
+        return runs.Run(
+            tmp_path,
+            "train_local",
+            Arguments("maze2d", accelerator="cpu", precision="32-true"),
+            2,
+            0,
+            settings=settings,
+        )
 
     begin(drivers=["corners"], loss_scale=0.1).finish({})
     (tmp_path / "last.ckpt").touch()

@@ -5,8 +5,9 @@ import pytest
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_sim.episodes import Episode, record_episode
+from training.data.batches import relative_poses, reversed_in_time
 from training.data.scans import ScannedMaze, Scanner
-from training.data.streams import PairStream, relative_poses, reversed_in_time
+from training.data.streams import PairStream
 from training.data.worlds import TRAIN_SEEDS, WORLDS
 
 IMAGE, SIZE = WORLD_IMAGES["scan"], {"rows": 3, "cols": 3}

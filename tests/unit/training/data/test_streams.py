@@ -12,25 +12,9 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION
 from ngo_sim.drivers import Action
 from ngo_sim.episodes import Episode
-from training.data import streams
-from training.data.streams import (
-    ACTION_HISTORY,
-    Batch,
-    PairStream,
-    PlaceStream,
-    Share,
-    TrajectoryStream,
-    action_histories,
-    episodes_in,
-    images_of,
-    loader,
-    mirrored,
-    partly_forgotten,
-    relative_poses,
-    revisits,
-    simulate,
-    wall_ranges,
-)
+from training.data.batches import ACTION_HISTORY, Batch, Share, action_histories, mirrored, relative_poses
+from training.data.episodes import episodes_in, images_of, simulate, wall_ranges
+from training.data.streams import PairStream, PlaceStream, TrajectoryStream, loader, partly_forgotten, revisits
 from training.data.worlds import DRAWN, TRAIN_SEEDS, WORLDS, World
 
 WORLD = WORLDS["maze2d"]
@@ -38,7 +22,7 @@ WORLD = WORLDS["maze2d"]
 
 @pytest.fixture(autouse=True)
 def short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "_GROUP", 2)
+    monkeypatch.setattr("training.data.episodes.GROUP", 2)
     monkeypatch.setattr(PairStream, "FRAMES", 41)
     monkeypatch.setattr(PlaceStream, "FRAMES", 400)
 
@@ -256,7 +240,7 @@ def test_place_pairs_come_in_either_order() -> None:
 
 
 def test_each_trajectory_is_met_once_whole_and_every_second_batch_in_a_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "_GROUP", 4)
+    monkeypatch.setattr("training.data.episodes.GROUP", 4)
     stream = TrajectoryStream(WORLD, TRAIN_SEEDS, 0, 4, 2, 60)
     batches = list(stream)
     assert len(batches) == len(stream) == 4
@@ -303,13 +287,13 @@ def test_of_a_tenth_of_the_histories_the_earlier_part_is_forgotten() -> None:
 
 def test_the_training_drivers_take_turns_group_by_group(monkeypatch: pytest.MonkeyPatch) -> None:
     drove: list[tuple[int, str]] = []
-    real = streams.episodes_in
+    real = episodes_in
 
     def noted(world: World, mazes: list[int], *rest: Any) -> Iterator[Episode]:
         drove.append((mazes[0], rest[-1]))
         return real(world, mazes, *rest)
 
-    monkeypatch.setattr(streams, "episodes_in", noted)
+    monkeypatch.setattr("training.data.streams.episodes_in", noted)
     world = dataclasses.replace(WORLD, training_drivers=("corners", "random", "random_goals"))
     for rank in range(2):  # which process simulates a group does not matter
         list(PairStream(world, TRAIN_SEEDS, 1, 6 * 2 * 40, 16, Share(rank, 2)))

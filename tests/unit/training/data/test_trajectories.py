@@ -11,7 +11,7 @@ from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
 from tests.unit.training.stores import SHAPES
-from training.data.streams import Share
+from training.data.batches import Share
 from training.data.trajectories import RandomStretches, StoredTrajectories, correction_scale, loops_of
 
 SEARCH = LoopSearch(per_pose=2, most=10, min_separation=1, min_apart=0)

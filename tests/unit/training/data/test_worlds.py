@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from training.data.drive_plan import driven_in_table
-from training.data.streams import PairStream, PlaceStream, simulate
+from training.data.drive_plan import drives_of_table
+from training.data.episodes import GROUP, simulate
+from training.data.streams import PairStream, PlaceStream
 from training.data.worlds import (
     DEMO_SEEDS,
     OPTIMIZER_TRAIN_SEEDS,
@@ -21,7 +22,6 @@ from training.data.worlds import (
     World,
     world_named,
 )
-from training.featurise import _GROUP
 from training.train_local import Arguments
 
 
@@ -103,14 +103,14 @@ def test_seen_mazes_are_those_of_the_local_network_and_unseen_ones_of_no_trainin
     seen, unseen = world.table_mazes("seen", split), world.table_mazes("unseen", split)
     assert set(seen) <= in_training
     # Groups of mazes are of one size, which the first of them decides: here as there.
-    assert list(seen[:_GROUP]) in trained.groups
+    assert list(seen[:GROUP]) in trained.groups
     assert not set(unseen) & {*TRAIN_SEEDS[:100_000]} and max(unseen) < TRAIN_SEEDS[0]
     assert not set(world.table_seeds("seen", split)) & set(world.table_seeds("unseen", split))
 
 
 def test_an_episode_in_a_seen_maze_has_the_walls_of_training_and_another_start_and_drive() -> None:
     world = WORLDS["maze3d"]
-    driven = driven_in_table(world, "seen", "validation", 2)
+    driven = drives_of_table(world, "seen", "validation", 2)
     seen = list(driven.episodes(dataclasses.replace(world, episode_frames=30), slice(0, 2)))
     trained = list(simulate(world, driven.mazes, 31))
     for now, then in zip(seen, trained, strict=True):
@@ -124,7 +124,7 @@ def test_a_table_of_another_driver_has_the_same_mazes_and_starts() -> None:
     world = dataclasses.replace(WORLDS["maze2d"], tables=tables, episode_frames=30)
     assert world.unseen_tables == ("unseen",) and world.validation_stores == ("validation_unseen",)
     ours, by_chance = (
-        next(driven_in_table(world, table, "validation", 1).episodes(world, slice(0, 1))) for table in tables
+        next(drives_of_table(world, table, "validation", 1).episodes(world, slice(0, 1))) for table in tables
     )
     np.testing.assert_array_equal(ours.maze.walls, by_chance.maze.walls)
     np.testing.assert_array_equal(ours.poses_xyyaw[0], by_chance.poses_xyyaw[0])

@@ -1,22 +1,28 @@
 """Recordings as training data: what is read, what is for what, and what is said of those that cannot be used."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
+from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint, write_untrained
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.observations import observation
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.frames import Frame
 from ngo_recordings.images import ScanGeometry
 from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_recordings import messages as m
 from tests.unit.training import drives
-from training.common.runs import RunError
+from training import evaluate, featurise, train_local, train_optimizer, train_place, train_smoother
+from training.common import runs
 from training.recordings import recording_source
-from training.recordings.recording_source import RecordedArguments, open_recorded, run_script
+from training.recordings.recording_source import RecordedArguments, TrainedLocal, open_recorded, trained_local
 from training.recordings.recording_store import MOST_RAYS, format_of, make_store
 from training.recordings.recording_tracks import PARTS
 
@@ -170,10 +176,98 @@ def test_actions_that_no_network_knows_are_refused(tmp_path: Path) -> None:
         open_recorded(RecordedArguments(data=(path,)), tmp_path)
 
 
-def test_a_run_that_does_not_fit_ends_a_script_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def main(_: object) -> None:
-        raise RunError("the folder holds another run")
+def local_of(given: RecordedArguments, folder: Path, **changes: Any) -> TrainedLocal:
+    """A local network as ``train_local`` leaves it after learning from recordings."""
+    data = open_recorded(given, folder / "runs")
+    domain = data.domain
+    config = LocalPoseConfig(
+        **{
+            "image": domain.image,
+            "width": 0.03,
+            "actions": domain.actions,
+            "period_s": domain.period_s,
+            "mirrored_actions": domain.mirrored_actions,
+            **changes,
+        }
+    )
+    training = runs.record("train_local", train_local.Arguments(recordings=given))
+    training["arguments"]["data_sha256"] = data.sha256
+    path = folder / "weights" / given.name / f"{LOCAL}.safetensors"
+    save_checkpoint(path, LocalPoseNetwork(config), LOCAL, given.name, {"training": training})
+    return load_local(path.parent)
 
-    monkeypatch.setattr("sys.argv", ["train_local"])
-    with pytest.raises(SystemExit, match=r"^unusable: the folder holds another run$"):
-        run_script(main, RecordedArguments, None)
+
+def test_the_data_of_the_local_network_are_taken_and_no_others(files: list[Path], tmp_path: Path) -> None:
+    given = RecordedArguments(data=tuple(files[:2]), scan_yaw_deg=3.0, topics=TopicArguments(image="/image"))
+    assert trained_local(tmp_path / "weights", given.name) is None
+    local = local_of(given, tmp_path)
+    assert open_recorded(given, tmp_path / "runs", local).sha256
+    read = (tmp_path / "runs" / given.name / "data" / "store.json").read_bytes()
+    for changed, message in (
+        (
+            replace(given, topics=TopicArguments()),
+            r"given --image left out; expected --image /image: give",
+        ),
+        (replace(given, topics=TopicArguments(image="/scan")), r"given --image /scan; expected --image /image"),
+        (replace(given, scan_yaw_deg=0.0), r"given --scan-yaw-deg 0\.0; expected --scan-yaw-deg 3\.0"),
+        (replace(given, data=(files[0],)), r"given --data drive_0\.mcap; expected --data drive_0\.mcap drive_1\.mcap"),
+        (replace(given, holdout=(files[0],)), r"given --holdout drive_0\.mcap; expected --holdout left out"),
+    ):
+        with pytest.raises(RecordingError, match=message) as raised:
+            open_recorded(changed, tmp_path / "runs", local)
+        assert "\n" not in str(raised.value)
+    # Nothing was read for it.
+    assert (tmp_path / "runs" / given.name / "data" / "store.json").read_bytes() == read
+    # What does not concern the local network may differ.
+    open_recorded(replace(given, place_radius_m=0.7), tmp_path / "runs", local)
+
+
+def test_a_local_network_that_takes_other_frames_or_is_told_other_things_is_refused(
+    files: list[Path], tmp_path: Path
+) -> None:
+    given = RecordedArguments(data=tuple(files[:2]))
+    other = local_of(given, tmp_path, image=ImageFormat(12, 16, 1, "uint8"))
+    with pytest.raises(RecordingError, match=r"takes ImageFormat.*channels=1.*these recordings give .*channels=3"):
+        open_recorded(given, tmp_path / "runs", other)
+    told = local_of(given, tmp_path, actions=3, mirrored_actions=(0, 2, 1))
+    with pytest.raises(RecordingError, match=r"and actions; these recordings give .* and images alone"):
+        open_recorded(given, tmp_path / "runs", told)
+
+
+def test_recordings_that_changed_since_are_refused(files: list[Path], tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    path.write_bytes(files[0].read_bytes())
+    given = RecordedArguments(data=(path,))
+    local = local_of(given, tmp_path)
+    recording_source._opened.cache_clear()
+    drives.write(path, FRAMES, seed=1)
+    with pytest.raises(RecordingError, match="are not those that its local network learned from"):
+        open_recorded(given, tmp_path / "runs", local)
+    untrained = (local[0], {"world": given.name})
+    with pytest.raises(RecordingError, match="was not trained on recordings"):
+        open_recorded(given, tmp_path / "runs", untrained)
+
+
+SCRIPTS: list[tuple[ModuleType, dict[str, str]]] = [
+    (train_place, {"out": "weights", "runs": "runs"}),
+    (featurise, {"weights": "weights", "out": "runs"}),
+    (train_smoother, {"weights": "weights", "out": "weights", "runs": "runs"}),
+    (train_optimizer, {"weights": "weights", "out": "weights", "runs": "runs"}),
+    (evaluate, {"weights": "weights", "runs": "runs"}),
+]
+
+
+@pytest.mark.parametrize(("script", "folders"), SCRIPTS, ids=lambda value: getattr(value, "__name__", ""))
+def test_every_script_of_a_training_compares(
+    script: Any, folders: dict[str, str], files: list[Path], tmp_path: Path
+) -> None:
+    given = RecordedArguments(data=tuple(files[:2]), topics=TopicArguments(image="/image"))
+    local_of(given, tmp_path)
+    if script is featurise:
+        write_untrained(tmp_path / "place", given.name, ImageFormat(*drives.SHAPE, "uint8"))
+        for path in (tmp_path / "place").glob("place_encoder.*"):
+            path.rename(tmp_path / "weights" / given.name / path.name)
+    places = {name: tmp_path / folder for name, folder in folders.items()}
+    forgotten = script.Arguments(recordings=replace(given, topics=TopicArguments()), **places)
+    with pytest.raises(RecordingError, match="given --image left out; expected --image /image"):
+        script.main(forgotten)

@@ -9,10 +9,17 @@ import torch
 from ngo_estimator.geometry import se2
 from ngo_recordings.errors import RecordingError
 from tests.unit.training import drives
+from training.data.batches import Share, mirrored
 from training.data.data_source import Domain
-from training.data.streams import Share, mirrored
 from training.recordings.recording_source import RecordedArguments, RecordedData, open_recorded
-from training.recordings.recording_streams import RecordedPairs, RecordedPlaces, known_to, pairs_at, revisited, windows
+from training.recordings.recording_streams import (
+    RecordedPairs,
+    RecordedPlaces,
+    known_side_information,
+    pairs_at,
+    revisited,
+    windows,
+)
 
 FRAMES = 700
 
@@ -91,6 +98,6 @@ def test_networks_are_told_only_what_their_domain_has(data: RecordedData) -> Non
         data.tracks("train")[0], twists=np.ones((len(data.tracks("train")[0]) - 1, 3), np.float32)
     )
     batch = pairs_at(track, np.arange(3))
-    assert "twist" in batch and "twist" not in known_to(data.domain, batch)
+    assert "twist" in batch and "twist" not in known_side_information(data.domain, batch)
     told: Domain = dataclasses.replace(data.domain, twist=True)
-    np.testing.assert_array_equal(mirrored(known_to(told, batch))["twist"], [[1.0, -1.0, -1.0]] * 3)
+    np.testing.assert_array_equal(mirrored(known_side_information(told, batch))["twist"], [[1.0, -1.0, -1.0]] * 3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from training.data.worlds import world_named
-from training.scoring.error_cache import measure
+from training.scoring.error_cache import evaluate_row
 from training.scoring.row_estimators import Arrays, Estimator
 from training.scoring.scores import scores
 
@@ -28,12 +28,12 @@ class Counted:
 
 
 def run(poses: Callable[[Arrays], np.ndarray], cache: Path, identity: str = "one", data: str = "data") -> None:
-    measure(Estimator(poses, identity), ARRAYS, data, (5, 10), WORLD, cache)
+    evaluate_row(Estimator(poses, identity), ARRAYS, data, (5, 10), WORLD, cache)
 
 
 def test_every_prefix_is_estimated_from_its_own_frames(tmp_path: Path) -> None:
     counted = Counted()
-    measured = measure(Estimator(counted, "one"), ARRAYS, "data", (10, 5), WORLD, tmp_path / "a.npz")
+    measured = evaluate_row(Estimator(counted, "one"), ARRAYS, "data", (10, 5), WORLD, tmp_path / "a.npz")
     assert counted.seen == [5, 10, 20]
     for length in (5, 10, 20):
         expected = scores(TRUTH[:, :length] + [0.1 * length, 0.0, 0.0], TRUTH[:, :length], WORLD)
@@ -44,8 +44,8 @@ def test_every_prefix_is_estimated_from_its_own_frames(tmp_path: Path) -> None:
 
 def test_what_is_known_is_read(tmp_path: Path) -> None:
     counted, cache = Counted(), tmp_path / "a.npz"
-    first = measure(Estimator(counted, "one"), ARRAYS, "data", (5,), WORLD, cache)
-    again = measure(Estimator(counted, "one"), ARRAYS, "data", (5,), WORLD, cache)
+    first = evaluate_row(Estimator(counted, "one"), ARRAYS, "data", (5,), WORLD, cache)
+    again = evaluate_row(Estimator(counted, "one"), ARRAYS, "data", (5,), WORLD, cache)
     assert counted.seen == [5, 20]
     np.testing.assert_array_equal(first.poses, again.poses)
     assert {length: set(found) for length, found in first.scores.items()} == {
@@ -84,4 +84,4 @@ def test_an_estimate_that_fails_leaves_no_file(tmp_path: Path) -> None:
 
 def test_prefixes_beyond_the_trajectory_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="expected 1 to 20"):
-        measure(Estimator(Counted(), "one"), ARRAYS, "data", (21,), WORLD, tmp_path / "a.npz")
+        evaluate_row(Estimator(Counted(), "one"), ARRAYS, "data", (21,), WORLD, tmp_path / "a.npz")

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from training.scoring.metrics import path_length_m, seen_from_first, trajectory_error
+from training.data.batches import seen_from_first
+from training.scoring.metrics import path_length_m, trajectory_error
 
 STRAIGHT = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
 

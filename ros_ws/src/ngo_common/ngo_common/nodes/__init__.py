@@ -1,1 +1,1 @@
-"""The ROS side of what nodes share: parameters, quality of service, and the process around a node."""
+"""Parameters, quality of service, and the process around a node."""

@@ -44,6 +44,12 @@ def _from_json(hint: Any, value: Any) -> Any:
     allowed = (int, float) if hint is float else hint
     if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
         raise ValueError(f"{value!r} is given where {hint.__name__} is expected")
-    if isinstance(value, float) and not math.isfinite(value):
+    if hint is not float:
+        return value
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
         raise ValueError(f"{value!r} is given where a finite number is expected")
-    return value
+    return number

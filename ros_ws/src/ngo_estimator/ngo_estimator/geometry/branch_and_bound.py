@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from ngo_estimator.geometry.planar_motion import transformed
+
 _REACH = 3.0
 """Deviations around a point that have a likelihood."""
 
@@ -36,12 +38,14 @@ class SearchMatch:
 
     ``pose`` ``(3,)`` is the pose of the points in the map (m, m, rad), ``response`` the mean likelihood of the points
     there, 0 to 1. ``second`` is the largest response at poses that are well separated from the best one, or an upper
-    bound of it where the search was cut short.
+    bound of it where the search was cut short. ``second_pose`` ``(3,)`` has that response; None where only the bound
+    is known.
     """
 
     pose: np.ndarray
     response: float
     second: float
+    second_pose: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -125,13 +129,24 @@ def search(
         grid.levels, cells, headings, half_x, half_y, apart, math.radians(config.separation_deg),
         config.least_response, config.least_second, config.most_blocks,
     )  # fmt: skip
-    response, second, angle, across, up = found
+    response, second, best, other = found
     if response < 0.0:
         return None
-    pose = np.array(
-        (centre[0] + across * grid.resolution_m, centre[1] + up * grid.resolution_m, headings[angle]), np.float64
-    )
-    return SearchMatch(pose, response, second)
+
+    def pose(place: tuple[int, int, int]) -> np.ndarray:
+        angle, across, up = place
+        shift = np.array((across, up)) * grid.resolution_m
+        return np.array((centre[0] + shift[0], centre[1] + shift[1], headings[angle]))
+
+    return SearchMatch(pose(best), response, second, None if other[0] < 0 else pose(other))
+
+
+def response_at(grid: PooledGrid, points: np.ndarray, pose: np.ndarray) -> float:
+    """Mean likelihood of points ``(n, 2)`` (m) at a pose ``(3,)``, 0 to 1; raises ``ValueError`` without a point."""
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
+        raise ValueError(f"points have the shape {points.shape}; expected (n, 2) with at least one point")
+    cells = np.floor((transformed(pose, points) - grid.origin_m) / grid.resolution_m).astype(np.int32)
+    return float(_sum(grid.levels[0], cells, 0, 0) / (255.0 * len(points)))
 
 
 def _heading_offsets(config: SearchConfig, window: float) -> np.ndarray:
@@ -171,8 +186,9 @@ def _sum(level: np.ndarray, cells: np.ndarray, across: int, up: int) -> int:
 def _best_first(
     levels: np.ndarray, cells: np.ndarray, headings: np.ndarray, half_x: int, half_y: int, apart: float,
     apart_rad: float, least_response: float, least_second: float, most_blocks: int,
-) -> tuple[float, float, int, int, int]:  # fmt: skip
-    """Response, second response, and the best pose's heading, column and row; a response of -1 where none was found."""
+) -> tuple[float, float, tuple[int, int, int], tuple[int, int, int]]:  # fmt: skip
+    """Response, second response, and heading, column and row of both; -1 for what was not found."""
+    nowhere = (-1, 0, 0)
     depth = len(levels) - 1
     while depth > 0 and (1 << depth) > 2 * max(half_x, half_y) + 1:
         depth -= 1
@@ -206,13 +222,13 @@ def _best_first(
                 continue
         if level == 0:
             if found:
-                return best / full, -negative / full, best_angle, best_across, best_up
+                return best / full, -negative / full, (best_angle, best_across, best_up), (angle, across, up)
             best, best_angle, best_across, best_up = -float(negative), angle, across, up
             least = max(least, least_second * best)
             continue
         blocks += 1
         if blocks > most_blocks:
-            return best / full if found else -1.0, -negative / full, best_angle, best_across, best_up
+            return best / full if found else -1.0, -negative / full, (best_angle, best_across, best_up), nowhere
         size = 1 << (level - 1)
         for i in range(2):
             for j in range(2):
@@ -222,5 +238,5 @@ def _best_first(
                     if bound >= least:
                         heapq.heappush(heap, (-bound, level - 1, angle, column, row))
     if best < 0.0:
-        return -1.0, 0.0, 0, 0, 0
-    return best / full, least / full, best_angle, best_across, best_up
+        return -1.0, 0.0, nowhere, nowhere
+    return best / full, least / full, (best_angle, best_across, best_up), nowhere

@@ -80,7 +80,7 @@ def likelihood_field(points: Array, normals: Array, middle: Array, config: Searc
 def draw(field: LikelihoodField, points: Array, normals: Array) -> None:
     """Draw more points ``(n, 2)`` with normals ``(n, 2)`` into a field."""
     config = field.config
-    _draw(field.scores, _joined(points, normals, config.cell_m), field.corner, config.cell_m, config.deviation_m)
+    _draw(field.scores, joined(points, normals, config.cell_m), field.corner, config.cell_m, config.deviation_m)
 
 
 def search(
@@ -115,8 +115,8 @@ def search(
 
 
 @njit(cache=True)
-def _joined(points: Array, normals: Array, spacing: float) -> Array:
-    """The points, and more between neighbours whose surfaces face alike and whose gap runs along these."""
+def joined(points: Array, normals: Array, spacing: float) -> Array:
+    """The points ``(n, 2)``, and more between neighbours whose surfaces face alike and whose gap runs along these."""
     between = np.zeros(len(points), dtype=np.int64)
     for i in range(len(points) - 1):
         x, y = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]

@@ -104,15 +104,10 @@ def key_scan(
     thin = _thinned(ends, config.spacing_m, config.most_points)
     normals = _normals(thin, config.neighbours, config.thickness_m, config.thickness_share, config.edge_on)
     turn = np.array((0.0, 0.0, mounting.sensor_xyyaw[2]))
-    return KeyScan(
-        stamp_ns,
-        transformed(mounting.sensor_xyyaw, thin),
-        transformed(turn, normals),
-        mounting.sensor_xyyaw,
-        angles,
-        ranges,
-        float(largest),
-    )
+    parts = transformed(mounting.sensor_xyyaw, thin), transformed(turn, normals), angles, ranges
+    # What messages carry: a live node sees the same as a run over a recording.
+    points, normals, angles, ranges = (part.astype(np.float32).astype(np.float64) for part in parts)
+    return KeyScan(stamp_ns, points, normals, mounting.sensor_xyyaw, angles, ranges, float(np.float32(largest)))
 
 
 def _checked(angles: Array, ranges: Array, range_limits: tuple[float, float]) -> tuple[Array, Array]:

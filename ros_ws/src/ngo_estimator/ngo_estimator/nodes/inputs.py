@@ -1,4 +1,4 @@
-"""Subscriptions that notice who publishes: others on the same topic, and those whose QoS does not fit."""
+"""Subscriptions that check their publishers: one publisher a topic, with a QoS that fits."""
 
 from collections.abc import Callable, Hashable
 from typing import Any
@@ -21,10 +21,10 @@ class OtherPublisher(ValueError):
 
 
 class Input:
-    """A subscription that takes the messages of one publisher, the first, and says so where there are more.
+    """A subscription that takes the messages of the first publisher only, and reports others.
 
-    What others publish meanwhile on the same topic is dropped and counted. Publishers whose quality of service does not
-    fit are named, for nothing comes from them.
+    Messages of other publishers on the same topic are dropped and counted. Publishers with a quality of service that
+    does not fit are named, because none of their messages arrive.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Input:
         identity: Callable[[Any], Hashable],
         timeout_s: float,
     ) -> None:
-        """Have ``callback`` called with each message; ``identity`` is what a message says of its source."""
+        """Have ``callback`` called with each message; ``identity`` gives the source that a message names."""
         self._node, self._status = node, status
         self._callback, self._identity = callback, identity
         self._guard = SourceGuard(timeout_s)
@@ -56,15 +56,15 @@ class Input:
         )
 
     def close(self) -> None:
-        """Take no more messages."""
+        """End the subscription."""
         self._node.destroy_subscription(self._subscription)
 
     def set_timeout(self, timeout_s: float) -> None:
-        """How long the publisher that is held on to may be silent."""
+        """Set the silence of the publisher after which another one takes its place."""
         self._guard.timeout_s = timeout_s
 
     def problems(self) -> list[str]:
-        """A line for each thing that is wrong with those who publish, the first of them since the last call."""
+        """One line for each problem with the publishers since the last call."""
         found = [self._others] if self._others else []
         self._others = ""
         misfits = self._misfits() if self._misfit_policy else []
@@ -98,7 +98,7 @@ class Input:
         return list(self._node.get_publishers_info_by_topic(self._subscription.topic_name))
 
     def _misfits(self) -> list[str]:
-        """Names of those from whom nothing comes."""
+        """Names of the publishers whose QoS does not fit."""
         own = self._subscription.qos_profile
         return sorted(
             _name(info)

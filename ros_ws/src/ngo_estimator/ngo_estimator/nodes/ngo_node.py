@@ -24,6 +24,7 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import run_node
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
+from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
@@ -34,7 +35,7 @@ from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.trajectory.files import edges_of, write_trajectory
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.online_trajectory import Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
@@ -53,7 +54,7 @@ class NgoNode(LifecycleNode):
         super().__init__(NAME)
         self._live = LiveSettings(self, NgoNodeSettings)
         self._live.on_change(self._on_settings)
-        self._built, self._listening = ExitStack(), ExitStack()  # what cleanup and deactivate undo
+        self._built, self._listening = ExitStack(), ExitStack()  # undone by cleanup and deactivate
         self._failure: Exception | None = None
         self._starting = False
         self._inputs: list[Input] = []
@@ -67,7 +68,7 @@ class NgoNode(LifecycleNode):
         return self._live.values
 
     def start(self) -> "NgoNode":
-        """Configure and activate, where ``autostart`` says so; raises what keeps the node from starting."""
+        """Configure and activate if ``autostart`` is set; raises the error that keeps the node from starting."""
         if self._settings.autostart:
             self._starting = True
             for transition in (self.trigger_configure, self.trigger_activate):
@@ -86,12 +87,12 @@ class NgoNode(LifecycleNode):
         return self._attempt(self._listen, self._listening)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no more; what comes meanwhile is a gap that the odometry bridges."""
+        """Stop taking relative poses. The odometry bridges the gap after the next activation."""
         self._listening.close()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the trajectory and the networks."""
+        """Drop the trajectory and the networks."""
         self._built.close()
         return super().on_cleanup(state)
 
@@ -108,7 +109,7 @@ class NgoNode(LifecycleNode):
         except Exception as error:  # rclpy itself would say nothing about it
             undo.close()
             self._failure = error
-            if not self._starting:  # whoever starts the node says it
+            if not self._starting:  # the caller of start() reports it
                 self.get_logger().error(" ".join(str(error).split()) or repr(error))
             return _FAILURE
         return _SUCCESS
@@ -118,9 +119,12 @@ class NgoNode(LifecycleNode):
         # Imported here because torch takes seconds: a bad parameter is said at once.
         from ngo_estimator.online.map_origin import MapOrigin
         from ngo_estimator.online.online_trajectory import OnlineTrajectory
+        from ngo_estimator.online.scan_trajectory import ScanTrajectory
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
-        def load(folder: Path, world: str) -> OnlineTrajectory:
+        def load(folder: Path, world: str) -> OnlineTrajectory | ScanTrajectory:
+            if is_lidar(folder):
+                return ScanTrajectory.load(folder, world, settings.iterations_per_step)
             return OnlineTrajectory.load(
                 folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
             )
@@ -130,6 +134,7 @@ class NgoNode(LifecycleNode):
         self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
         self._paused = False
         self._gaps = self._restarts = self._new_gaps = 0
+        self._fault = ""
         self._begin_anew()
         self._live.lock()
         built.callback(self._live.lock, False)
@@ -197,7 +202,7 @@ class NgoNode(LifecycleNode):
         self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
     def _begin_anew(self) -> None:
-        """What belongs to one trajectory."""
+        """Reset the state that belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
         self._covariance = np.zeros((3, 3))
         self._last_correction_m = 0.0
@@ -205,8 +210,8 @@ class NgoNode(LifecycleNode):
         self._smoothing.reset()
 
     def _on_relative_pose(self, message: RelativePose) -> None:
-        step = messages.relative_step(message)
         try:
+            step = messages.relative_step(message)
             with self._status.timed("time an update"):
                 update = self._core.update(step, optimize=not self._paused)
         except ValueError as error:
@@ -228,15 +233,16 @@ class NgoNode(LifecycleNode):
             )
         self._gaps += update.gap
         self._new_gaps += update.gap
+        self._fault = update.fault or self._fault
         if update.optimized:
             self._last_correction_m = update.largest_move_m
             self._status.took("time an optimisation", self._core.optimization_s)
         begins = self._latest is None
         self._latest = update
-        self._publish(update, step.odom_xyyaw)
+        self._publish(update, step.tf_odom_xyyaw)
         # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last one.
         self._whole.changed(loops=update.optimized or begins)
-        self._odom_xyyaw = step.odom_xyyaw
+        self._odom_xyyaw = step.tf_odom_xyyaw
         if self._core.unfinished:
             self._pending.reset()
         else:
@@ -287,7 +293,7 @@ class NgoNode(LifecycleNode):
     async def _on_save(
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
-        """Have a thread write the file: relative poses go on meanwhile."""
+        """Write the file in a thread, so that relative poses are processed meanwhile."""
         path, trajectory = Path(request.path).expanduser().absolute(), self._trajectory()
         done, executor = Future(), self.executor
 
@@ -346,19 +352,22 @@ class NgoNode(LifecycleNode):
         if self._new_gaps:
             found.append(f"{self._new_gaps} gaps in the relative poses, bridged by the odometry")
             self._new_gaps = 0
+        if self._fault:
+            found.append(f"internal fault, the trajectory goes on by odometry: {self._fault}")
+            self._fault = ""
         if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:
             found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
         return found
 
 
 def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
-    """Write a file; returns whether that went well, and what to say."""
+    """Write a file; returns whether it succeeded, and a message for the user."""
     try:
         if trajectory is None:
             raise ValueError("the trajectory is empty; nothing was written")
         edges = edges_of(trajectory) if path.suffix == ".g2o" else ()
         write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw, edges)
-    except Exception as error:  # whatever it is, whoever called must get an answer
+    except Exception as error:  # the caller of the service gets an answer in any case
         return False, " ".join(str(error).split()) or repr(error)
     return True, f"wrote {len(trajectory.stamps_ns)} poses to {path}"
 

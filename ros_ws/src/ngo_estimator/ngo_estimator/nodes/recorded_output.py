@@ -1,4 +1,4 @@
-"""What a run over a recording leaves behind: trajectories, a recording of both paths, a plot and the errors."""
+"""The files of a run over a recording: trajectories, a recording of both paths, a plot and the errors."""
 
 import json
 from pathlib import Path
@@ -76,14 +76,14 @@ class RecordedOutput:
         self._writer.close()
 
     def add(self, step: RecordedStep) -> None:
-        """Write what the nodes publish about a step."""
+        """Write the messages that the nodes publish about a step."""
         local, update, frames = step.local, step.update, self._frames
         self._covariance = propagate(self._covariance, local.odom_xyyaw, local.relative_xyyaw, local.covariance)
         stamp_ns, odom, map_frame = local.stamp_ns, frames["odom"], frames["map"]
         odometry = messages.odometry_message(local, self._covariance, odom, frames["base"])
         pose = messages.pose_message(stamp_ns, map_frame, update.pose_xyyaw, update.covariance)
         transforms = messages.transform_message(stamp_ns, map_frame, odom, update.map_from_odom_xyyaw)
-        below = messages.transform_message(stamp_ns, odom, frames["base"], local.odom_xyyaw)
+        below = messages.transform_message(stamp_ns, odom, frames["base"], local.tf_odom_xyyaw)
         transforms.transforms = [*transforms.transforms, *below.transforms]
         for topic, message in ((ODOMETRY, odometry), (POSE, pose), (TF, transforms)):
             self._writer.write(topic, self._serialise(message, _TYPES[topic]), stamp_ns)
@@ -111,7 +111,7 @@ class RecordedOutput:
             in_map = _seen_by(truth, SpatialPoses.from_planar(stamps_ns, estimates["corrected"]))
             self._write_path(PATHS["truth"], self._frames["map"], truth.stamps_ns, in_map)
         shown = {name: estimates[name] for name in ("odometry", "corrected")}
-        save_plot(self.folder / "plot.png", title, shown, in_map)
+        save_plot(self.folder / "plot.png", title, shown, in_map, run.walls)
         if truth is None:
             return {}
         reports = {
@@ -147,6 +147,6 @@ def _seen_by(truth: SpatialPoses, estimate: SpatialPoses) -> np.ndarray:
 
 
 def _residual(values: np.ndarray) -> dict[str, Any]:
-    """What the projection of the truth to the plane leaves out: root mean square of z, roll and pitch."""
+    """Root mean square of z, roll and pitch, which the projection of the truth to the plane leaves out."""
     z_m, roll_rad, pitch_rad = np.sqrt(np.mean(values**2, axis=0)).tolist()
     return {"z_m": z_m, "roll_deg": float(np.degrees(roll_rad)), "pitch_deg": float(np.degrees(pitch_rad))}

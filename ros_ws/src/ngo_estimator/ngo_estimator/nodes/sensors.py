@@ -35,7 +35,7 @@ def sensor_topic(image_format: ImageFormat, image_topic: str, scan_topic: str, c
 def sensor_array(message: Any, image_format: ImageFormat, topic: str, scan_yaw_rad: float = 0.0) -> np.ndarray:
     """The observation in an Image, CompressedImage or LaserScan, as ``image_format`` says.
 
-    Raises ``ValueError`` for another encoding or size, or data that is not what the message says.
+    Raises ``ValueError`` for another encoding or size, or data that contradicts the message's header.
     """
     if isinstance(message, Image):
         expected = _ENCODINGS[image_format.channels, image_format.dtype]

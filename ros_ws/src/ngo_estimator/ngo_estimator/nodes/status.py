@@ -1,4 +1,4 @@
-"""What a node tells about itself: counts, rates and durations on /diagnostics, and throttled warnings."""
+"""Diagnostics of a node: counts, rates and durations on /diagnostics, and throttled warnings."""
 
 import re
 import time
@@ -19,7 +19,7 @@ _QUIET_S = 5.0
 
 
 class NodeStatus:
-    """Counts what a node takes and drops, and publishes it once a period.
+    """Counts the inputs that a node takes and drops, and publishes the counts once a period.
 
     The period is one of real time, so that a silent input shows; the stamp is that of the newest input.
     """
@@ -41,7 +41,7 @@ class NodeStatus:
         self._unsaid: Counter[str] = Counter()
         self._newest_ns = 0
         self.idle = ""
-        """Why no input is expected now; empty: it is."""
+        """Why no input is expected now; empty: input is expected."""
         self._start_period()
         self._publisher = node.create_publisher(DiagnosticArray, topic, 10, qos_overriding_options=overridable())
         self._timer = node.create_timer(period_s, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -72,7 +72,7 @@ class NodeStatus:
 
     @contextmanager
     def timed(self, what: str) -> Iterator[None]:
-        """Measure how long something takes; what fails does not count."""
+        """Measure the duration of the block, unless it fails."""
         started = time.perf_counter()
         yield
         self.took(what, time.perf_counter() - started)
@@ -80,8 +80,8 @@ class NodeStatus:
     def dropped(self, kind: str, reason: object, count: int = 1, warn: bool = True) -> None:
         """Count ``count`` inputs as dropped, and warn: at once, then at most every few seconds a kind and reason.
 
-        They are counted by ``kind`` and, where ``reason`` is an error with a name of its own, by that, too. Without
-        ``warn`` they are counted only.
+        They are counted by ``kind``, and by the name of ``reason`` if it is an error class of its own. Without ``warn``
+        they are counted only.
         """
         key = kind + _short(reason)
         self._dropped[key] += count

@@ -1,4 +1,4 @@
-"""The corrected trajectory in the forms that cost more the longer it is."""
+"""The corrected trajectory as messages whose cost grows with its length."""
 
 import time
 from collections.abc import Callable
@@ -20,16 +20,16 @@ from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.online.publication_pace import PublicationPace
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.online_trajectory import Trajectory as WholeTrajectory
+    from ngo_estimator.online.corrected_trajectory import Trajectory as WholeTrajectory
 
 _DEPTH = 10
 
 
 class TrajectoryPublishers:
-    """Publishes a path, a flat trajectory and the loops, each made only while somebody subscribes to it.
+    """Publishes a path, a flat trajectory and the loops, each only while it has subscribers.
 
-    They come at a pace of their own: after a change at once or, where that would be too often, when it is time. A
-    subscriber that comes later gets the newest ones at once.
+    A change is published at once, or after the period of the highest rate. A subscriber that comes later gets the
+    newest messages at once.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class TrajectoryPublishers:
         settings: NgoNodeSettings,
         snapshot: Callable[[], "WholeTrajectory | None"],
     ) -> None:
-        """Publish what ``snapshot`` gives on the three topics of ``settings``."""
+        """Publish the trajectory of ``snapshot()`` on the three topics of ``settings``."""
         self._node = node
         self._snapshot = snapshot
         self._frame_id = settings.framed(settings.map_frame)
@@ -59,7 +59,7 @@ class TrajectoryPublishers:
             self._node.destroy_lifecycle_publisher(publisher)
 
     def set_rate(self, rate_hz: float) -> None:
-        """Publish so often at most; 0: after every change."""
+        """Set the highest rate; 0: after every change."""
         self._end_timer()
         self._pace = PublicationPace(rate_hz)
         if rate_hz > 0.0:

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep, key_scan
+from ngo_estimator.networks.step_deviation import StepDeviation
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
+from ngo_estimator.odometry.step_evidence import StepScaling
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry, WheelOdometryConfig
 from ngo_recordings.scan_stream import LidarScan
 
@@ -29,9 +32,10 @@ _LEAST_POINTS = 3
 class LidarOdometryConfig:
     """How scans and wheels become odometry.
 
-    A scan waits for wheels at most ``wheel_wait_s``. Wheels that were silent for ``wheel_silence_s`` are not waited for.
-    A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are the smallest
-    variances of a step: what rounding leaves of a robot that stands.
+    A scan waits for wheels at most ``wheel_wait_s``. Wheels that were silent for ``wheel_silence_s`` are not waited
+    for. A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are
+    the smallest variances of a step. With ``learned_deviation`` a trained network scales the deviations that are
+    published; no pose changes.
     """
 
     points: ScanPointsConfig = field(default_factory=ScanPointsConfig)
@@ -42,22 +46,28 @@ class LidarOdometryConfig:
     most_rays: int = 20_000
     least_variance_m2: float = 1e-8
     least_variance_rad2: float = 1e-9
+    learned_deviation: bool = False
 
     def __post_init__(self) -> None:
         positive = (self.wheel_wait_s, self.wheel_silence_s, self.least_variance_m2, self.least_variance_rad2)
         if not all(0.0 < value < math.inf for value in positive) or self.most_rays < 2:
             raise ValueError(
-                f"wheel_wait_s, wheel_silence_s, least_variance_m2, least_variance_rad2 are {positive} and most_rays is "
-                f"{self.most_rays}; expected positive numbers, and at least 2 rays"
+                f"wheel_wait_s, wheel_silence_s, least_variance_m2, least_variance_rad2 are {positive} and most_rays "
+                f"is {self.most_rays}; expected positive numbers, and at least 2 rays"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class LidarStep(RelativeStep):
-    """Motion between two scans; ``share`` of the points fit the walls seen before, ``unsure`` where the scan says nothing."""
+    """Motion between two scans.
+
+    ``share`` of the points fit the walls seen before. The scan of an ``unsure`` step does not say where it was taken.
+    ``evidence`` ``(12,)`` has the columns ``STEP_EVIDENCE``.
+    """
 
     share: float
     unsure: bool
+    evidence: Array
 
 
 class LidarOdometry:
@@ -66,8 +76,19 @@ class LidarOdometry:
     Scans and wheels are each in order of time, and may arrive in any order against each other.
     """
 
-    def __init__(self, config: LidarOdometryConfig | None = None, mounting: Mounting | None = None) -> None:
+    def __init__(
+        self,
+        config: LidarOdometryConfig | None = None,
+        mounting: Mounting | None = None,
+        deviation: StepDeviation | None = None,
+    ) -> None:
         self.config = config or LidarOdometryConfig()
+        if self.config.learned_deviation != (deviation is not None):
+            raise ValueError(
+                f"learned_deviation is {self.config.learned_deviation}, and the network is {deviation}; expected both "
+                "or neither"
+            )
+        self._scaling = None if deviation is None else StepScaling(deviation)
         self.mounting = mounting or Mounting(np.zeros(3))
         """Where the sensor sits on the robot; may be set until the first scan comes."""
         self.restarts = 0
@@ -76,12 +97,17 @@ class LidarOdometry:
 
     @classmethod
     def load(cls, weights: Path, world: str | None = None) -> "LidarOdometry":
-        """Begin with the settings in the folder ``weights``; raises ``LidarFileError``, of one clear line."""
-        return cls(read_lidar_file(weights, "odometry", LidarOdometryConfig, world))
+        """Begin with the settings in the folder ``weights``, and the trained network where they ask for it.
+
+        Raises:
+            LidarFileError, CheckpointError: of one clear line.
+        """
+        config = read_lidar_file(weights, "odometry", LidarOdometryConfig, world)
+        return cls(config, deviation=load_step_deviation(weights, world) if config.learned_deviation else None)
 
     def reset(self) -> None:
         """Forget everything: the next scan is the new origin of ``odom``."""
-        self._core = ScanOdometry(self.config.odometry)
+        self._core = ScanOdometry(self.config.odometry, self._scaling)
         self._wheels: WheelOdometry | None = None
         self._newest_wheels_ns: int | None = None
         self._waiting: deque[LidarScan] = deque()
@@ -183,7 +209,9 @@ class LidarOdometry:
         least = np.diag((self.config.least_variance_m2, self.config.least_variance_m2, self.config.least_variance_rad2))
         key_step = None
         if estimate.is_key:
-            key_step = KeyScanStep(key, self._key_ns, estimate.since_key, estimate.since_key_covariance + least)
+            key_step = KeyScanStep(
+                key, self._key_ns, estimate.since_key, estimate.since_key_covariance + least, estimate.factors
+            )
             self._key_ns = key.stamp_ns
         origin, self._origin = self._origin, None
         nothing = np.zeros(0, np.float32)
@@ -198,6 +226,7 @@ class LidarOdometry:
             place_code=nothing,
             share=estimate.share,
             unsure=estimate.unsure,
+            evidence=estimate.evidence,
             key=key_step,
             origin_scan=origin,
             robot_odom_xyyaw=self._robot_odom_at(key.stamp_ns, estimate.step),
@@ -212,7 +241,7 @@ class LidarOdometry:
         return pose
 
     def _key_scan(self, scan: LidarScan) -> KeyScan:
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
         try:
@@ -242,4 +271,4 @@ class LidarOdometry:
             ends = self._wheels.pose_at(self._last.stamp_ns), self._wheels.pose_at(scan.stamp_ns)
             if ends[0] is not None and ends[1] is not None:
                 twist = between(ends[0], ends[1]) / between_s
-        return Sweep(scan.time_increment * np.arange(len(scan.ranges)), twist)
+        return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)

@@ -5,14 +5,19 @@ from collections import deque
 
 import numpy as np
 
+from ngo_estimator.geometry import branch_and_bound
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.likelihood_field import LikelihoodField, SearchConfig, draw, likelihood_field
+from ngo_estimator.geometry.likelihood_field import LikelihoodField, SearchConfig, draw, joined, likelihood_field
 from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points
 from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
 
 _REDRAWN_SCANS = 10
 _REDRAWN_M = 5.0
 """The field is drawn anew after so many scans or metres; scans that left the submap stay in it until then."""
+
+
+_WIDE_SCANS = 10
+"""So many of the newest scans make the grid of wide searches."""
 
 
 class LocalSubmap:
@@ -26,6 +31,7 @@ class LocalSubmap:
         self._middle = np.zeros(2)
         self._lines: LineMap | None = None
         self._field: LikelihoodField | None = None
+        self._grid: branch_and_bound.PooledGrid | None = None
         self._undrawn = 0
         self._drawn = 0
 
@@ -34,7 +40,7 @@ class LocalSubmap:
         self._points.append(transformed(pose, scan.points))
         self._normals.append(rotated(pose[2], scan.normals))
         self._last = pose[:2].copy()
-        self._lines = None
+        self._lines = self._grid = None
         self._undrawn += 1
 
     @property
@@ -44,6 +50,14 @@ class LocalSubmap:
             points, normals = np.concatenate(self._points), np.concatenate(self._normals)
             self._lines = line_map_of_points(*averaged_lines(points, normals))
         return self._lines
+
+    def grid(self, config: branch_and_bound.SearchConfig) -> branch_and_bound.PooledGrid:
+        """The pooled grid of the newest scans, for wide searches; the same until a scan is added."""
+        if self._grid is None:
+            points = np.concatenate(list(self._points)[-_WIDE_SCANS:])
+            normals = np.concatenate(list(self._normals)[-_WIDE_SCANS:])
+            self._grid = branch_and_bound.pooled_grid(config, joined(points, normals, config.resolution_m))
+        return self._grid
 
     @property
     def field(self) -> LikelihoodField:

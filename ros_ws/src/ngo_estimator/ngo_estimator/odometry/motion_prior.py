@@ -28,8 +28,8 @@ class MotionPriorConfig:
     still_deg: float = 1.5
     acceleration_m_s2: float = 2.0
     acceleration_rad_s2: float = 4.0
-    largest_m: float = 0.5
-    largest_deg: float = 30.0
+    largest_m: float = 1.0
+    largest_deg: float = 45.0
     longest_s: float = 1.5
     doubt_m: float = 0.1
     doubt_m_s2: float = 4.0
@@ -109,9 +109,7 @@ class MotionPrior:
         moves = not doubted and bool(step.any())
         total = np.diag(deviations**2)
         step_covariance = np.diag(step_deviations**2) if moves else None
-        return Prediction(
-            mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance
-        )
+        return Prediction(mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance)
 
     def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
         config = self.config
@@ -123,9 +121,13 @@ class MotionPrior:
         information = np.linalg.inv(total).astype(np.float64)
         return Prediction(mean, total, information, (mean,))
 
-    def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool) -> None:
-        """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before."""
-        self._velocity = step / ((stamp_ns - self._stamp_ns) * 1e-9)
+    def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool, unsure: bool) -> None:
+        """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before.
+
+        A step that is ``unsure`` is no measured velocity: without wheels the last one is believed less and less.
+        """
+        measured = not unsure or self._now_wheels is not None
+        self._velocity = step / ((stamp_ns - self._stamp_ns) * 1e-9) if measured else 0.5 * self._velocity
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
         if is_key:
             self._anchor, self._anchor_wheels = pose, self._now_wheels

@@ -14,4 +14,4 @@ class LateFrame(RejectedFrame):
 
 
 class UnusableImage(RejectedFrame):
-    """An image or scan of the wrong size or type, or with values that make no sense, or an unknown action or velocity."""
+    """An image or scan of the wrong size or type, one whose values make no sense, or an unknown action or velocity."""

@@ -2,15 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-
-import numpy as np
+from typing import Any
 
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
-from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, Truth
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from ngo_estimator.trajectory.files import SpatialPoses, seconds
+from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 
 _REASONS: dict[type[ValueError], str] = {
@@ -40,14 +39,27 @@ class LidarRun:
         """Steps that bridge scans that were lost."""
         self.unsure = 0
         """Scans that did not say where they were taken."""
+        self.faults: list[str] = []
+        """What failed inside, in words; the trajectory went on by odometry there."""
 
     @property
-    def lag_s(self) -> float:
-        """How much older the scans are than their stamps, by the wheels' clock."""
-        return self._odometry.lag_s
+    def facts(self) -> dict[str, Any]:
+        """What else is worth keeping of the run."""
+        return {"unsure": self.unsure, "lag_s": self._odometry.lag_s, "faults": len(self.faults)}
+
+    def remarks(self) -> list[str]:
+        """What a person should know of the run, a line each."""
+        lines = []
+        if lag_s := self._odometry.lag_s:
+            lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
+        if self.unsure:
+            lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
+        if self.faults:
+            lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
+        return lines
 
     def run(
-        self, records: Iterable[LidarScan | WheelPose], truth: SpatialPoses | None = None
+        self, records: Iterable[LidarScan | WheelPose], truth: Truth | None = None
     ) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.
 
@@ -79,19 +91,26 @@ class LidarRun:
                     update = self._online.update(step)
                     self.gaps += update.gap
                     self.unsure += step.unsure
+                    self._note_fault()
                     yield RecordedStep(step, update)
                 return
             except ValueError as error:
                 self._reject("not usable", str(error))
 
+    def _note_fault(self) -> None:
+        if self._online.fault:
+            self.faults.append(self._online.fault)
+
     def _reject(self, reason: str, example: str) -> None:
         self.rejected[reason] += 1
         self.examples.setdefault(reason, example)
 
-    def _finished(self, truth: SpatialPoses | None) -> Iterator[RecordedRun]:
+    def _finished(self, truth: Truth | None) -> Iterator[RecordedRun]:
         """The trajectory that ends here, if there is one."""
-        self._online.finish()
+        if self._online.finish() is None:
+            self._note_fault()
         trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
         self._online.reset()
         if trajectory is not None:
-            yield RecordedRun(trajectory, truth, np.zeros((0, 3)), walls)
+            true, residual = (truth or Truth()).poses()
+            yield RecordedRun(trajectory, true, residual, walls)

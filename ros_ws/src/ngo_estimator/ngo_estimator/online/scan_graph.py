@@ -14,9 +14,10 @@ import torch
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.key_scan import KeyScan, no_scan
-from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.geometry.planar_covariance import bounded, propagate
 from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
@@ -24,15 +25,19 @@ from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
 
+_KEYS_PER_OPTIMISED = 200
+"""For each so many nodes an optimisation waits for one more key scan."""
+
 
 @dataclass(frozen=True)
 class ScanGraphConfig:
     """How key scans are optimised.
 
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
-    at once where a new loop is ``surprise`` deviations off the graph. Steps and loops are damped as by Cauchy, ``kernel``
-    deviations wide. To each step's covariance come ``step_m`` and ``step_deg`` (deviations), which registration in the
-    same few key scans does not see.
+    at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
+    ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to
+    each step's covariance: registration in the same few key scans does not see them. About ``most_scans`` key scans are
+    kept; where there are more, places that many of them show lose some. Their poses stay.
     """
 
     loops: ScanLoopConfig = field(default_factory=ScanLoopConfig)
@@ -43,11 +48,13 @@ class ScanGraphConfig:
     kernel: float = 3.0
     step_m: float = 0.005
     step_deg: float = 0.15
+    most_scans: int = 4000
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.keys_between < 1:
+        if self.iterations < 1 or self.keys_between < 1 or self.most_scans < 100:
             raise ValueError(
-                f"iterations, keys_between are {self.iterations}, {self.keys_between}; expected at least 1 of each"
+                f"iterations, keys_between, most_scans are {self.iterations}, {self.keys_between}, {self.most_scans}; "
+                "expected at least 1, 1 and 100"
             )
         positive = (self.surprise, self.kernel, self.step_m, self.step_deg)
         if not all(0.0 < value < math.inf for value in positive):
@@ -65,8 +72,9 @@ class ScanGraph:
         self._frames = GrowingRows((), np.int64)  # of the nodes
         self._nodes = GrowingRows((3,), np.float64)
         self._steps = GrowingRows((3,), np.float64)
-        self._step_covariance = GrowingRows((3, 3), np.float64)
-        self._scans: list[KeyScan] = []
+        self._step_covariance = GrowingRows((3, 3), np.float64)  # for the optimisation
+        self._published_covariance = GrowingRows((3, 3), np.float64)
+        self._scans = KeyScanStore()
         self._key_stamp_ns = 0
         self._finder = ScanLoopFinder(config.loops)
         self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
@@ -81,6 +89,10 @@ class ScanGraph:
         """Of the loops in the last optimisation ``(loops,)``, zero to one."""
         self.took_s = 0.0
         """Computing time of the last optimisation."""
+        self.optimized = False
+        """Whether an optimisation ended since the newest frame came."""
+        self.fault = ""
+        """What failed since the newest frame came, in words. Everything is then as it was before, but for the loops."""
 
     @property
     def keys(self) -> int:
@@ -99,7 +111,7 @@ class ScanGraph:
         return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
 
     def begin_at(self, step: RelativeStep) -> None:
-        """Take the first frame, before the first step. No loop leads to it where its scan is missing."""
+        """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""
         self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
         self._frames.append(0)
         self._nodes.append(np.zeros(3))
@@ -107,6 +119,7 @@ class ScanGraph:
 
     def append(self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None) -> bool:
         """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise."""
+        self.optimized, self.fault = False, ""
         last = torch.from_numpy(self.odometry.values[-1])
         self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
         since = self._since_key()
@@ -117,8 +130,22 @@ class ScanGraph:
             self.advance(self._left)  # what comes now adds a node to those that it is about
         known = key.from_key_stamp_ns == self._key_stamp_ns
         # Registration in the same key scans: errors of the steps between do not add up.
-        self._complete(key, since, key.covariance if known else self._since)
-        return self._look_for_loops()
+        if known:
+            covariance = bounded(key.covariance)
+            self._complete(key, since, covariance, covariance * np.outer(key.factors, key.factors))
+        else:
+            covariance = bounded(self._since)
+            self._complete(key, since, covariance, covariance)
+        try:
+            return self._look_for_loops()
+        except Exception as error:  # numerics of a library, or a fault of ours: it may cost loops, and nothing else
+            self.fail(error, "the search for loops")
+            return False
+
+    def fail(self, error: Exception, work: str = "an optimisation") -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+        self.fault = f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self._running, self._waiting = None, 0
 
     def _since_key(self) -> np.ndarray:
         """Pose ``(3,)`` of the newest frame, seen from the last node."""
@@ -126,13 +153,14 @@ class ScanGraph:
         since: np.ndarray = se2.between(ends[0], ends[1]).numpy()
         return since
 
-    def _complete(self, key: KeyScanStep, since: np.ndarray, covariance: np.ndarray) -> None:
+    def _complete(self, key: KeyScanStep, since: np.ndarray, covariance: np.ndarray, published: np.ndarray) -> None:
         config = self.config
         floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
         self._steps.append(since)
         self._step_covariance.append(covariance + floor)
+        self._published_covariance.append(published + floor)
         pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
-        self._end = propagate(self._end, pose, since, covariance + floor)
+        self._end = propagate(self._end, pose, since, published + floor)
         self._nodes.append(pose)
         self._frames.append(len(self.odometry) - 1)
         self._scans.append(key.scan)
@@ -148,21 +176,34 @@ class ScanGraph:
         else:
             windows = distance_windows(config.windows, graph_distances(poses, accepted, self.keys - 1))
             loops = self._finder.find(self._scans, poses, windows)
+            self._save_memory()
             off = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance).residuals(poses)
             found = float(np.sqrt((off**2).sum(1)).max(initial=0.0))
             self._waiting = max(self._waiting, int(len(loops) > 0))
         self._waiting += self._waiting > 0
-        return self._waiting > config.keys_between or found > config.surprise
+        # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
+        return self._waiting > max(config.keys_between, self.keys // _KEYS_PER_OPTIMISED) or found > config.surprise
+
+    def _save_memory(self) -> None:
+        """Bound the memory of scans that the finder has seen."""
+        self._scans.compact()
+        most = self.config.most_scans
+        if self._scans.kept > most + most // 10:
+            newest = self.config.loops.submap_keys
+            self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.values, newest))
 
     def begin(self) -> None:
-        """Begin to optimise all nodes."""
+        """Begin to optimise all nodes; where that fails, ``fault`` says so."""
+        try:
+            self._begin()
+        except Exception as error:  # see append
+            self.fail(error)
+
+    def _begin(self) -> None:
         began = time.perf_counter()
         self._rows = np.flatnonzero(self._finder.loops.accepted)
         loops = self._finder.loops[self._rows]
-        chain = np.arange(self.keys - 1)
-        steps = RelativePoses.of_covariances(
-            np.stack((chain, chain + 1), axis=1), self._steps.values, self._step_covariance.values
-        )
+        steps = self._chain(self._step_covariance.values)
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         gates = np.ones(len(loops))
         self._running = ScanPoseGraph(steps, measured, gates, self._nodes.values, self.config.kernel)
@@ -170,11 +211,25 @@ class ScanGraph:
         self._waiting = 0
         self.took_s = time.perf_counter() - began
 
+    def _chain(self, covariance: np.ndarray) -> RelativePoses:
+        """The steps between the nodes, with covariances ``(keys - 1, 3, 3)``."""
+        chain = np.arange(self.keys - 1)
+        return RelativePoses.of_covariances(np.stack((chain, chain + 1), axis=1), self._steps.values, covariance)
+
     def advance(self, iterations: int) -> bool:
-        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose."""
-        running = self._running
-        if running is None:
+        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
+
+        Where it fails, it is over, every node is where it was, and ``fault`` says so.
+        """
+        if self._running is None:
             raise RuntimeError("no optimisation has begun")
+        try:
+            return self._advance(self._running, iterations)
+        except Exception as error:  # see append
+            self.fail(error)
+            return False
+
+    def _advance(self, running: ScanPoseGraph, iterations: int) -> bool:
         began = time.perf_counter()
         for _ in range(min(iterations, self._left)):
             running.iterate()
@@ -182,12 +237,16 @@ class ScanGraph:
         self.took_s += time.perf_counter() - began
         if self._left:
             return False
+        end = self._end
+        if self.keys > 1:
+            end = running.covariance(self._chain(self._published_covariance.values), self.keys - 1)
+        if not (np.isfinite(running.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running = None
         self._before = self._nodes.values.copy()
         self._nodes.values[:] = running.poses
         self._loop_rows, self.loop_weights = self._rows, running.weights
-        if running.equations is not None:
-            self._end = running.equations.covariance([self.keys - 1])
+        self._end, self.optimized = end, True
         return True
 
     def abandon(self) -> None:
@@ -196,18 +255,24 @@ class ScanGraph:
             self._running, self._waiting = None, self.config.keys_between
 
     @property
-    def waiting(self) -> bool:
-        """Whether there is a loop that no optimisation has seen."""
-        return self._waiting > 0
+    def unfinished(self) -> bool:
+        """Whether an optimisation has begun, or a loop waits for one."""
+        return self.running or self._waiting > 0
+
+    @property
+    def window_fill(self) -> float:
+        """All key scans are optimised: there is no window to fill."""
+        return 0.0
 
     def finish(self) -> bool:
-        """Optimise until nothing moves any more; returns whether there was anything to optimise."""
+        """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
+        self.fault = ""
         if self._running is None:
             if not self._finder.loops.accepted.any():
                 return False
             self.begin()
         self._left = _MOST_ITERATIONS
-        return self.advance(self._left)
+        return self._running is not None and self.advance(self._left)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
@@ -221,8 +286,12 @@ class ScanGraph:
         The difference between two nodes and their odometry is spread evenly over the frames between.
         """
         nodes = self._nodes.values.copy()
-        if before:
-            nodes[: len(self._before)] = self._before
+        if before:  # nodes that came since follow the last of those
+            last = len(self._before) - 1
+            moved = torch.from_numpy(nodes[last:].copy())
+            nodes[: last + 1] = self._before
+            since = se2.between(moved[:1], moved)
+            nodes[last:] = se2.compose(torch.from_numpy(self._before[-1:]), since).numpy()
         odometry, at = torch.from_numpy(self.odometry.values), self._frames.values
         starts, ends = torch.from_numpy(nodes), odometry[torch.from_numpy(at)]
         segment = torch.from_numpy(np.searchsorted(at, np.arange(len(odometry)), side="right") - 1)
@@ -239,8 +308,7 @@ class ScanGraph:
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
-        total = sum(len(scan.points) for scan in self._scans)
-        every = max(1, -(-total // most))
+        every = max(1, -(-self._scans.points // most))
         parts = [
             transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.values, self._scans, strict=True)
         ]

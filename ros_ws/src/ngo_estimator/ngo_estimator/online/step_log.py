@@ -20,8 +20,8 @@ from ngo_estimator.geometry import se2
 class TakenStep:
     """Motion from the newest frame to the next one.
 
-    ``relative`` (3,) and its ``covariance`` (3, 3). ``begins``: it is the first of a trajectory; ``restarted``: there was
-    another before. ``gap``: steps were lost, and the motion is composed from the odometry.
+    ``relative`` (3,) and its ``covariance`` (3, 3). ``begins``: it is the first of a trajectory; ``restarted``: there
+    was another before. ``gap``: steps were lost, and the motion is composed from the odometry.
     """
 
     relative: np.ndarray

@@ -1,10 +1,12 @@
-"""Loop closures: candidates from place codes, their residuals, and the correction that they ask for.
+"""Loop closures: the record of loops, and the search for them in whole trajectories.
 
 Not in the paper, whose attention has to learn all this. A loop says where a meta-pose lies relative to an earlier
 frame.
 """
 
-import math
+from __future__ import annotations
+
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,12 +17,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import Scans
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.optimizer.gauss_newton import pick
-
-VIEWS = ((0, 0), (-4, -4), (4, -4), (-2, -2), (2, -2), (-4, 0), (4, 0), (0, -3), (0, -6))
-"""Steps from the frames of a candidate to those of its views: at the earlier frame, and at the later one."""
-
-_REWEIGHTINGS = 3
-SMALLEST_SPREAD = 1e-4  # m or rad
+from ngo_estimator.optimizer.pair_measurement import VIEWS, PairViews, measure_pairs
 
 
 @dataclass(frozen=True)
@@ -90,11 +87,22 @@ class Loops:
     most_drift: Tensor | None = None
     scans: Scans | None = None
 
-    def and_also(self, others: "Loops") -> "Loops":
-        """These and, behind them, others of the same trajectories; both without ``length`` and ``most_drift``."""
-        names = ("start", "end", "frame", "measured", "log_scale", "spread", "logit", "similarity", "valid")
-        both = {name: torch.cat((getattr(self, name), getattr(others, name)), dim=1) for name in names}
-        return Loops(**both, embeddings=self.embeddings)  # type: ignore[arg-type]
+    def where(self, which: Tensor) -> Loops:
+        """The loops of a boolean mask or of indices ``(n,)``, the same for the whole batch."""
+        return self._with({name: value[:, which] for name, value in self._per_loop().items()})
+
+    def and_also(self, others: Loops) -> Loops:
+        """These and, behind them, others of the same trajectories; both have the same optional fields."""
+        mine, theirs = self._per_loop(), others._per_loop()
+        if mine.keys() != theirs.keys():
+            raise ValueError(f"loops have {sorted(mine)}, others {sorted(theirs)}; expected the same fields")
+        return self._with({name: torch.cat((value, theirs[name]), dim=1) for name, value in mine.items()})
+
+    def _per_loop(self) -> dict[str, Tensor]:
+        return {name: value for name in _PER_LOOP if (value := getattr(self, name)) is not None}
+
+    def _with(self, per_loop: dict[str, Tensor]) -> Loops:
+        return dataclasses.replace(self, **per_loop)  # type: ignore[arg-type]
 
     @cached_property
     def description(self) -> Tensor:
@@ -137,87 +145,22 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     frame, end, logit, similarity = (value.gather(1, keep) for value in (frame, end, logit, similarity))
     measured, log_scale = pick(measured, keep), pick(log_scale, keep)
     last = end * block + block - 1
-    spread = torch.full_like(log_scale, math.log(SMALLEST_SPREAD))
-    if search.views > 1:
-        seen = (measured, log_scale)
-        measured, log_scale, spread = fused_measurements(pair_head, codes, in_blocks, frame, last, search.views, seen)
-    if search.registrations:
-        pair = pick(codes, frame), pick(codes, last)
-        measured, log_scale = pair_head.register(*pair, measured, log_scale, search.registrations)
+    views = PairViews.of_trajectories(codes, frame_odometry(in_blocks), frame, last, VIEWS[: search.views])
+    result, _ = measure_pairs(pair_head, views, search.registrations, (measured, log_scale))
     return Loops(
         # Fill lies anywhere: kept in order, it is a loop like any other, of no weight.
         start=torch.minimum(frame // block, end),
         end=end,
         frame=frame,
-        measured=se2.compose(pick(in_blocks.flatten(1, 2), frame), measured),
-        log_scale=log_scale,
-        spread=spread,
+        measured=se2.compose(pick(in_blocks.flatten(1, 2), frame), result.measured),
+        log_scale=result.log_scale,
+        spread=result.spread,
         logit=logit.clamp(min=-20.0),
         similarity=similarity,
         valid=logit > -1e3,
         embeddings=at_ends,
         scans=pair_head.scans(codes) if search.overlaps else None,
     )
-
-
-def fused_measurements(
-    pair_head: PairHead,
-    codes: Tensor,
-    in_blocks: Tensor,
-    earlier: Tensor,
-    later: Tensor,
-    views: int,
-    first: tuple[Tensor, Tensor] | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Measure each candidate from several pairs of frames near it, and fuse them robustly.
-
-    Errors of the pair head change from frame to frame, those of the odometry over so few steps are small.
-
-    Args:
-        earlier, later: the frames of each candidate ``(batch, loops)``.
-        first: pose and logarithm of scales of the frames themselves, where they were measured already.
-
-    Returns:
-        As ``fuse_views``.
-    """
-    steps = codes.shape[1]
-    poses = frame_odometry(in_blocks)
-    start = pick(poses, earlier)
-    results, log_scales = [], []
-    for number, (at_earlier, at_later) in enumerate(VIEWS[:views]):
-        a = (earlier + at_earlier).clamp(0, steps - 1)
-        b = (later + at_later).clamp(0, steps - 1)
-        if number == 0 and first is not None:
-            measured, log_scale = first
-        else:
-            measured, log_scale, _ = pair_head(pick(codes, a), pick(codes, b))
-        measured = se2.compose(se2.between(start, pick(poses, a)), measured)
-        results.append(se2.compose(measured, se2.between(pick(poses, b), pick(poses, later))))
-        log_scales.append(log_scale)
-    return fuse_views(torch.stack(results), torch.stack(log_scales))
-
-
-def fuse_views(measured: Tensor, log_scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Fuse measurements of the same pair of frames robustly.
-
-    Args:
-        measured: ``(views, ..., 3)``; log_scale: logarithm of their scales ``(views, ..., 2)``.
-
-    Returns:
-        Pose of the later frame in the earlier one ``(..., 3)``, logarithm of its scales ``(..., 2)`` as if the views
-        erred independently, and logarithm of their spread ``(..., 2)``.
-    """
-    precision = torch.exp(-2.0 * log_scale)
-    error = se2.wrapped(measured - measured[0])
-    weight, mean = precision, torch.zeros_like(measured[0])
-    for _ in range(_REWEIGHTINGS + 1):
-        by_component = weight[..., [0, 0, 1]]
-        mean = (by_component * error).sum(0) / by_component.sum(0)
-        left = (error - mean).square()
-        squares = torch.stack((left[..., 0] + left[..., 1], left[..., 2]), dim=-1)
-        weight = precision / (1.0 + 0.25 * precision * squares)
-    spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=SMALLEST_SPREAD).log()
-    return se2.wrapped(measured[0] + mean), -0.5 * weight.sum(0).log(), spread
 
 
 def frame_odometry(in_blocks: Tensor) -> Tensor:
@@ -227,7 +170,7 @@ def frame_odometry(in_blocks: Tensor) -> Tensor:
     return se2.compose(starts.unsqueeze(2), in_blocks).flatten(1, 2)
 
 
-_NONE = -4.0  # the similarity of what is no candidate
+_NONE = -4.0  # similarity that marks fill
 
 
 def _most_similar(at_ends: Tensor, embeddings: Tensor, block: int, search: LoopSearch) -> tuple[Tensor, Tensor, Tensor]:
@@ -242,16 +185,35 @@ def _most_similar(at_ends: Tensor, embeddings: Tensor, block: int, search: LoopS
     return values.flatten(1), frames.flatten(1), index.repeat_interleave(chosen.shape[-1]).expand(batch, -1)
 
 
-def each_from_elsewhere(values: Tensor, count: int, apart: int, none: float) -> tuple[Tensor, Tensor]:
+def each_from_elsewhere(
+    values: Tensor, count: int, apart: int, none: float, places: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """The ``count`` best of each row ``(..., n)``, and their indices, both ``(..., count)``.
 
-    Neighbours of one would say the same again: the next one is more than ``apart`` away, or ``none``.
+    Neighbours of a candidate would tell the same again. Each candidate is more than ``apart`` away from the better
+    ones; where there is none left, the value is ``none``. ``places`` ``(n,)`` are the numbers that tell how far
+    candidates are apart, by default their indices.
     """
-    index = torch.arange(values.shape[-1], device=values.device)
+    places = torch.arange(values.shape[-1], device=values.device) if places is None else places
     chosen = []
     for _ in range(count):
         top = values.max(dim=-1, keepdim=True)
         chosen.append((top.values, top.indices))
-        values = values.masked_fill((index - top.indices).abs() <= apart, none)
+        values = values.masked_fill((places - places[top.indices]).abs() <= apart, none)
     best, at = (torch.cat(parts, dim=-1) for parts in zip(*chosen, strict=True))
     return best, at
+
+
+_PER_LOOP = (
+    "start",
+    "end",
+    "frame",
+    "measured",
+    "log_scale",
+    "spread",
+    "logit",
+    "similarity",
+    "valid",
+    "length",
+    "most_drift",
+)

@@ -11,37 +11,25 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans, register
+from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans
 from ngo_estimator.optimizer.gauss_newton import pick
-from ngo_estimator.optimizer.loop_closure import (
-    VIEWS,
-    Loops,
-    LoopSearch,
-    each_from_elsewhere,
-    frame_odometry,
-    fuse_views,
-)
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere, frame_odometry
+from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, PairViews, measure_overlaps
 
 OVERLAP_LOGIT = 4.0
 """Belief in a loop that was found by poses: what registers is taken for right, and kernels judge it by its residual."""
 
-OVERLAP_VIEWS = VIEWS[:5]
-"""Pairs of frames, near the two of an overlap, between which it is measured."""
-
 LEAST_SHARED = 0.25
 """Share of the rays that must agree before two frames are registered."""
 
-_DRIFT_M, _DRIFT_RAD = 0.5, math.radians(5.0)
-"""Deviations of a relative pose that a registration starts from."""
+_DRIFT_M = 0.5
+"""Deviation of a position under which frames are compared."""
 
 _AGREEING = 5.0
 """Ranges agree that differ by so many of their deviations, and half of the drift."""
 
 _EVERY = 3
 """One of so many rays tells whether frames share what they see."""
-
-_ERRING_TOGETHER = 3.0
-"""A fused measurement's deviations in units of what its views say: rays of one picture, and views, err together."""
 
 
 def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Tensor, search: LoopSearch) -> Loops:
@@ -65,28 +53,20 @@ def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Te
         share, earlier = share.flatten(1), earlier.flatten(1)
         keep = share.topk(min(search.overlaps, share.shape[1]), dim=-1).indices
         share, earlier, later = (values.gather(1, keep) for values in (share, earlier, later))
-        odometry = frame_odometry(in_blocks.float())
         frame, last = (at * block + block - 1 for at in (earlier, later))
-        end = blocks * block - 1
-        views = [((frame + a).clamp(0, end), (last + b).clamp(0, end)) for a, b in OVERLAP_VIEWS]
-        measured, log_scale, spread, found = measure_overlaps(
-            config,
-            torch.stack([pick(scans.ranges, a) for a, _ in views]),
-            torch.stack([pick(scans.ranges, b) for _, b in views]),
-            torch.stack([se2.between(pick(odometry, frame), pick(odometry, a)) for a, _ in views]),
-            torch.stack([se2.between(pick(odometry, b), pick(odometry, last)) for _, b in views]),
-            se2.between(pick(nodes, earlier), pick(nodes, later)),
-            search.registrations,
-        )
+        odometry = frame_odometry(in_blocks.float())
+        views = PairViews.of_trajectories(scans.ranges, odometry, frame, last, OVERLAP_VIEWS)
+        start = se2.between(pick(nodes, earlier), pick(nodes, later))
+        result, found = measure_overlaps(config, views, start, search.registrations)
         similarity = (pick(embeddings, earlier) * pick(embeddings, later)).sum(-1)
     valid = found & (share >= LEAST_SHARED)
     return Loops(
         start=torch.where(valid, earlier + 1, later),
         end=later,
         frame=frame,
-        measured=measured,
-        log_scale=log_scale,
-        spread=spread,
+        measured=result.measured,
+        log_scale=result.log_scale,
+        spread=result.spread,
         logit=torch.full_like(share, OVERLAP_LOGIT),
         similarity=similarity,
         valid=valid,
@@ -136,32 +116,3 @@ def _seen_again(config: RegistrationConfig, a: Tensor, b: Tensor, relative: Tens
     tolerance = 0.5 * _DRIFT_M + _AGREEING * (config.noise_m + config.noise_share * there)
     meets = inside & (there > 0.0) & ((seen.norm(dim=-1) - there).abs() < tolerance)
     return meets.to(b.dtype).mean(-1)
-
-
-def measure_overlaps(
-    config: RegistrationConfig, a: Tensor, b: Tensor, from_a: Tensor, to_b: Tensor, start: Tensor, steps: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Register frames near the two of each overlap, and fuse what they say.
-
-    Args:
-        a, b: ranges ``(views, ..., rays)`` of frames near the earlier and near the later one.
-        from_a: poses ``(views, ..., 3)`` of the one as seen from the earlier frame; to_b: those of the later frame as
-            seen from the other.
-        start: pose of the later frame in the earlier one ``(..., 3)``, as far as it is known.
-        steps: steps of each registration.
-
-    Returns:
-        The pose ``(..., 3)``, logarithms of its deviations and of how far the views disagree ``(..., 2)``, and whether
-        most views were registered ``(...)``.
-    """
-    # In the digits of a registration: what it leaves alone has to be found the same.
-    from_a, to_b, start = from_a.float(), to_b.float(), start.float()
-    guess = se2.compose(se2.compose(se2.inverse(from_a), start), se2.inverse(to_b))
-    drift = guess.new_tensor([_DRIFT_M, _DRIFT_RAD]).log().expand(*guess.shape[:-1], 2)
-    measured, after = register(config, a, b, guess, drift, steps)
-    registered = (after != drift).any(-1)
-    # What was not registered says nothing.
-    after = torch.where(registered.unsqueeze(-1), after, drift + math.log(100.0))
-    measured, log_scale, spread = fuse_views(se2.compose(se2.compose(from_a, measured), to_b), after)
-    most = registered.to(start.dtype).mean(0) > 0.5
-    return measured, log_scale + math.log(_ERRING_TOGETHER), spread, most

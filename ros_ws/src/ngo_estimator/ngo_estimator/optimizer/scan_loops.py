@@ -8,11 +8,12 @@ pose fits nearly as well, and a neighbouring loop agrees. No loop is better than
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry.branch_and_bound import PooledGrid, SearchConfig, pooled_grid, search
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.line_map import LineMap, line_map_of_points
@@ -193,7 +194,8 @@ class ScanLoopFinder:
         self.config = config
         self.loops = ScanLoops.none()
         self._profiles: list[np.ndarray] = []
-        self._middles: list[np.ndarray] = []
+        self._middles = GrowingRows((2,), np.float64)
+        self._forgotten: set[int] = set()
         self._submaps: OrderedDict[int, _Submap] = OrderedDict()
 
     def find(
@@ -217,7 +219,7 @@ class ScanLoopFinder:
                 f"poses, windows have the shapes {poses.shape}, {windows.shape} for {count} scans; expected (keys, 3)"
             )
         for scan in scans[len(self._profiles) :]:
-            self._profiles.append(range_profile(scan))
+            self._profiles.append(range_profile(scan).astype(np.float32))  # as scans have them: nothing is lost
             near = scan.points[np.linalg.norm(scan.points, axis=1) < 10.0]
             self._middles.append(near.mean(0) if len(near) else np.zeros(2))
         if (count - 1) % config.every:
@@ -231,18 +233,26 @@ class ScanLoopFinder:
                 found = found.extended(loop)
         return self._agreed(found, poses)
 
+    def forget(self, keys: Iterable[int]) -> None:
+        """Look for no more loops at these keys, whose scans are gone."""
+        nothing = np.zeros_like(self._profiles[0]) if self._profiles else np.zeros(0, np.float32)
+        for key in keys:
+            self._profiles[key] = nothing
+            self._forgotten.add(key)
+
     def _candidates(self, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]) -> list[_Candidate]:
         config, key = self.config, len(poses) - 1
         path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))))
         last = int(np.searchsorted(path, path[-1] - config.least_gap_m)) - config.submap_keys // 2
         last = min(last, key - config.source_keys - config.submap_keys // 2)
-        places = range(0, max(0, last), config.place_step)
+        steps = range(0, max(0, last), config.place_step)
+        places = [place for place in steps if place not in self._forgotten]
         if len(places) == 0:
             return []
-        seen = dict.fromkeys(min(round(m / config.place_step), len(places) - 1) for m in matches if 0 <= m < last)
+        seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)
         around = np.array((config.match_m, config.match_m, math.pi))
-        chosen = [_Candidate(p * config.place_step, np.zeros(3), around, windows[p * config.place_step]) for p in seen]
-        middles = np.stack(self._middles)
+        chosen = [_Candidate(p, np.zeros(3), around, windows[p]) for p in seen if p not in self._forgotten]
+        middles = self._middles.values
         cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         views = poses[:, :2] + np.stack(
             (cosine * middles[:, 0] - sine * middles[:, 1], sine * middles[:, 0] + cosine * middles[:, 1]), axis=1

@@ -1,8 +1,8 @@
 """A pose graph over key scans: a chain of steps and robust loops, each with a whole information matrix.
 
-It is the loop closing of the Neural Graph Optimizer where no network takes part: every iteration gates loops and steps by
-their residuals under the current poses, and takes a Gauss-Newton step. It begins at the last solution. A step is gated,
-as well, since registration can be wrong and sure of it: the graph may break there if loops say so.
+It is the loop closing of the Neural Graph Optimizer where no network takes part. Every iteration gates loops and steps
+by their residuals under the current poses, and takes a Gauss-Newton step. It begins at the last solution. Steps are
+gated since registration can be wrong and sure of it: the graph may break there if loops say so.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ _HALVINGS = 4
 class RelativePoses:
     """Measured poses of nodes, each seen from another.
 
-    ``nodes`` ``(n, 2)``: seen from the first, the second; ``relative`` ``(n, 3)`` (m, m, rad); ``root`` ``(n, 3, 3)``: a
-    root of the information matrix, ``root.T @ root``, along the axes of the first node.
+    ``nodes`` ``(n, 2)``: the second is seen from the first; ``relative`` ``(n, 3)`` (m, m, rad). ``root`` ``(n, 3, 3)``
+    makes the information matrix ``root.T @ root``, along the axes of the first node.
     """
 
     nodes: np.ndarray
@@ -84,8 +84,6 @@ class ScanPoseGraph:
         self.poses = poses.copy()
         self.weights = gates.copy()
         """What the loops weigh ``(n,)``, zero to one."""
-        self.equations: NormalEquations | None = None
-        """Of the last step."""
         self.converged = False
         self._structure = GraphStructure(np.concatenate((steps.nodes, loops.nodes)), len(poses))
         self._cost = self._total(self.poses)
@@ -97,8 +95,7 @@ class ScanPoseGraph:
             self._steps.factors(self.poses, self._kernel_weights(self._steps)),
             self._loops.factors(self.poses, self.weights),
         ]
-        self.equations = NormalEquations(factors, self._structure)
-        step = self.equations.step()[0].numpy()
+        step = NormalEquations(factors, self._structure).step()[0].numpy()
         for _ in range(_HALVINGS):
             poses = self.poses + step
             cost = self._total(poses)
@@ -111,6 +108,14 @@ class ScanPoseGraph:
         poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
         self.converged = bool(np.abs(step).max() < _LEAST_STEP)
         self.poses, self._cost = poses, cost
+
+    def covariance(self, steps: RelativePoses, node: int) -> np.ndarray:
+        """Covariance ``(3, 3)`` of a node's pose where the steps are known as well as ``steps`` say."""
+        factors = [
+            steps.factors(self.poses, self._kernel_weights(self._steps)),
+            self._loops.factors(self.poses, self.weights),
+        ]
+        return NormalEquations(factors, self._structure).covariance([node])
 
     def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
         squared = (measured.residuals(self.poses) ** 2).sum(1)

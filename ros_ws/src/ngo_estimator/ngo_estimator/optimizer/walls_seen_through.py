@@ -49,7 +49,7 @@ def placed(scans: Sequence[KeyScan], profiles: Sequence[Array], poses: Array) ->
         np.concatenate([transformed(pose, scan.points) for scan, pose in pairs]),
         np.concatenate([rotated(pose[2], scan.normals) for scan, pose in pairs]),
         np.stack([compose(pose, scan.sensor_xyyaw) for scan, pose in pairs]),
-        np.stack(profiles),
+        np.array(profiles, np.float64),
     )
 
 

@@ -13,7 +13,7 @@ from ngo_sim.flow_control import FlowControl, header_stamp_ns
 
 
 class Consumers:
-    """Feeds a FlowControl from topics of any stamped type. Call look() now and then: consumers come and go.
+    """Feeds a FlowControl from topics of any stamped type. Call look() regularly, because consumers come and go.
 
     Messages are never deserialised: the stamp is read from the bytes of the header.
     """
@@ -59,7 +59,7 @@ class Consumers:
         return self._flow.in_flight() == 0 or self._stalled(now_s, stall_timeout_s)
 
     def _stalled(self, now_s: float, stall_timeout_s: float) -> bool:
-        """Whether nothing was heard for too long; if so, warn and count the frames in hand as lost."""
+        """Whether the timeout has passed without an answer; if so, warn and count the frames in flight as lost."""
         if self._answers:
             self._answers, self._progress_s = 0, now_s
         if stall_timeout_s == 0.0 or now_s - self._progress_s < stall_timeout_s:

@@ -10,8 +10,10 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image, LaserScan
 
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
-from ngo_sim.nodes.simulator_node import SimulatorNode, run_simulator
+from ngo_sim.nodes.process import run_simulator
+from ngo_sim.nodes.simulator_node import SimulatorNode
 from ngo_sim.simulation import Frame, World
+from ngo_sim.simulator_config import SimulatorConfig
 
 
 class Maze2DNode(SimulatorNode):
@@ -59,7 +61,7 @@ class Maze2DNode(SimulatorNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return run_simulator(Maze2DNode, "maze2d", args)
+    return run_simulator(Maze2DNode, "maze2d", (SimulatorConfig, Maze2DConfig), args, **Maze2DNode.defaults)
 
 
 if __name__ == "__main__":

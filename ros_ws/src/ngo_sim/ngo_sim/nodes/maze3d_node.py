@@ -12,8 +12,10 @@ from geometry_msgs.msg import Quaternion, Transform, TransformStamped
 from sensor_msgs.msg import CameraInfo, Image
 
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
-from ngo_sim.nodes.simulator_node import SimulatorNode, run_simulator
+from ngo_sim.nodes.process import run_simulator
+from ngo_sim.nodes.simulator_node import SimulatorNode
 from ngo_sim.simulation import Frame, World
+from ngo_sim.simulator_config import SimulatorConfig
 
 # An optical frame looks along z, with x to the right and y down (REP-103).
 _BASE_FROM_OPTICAL = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
@@ -79,7 +81,7 @@ class Maze3DNode(SimulatorNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return run_simulator(Maze3DNode, "maze3d", args)
+    return run_simulator(Maze3DNode, "maze3d", (SimulatorConfig, Maze3DConfig), args, **Maze3DNode.defaults)
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ class Output:
 
 
 class Recording:
-    """A file being written, and the log time of what is written next."""
+    """A file being written, and the log time of the next message."""
 
     def __init__(self, path: Path) -> None:
         self.writer = RecordingWriter(path, library="ngo_sim")
@@ -65,11 +65,11 @@ class Outputs:
                 self._recording = Recording(path)
             except (OSError, RecordingError) as error:
                 raise BadParameter(f"parameter 'record' is {record!r}, which cannot be written: {error}") from None
-            # A node that is interrupted while it starts has nobody to close it.
+            # Nothing else closes the file of a node that is interrupted while it starts.
             weakref.finalize(self, self._recording.writer.close)
 
     def create(self, message_type: type, topic: str, qos: QoSProfile | None = None) -> Output:
-        """A topic to publish on; qos: another one than that of the sensors."""
+        """A topic to publish on; qos: that of the sensors by default."""
         qos = copy.copy(self._qos if qos is None else qos)  # rclpy writes the overrides into it
         with checked_overrides():
             publisher = self._node.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
@@ -87,12 +87,12 @@ class Outputs:
         return Output(publisher, self._recording)
 
     def set_time(self, stamp_ns: int) -> None:
-        """What is published from now on has this log time."""
+        """Set the log time of the next messages."""
         if self._recording is not None:
             self._recording.now_ns = stamp_ns
 
     def flush_if_due(self) -> None:
-        """Let what is recorded get to the file now and then."""
+        """Write buffered messages to the file once a period."""
         if self._recording is not None:
             self._recording.writer.flush_if_due()
 

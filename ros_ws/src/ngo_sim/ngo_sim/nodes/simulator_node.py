@@ -1,8 +1,7 @@
-"""The node that both worlds share: paces a simulation, takes actions from outside, publishes each frame."""
+"""The node that all worlds share: paces a simulation, takes actions from outside, publishes each frame."""
 
 from __future__ import annotations
 
-import inspect
 import time
 from abc import abstractmethod
 from collections.abc import Callable
@@ -21,8 +20,7 @@ from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.parameters import LiveSettings
-from ngo_common.nodes.process import run_node
-from ngo_common.settings import BadParameter, Settings, usage
+from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
@@ -40,7 +38,7 @@ class SimulatorNode(Node):
 
     world_config_type: ClassVar[type[Settings]]
     defaults: ClassVar[dict[str, Any]] = {}
-    image_publisher: Publisher  # its subscribers are those that wait_for_subscribers counts
+    image_publisher: Publisher  # wait_for_subscribers counts its subscribers
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -51,7 +49,7 @@ class SimulatorNode(Node):
         self._live.lock()
         world.lock()
         self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
-        # Deep enough that a reliable reader may be late with its acknowledgement by far more than what is in flight.
+        # Deep enough for late acknowledgements of a reliable reader: far more than the frames in flight.
         qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
         self.outputs = Outputs(self, qos, self.config.record)
         self.outputs.set_time(time.time_ns() if self.config.use_wall_stamps else self.config.stamp_ns(0, 0.0))
@@ -61,7 +59,7 @@ class SimulatorNode(Node):
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         try:
             self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
-        except ValueError as error:  # what only the files or the world can say
+        except ValueError as error:  # an error that only the files or the world can show
             raise BadParameter(str(error)) from None
         self._pacer = Pacer()
         self._published = 0
@@ -131,7 +129,7 @@ class SimulatorNode(Node):
                 executor.spin_once(timeout_sec=idle_s)
 
     def _ready_line(self) -> str:
-        """What the node publishes, how fast, and what it waits for."""
+        """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""
         config, topics = self.config, ", ".join(sorted(self.outputs.topic_names))
         pace = f"{config.rate:g} frames a second" if config.rate else "as fast as the frames are taken"
         subscribers = f"; waits for {config.wait_for_subscribers} subscribers of the image"
@@ -140,7 +138,7 @@ class SimulatorNode(Node):
         return f"ready: {name}, seed {config.seed}, {pace}, publishes {topics}{waits}"
 
     def _idle_s(self, now_s: float) -> float:
-        """How long nothing is to be done before the next frame, 0 where it is due; messages end the wait earlier."""
+        """Time until the next frame, 0 if it is due; messages end the wait earlier."""
         config = self.config
         if self._published == 0:
             awaited = self.image_publisher.get_subscription_count() < config.wait_for_subscribers or (
@@ -190,10 +188,3 @@ class SimulatorNode(Node):
             self.simulation.external.command(message.action, time.monotonic())
         except ValueError as error:
             self.get_logger().warning(f"action_command dropped: {error}", throttle_duration_sec=5.0)
-
-
-def run_simulator(node_type: type[SimulatorNode], name: str, args: list[str] | None = None) -> int:
-    """Run a simulator node until it has published its frames or gets a signal; returns the process's exit code."""
-    summary = (inspect.getdoc(node_type) or "").partition("\n\n")[0]
-    text = usage("ngo_sim", name, summary, SimulatorConfig, node_type.world_config_type, **node_type.defaults)
-    return run_node(name, lambda: node_type(name), text, lambda node, ended: node.run(ended), args)

@@ -1,0 +1,79 @@
+"""What all commands of the training have in common: their help, and how they end."""
+
+import importlib
+import logging
+import subprocess
+import warnings
+from collections.abc import Iterator
+
+import pytest
+import tyro
+
+from training.common.command_line import quiet_framework, run_command
+from training.common.runs import ROOT, RunError
+from training.recordings.recording_source import RecordedArguments
+
+COMMANDS = sorted(path.stem for path in (ROOT / "training").glob("*.py") if "\nif __name__" in path.read_text())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_says_first_what_a_command_makes(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = importlib.import_module(f"training.{name}")
+    assert command.__doc__ is not None
+    with pytest.raises(SystemExit, match=r"^0$"):
+        tyro.cli(command.Arguments, args=["--help"], description=command.__doc__)
+    told = " ".join(capsys.readouterr().out.split())
+    first = command.__doc__.splitlines()[0]
+    assert first.endswith(".") and first[:40] in told
+
+
+def test_a_run_that_does_not_fit_ends_a_command_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def main(_: object) -> None:
+        raise RunError("the folder holds another run")
+
+    monkeypatch.setattr("sys.argv", ["train_local"])
+    with pytest.raises(SystemExit, match=r"^unusable: the folder holds another run$"):
+        run_command(main, RecordedArguments, None)
+
+
+@pytest.fixture
+def as_before() -> Iterator[None]:
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        yield
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
+
+
+@pytest.mark.usefixtures("as_before")
+def test_the_framework_is_quiet_and_nothing_else_is() -> None:
+    warnings.resetwarnings()
+    quiet_framework()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.warn_explicit("a hint", UserWarning, "trainer.py", 1, module="lightning.pytorch.trainer")
+        warnings.warn_explicit("of weight", UserWarning, "runs.py", 1, module="training.common.runs")
+    assert [str(one.message) for one in caught] == ["of weight"]
+    assert not logging.getLogger("lightning.pytorch.utilities.rank_zero").isEnabledFor(logging.INFO)
+    assert logging.getLogger("lightning.pytorch").isEnabledFor(logging.ERROR)
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="the files are no checkout of git")
+@pytest.mark.parametrize(
+    ("path", "ignored"),
+    [
+        ("drive_1.mcap", True),
+        ("drive_1.mcap.png", True),
+        ("truth.tum", True),
+        ("runs/my_robot/features/train/done.json", True),
+        ("results/metrics.json", True),
+        ("out/plot.png", True),
+        ("ros_ws/src/ngo_estimator/weights/my_robot/local_pose_network.json", True),
+        ("ros_ws/src/ngo_estimator/weights/maze2d/local_pose_network.json", False),
+        ("training/results/maze2d.json", False),
+        ("docs/images/demo_maze2d.png", False),
+    ],
+)
+def test_git_ignores_what_the_commands_of_the_docs_leave_behind(path: str, ignored: bool) -> None:
+    done = subprocess.run(["git", "check-ignore", "--no-index", "-q", path], cwd=ROOT, check=False)
+    assert (done.returncode == 0) == ignored

@@ -1,0 +1,36 @@
+"""How the commands of the training start and end."""
+
+import logging
+import sys
+import warnings
+from collections.abc import Callable
+from typing import TypeVar
+
+import tyro
+
+from ngo_estimator.checkpoint import CheckpointError
+from ngo_recordings.errors import RecordingError
+from training.common.runs import RunError
+
+Arguments = TypeVar("Arguments")
+
+
+def run_command(main: Callable[[Arguments], object], arguments: type[Arguments], description: str | None) -> None:
+    """Run ``main`` with the command line's arguments.
+
+    Ends with one line on stderr where recordings, weights or a run cannot be used.
+    """
+    quiet_framework()
+    given = tyro.cli(arguments, description=description)
+    try:
+        main(given)
+    except (RecordingError, CheckpointError, RunError) as error:
+        sys.exit(f"unusable: {error}")
+
+
+def quiet_framework() -> None:
+    """Keep what Lightning says of itself off the terminal: hints at its products, and at settings that are ours."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for category in (UserWarning, DeprecationWarning, FutureWarning):
+        warnings.filterwarnings("ignore", category=category, module=r"lightning\.")
