@@ -106,17 +106,3 @@ def test_bad_wheels_are_refused() -> None:
         WheelOdometryConfig(still_m=0.0)
     with pytest.raises(ValueError, match="step_s"):
         WheelLagConfig(step_s=1.0)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_noise_of_the_wheels_is_no_lag(seed: int) -> None:
-    """Wheels that are read with every scan, noisy a period: interpolation would smooth them at lags between."""
-    generator = np.random.default_rng(seed)
-    lag, period_s = WheelLag(), 0.167
-    stamps = np.arange(0.0, 150.0, period_s)
-    turns = np.diff([heading(0.5 * t) for t in stamps])
-    yaws = np.concatenate(([0.0], np.cumsum(turns + 0.03 * generator.standard_normal(len(turns)))))
-    for i, turn in enumerate(turns):
-        lag.observe(stamps[i], stamps[i + 1], turn)
-        lag.update(stamps[: i + 2], yaws[: i + 2])
-        assert abs(lag.lag_s) < 0.06

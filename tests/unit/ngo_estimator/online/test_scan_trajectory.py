@@ -212,7 +212,7 @@ def test_a_robot_that_stands_adds_frames_alone() -> None:
                 from_stamp_ns=last.stamp_ns + (k - 1) * STEP_NS,
                 relative_xyyaw=np.zeros(3),
                 key=None,
-            )  # fmt: skip
+            )
         )
     assert update.frames == 10_051
     graph = trajectory._graph

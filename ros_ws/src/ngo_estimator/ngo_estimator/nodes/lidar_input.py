@@ -115,7 +115,11 @@ class LidarInput:
         if pose is None:
             self._status.dropped("robot odometry", "pose has values that are not finite, or no orientation")
             return
-        self._core.add_wheels(stamp_ns, pose.planar()[0])
+        try:
+            self._core.add_wheels(stamp_ns, pose.planar()[0])
+        except ValueError as error:
+            self._status.dropped("robot odometry", error)
+            return
         self._update()
 
     def _update(self) -> None:

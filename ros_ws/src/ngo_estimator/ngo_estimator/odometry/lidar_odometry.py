@@ -10,7 +10,7 @@ import numpy as np
 
 from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
-from ngo_estimator.data.relative_step import RESTART_AFTER_NS, KeyScanStep, RelativeStep
+from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep, key_scan
@@ -23,6 +23,12 @@ from ngo_recordings.scan_stream import LidarScan
 
 _FARTHEST_M = 1000.0
 """Stands for a ``range_max`` of zero or infinity, as some drivers publish it."""
+
+_SWEEP_STEPS = 2
+"""Steps whose mean velocity removes a sweep's motion.
+
+Of one step alone the error comes back with the other sign, and swings.
+"""
 
 _LEAST_POINTS = 3
 """Points without which a scan says nothing."""
@@ -112,7 +118,7 @@ class LidarOdometry:
         self._newest_wheels_ns: int | None = None
         self._waiting: deque[LidarScan] = deque()
         self._last: KeyScan | None = None
-        self._last_step: tuple[float, Array] | None = None
+        self._last_steps: deque[tuple[float, Array]] = deque(maxlen=_SWEEP_STEPS)
         self._origin: KeyScan | None = None
         self._robot_odom: Array | None = None
         self._key_ns = 0
@@ -134,10 +140,15 @@ class LidarOdometry:
         return 0.0 if self._wheels is None else self._wheels.lag_s
 
     def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
-        """Take the wheels' pose ``(3,)`` in their own frame; raises ``ValueError`` unless it is finite.
+        """Take the wheels' pose ``(3,)`` in their own frame.
 
         A pose that is not newer than the last one is of no use and is left out.
+
+        Raises:
+            ValueError: the pose is not finite, or larger than ``LARGEST_ODOMETRY``. Nothing has changed.
         """
+        if pose_xyyaw.shape != (3,) or not (np.abs(pose_xyyaw) <= LARGEST_ODOMETRY).all():
+            raise ValueError(f"the wheels' pose is {pose_xyyaw}; expected three numbers up to {LARGEST_ODOMETRY:g}")
         newest = self._newest_wheels_ns
         if newest is not None and stamp_ns <= newest - RESTART_AFTER_NS:
             self._wheels, self._newest_wheels_ns = None, None
@@ -202,7 +213,7 @@ class LidarOdometry:
         if last is None:
             self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns
             return None
-        self._last_step = ((key.stamp_ns - last.stamp_ns) * 1e-9, estimate.step)
+        self._last_steps.append(((key.stamp_ns - last.stamp_ns) * 1e-9, estimate.step))
         return self._published(key, last, estimate)
 
     def _published(self, key: KeyScan, last: KeyScan, estimate: ScanEstimate) -> LidarStep:
@@ -259,14 +270,14 @@ class LidarOdometry:
 
     def _sweep(self, scan: LidarScan) -> Sweep | None:
         """How the robot moves during the scan, where the scan says how long it takes and the motion is known."""
-        if self._last is None or self._last_step is None or scan.time_increment == 0.0:
+        if self._last is None or not self._last_steps or scan.time_increment == 0.0:
             return None
-        duration_s, step = self._last_step
         between_s = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
         # A sweep that lasts longer than from scan to scan is none.
         if not 0.0 < abs(scan.time_increment) * len(scan.ranges) <= 1.2 * between_s:
             return None
-        twist = step / duration_s
+        duration_s = sum(duration for duration, _ in self._last_steps)
+        twist = np.sum([step for _, step in self._last_steps], axis=0) / duration_s
         if self._wheels is not None:
             ends = self._wheels.pose_at(self._last.stamp_ns), self._wheels.pose_at(scan.stamp_ns)
             if ends[0] is not None and ends[1] is not None:

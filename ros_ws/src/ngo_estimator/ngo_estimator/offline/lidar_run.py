@@ -70,7 +70,10 @@ class LidarRun:
         self._odometry.mounting = self._mounting
         for record in records:
             if isinstance(record, WheelPose):
-                self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+                try:
+                    self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+                except ValueError as error:
+                    self._reject("wheel pose not usable", f"{seconds(record.stamp_ns)} s: {error}")
             else:
                 self.frames += 1
                 restarts = self._odometry.restarts

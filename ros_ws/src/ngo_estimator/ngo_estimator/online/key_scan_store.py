@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -62,7 +62,8 @@ class KeyScanStore(Sequence[KeyScan]):
         """Drop the rays of all key scans so far, and keep points and normals as single floats, as messages do."""
         for k in range(self._compact, len(self._scans)):
             scan = self._scans[k]
-            points, normals = scan.points.astype(np.float32), scan.normals.astype(np.float32)
+            points: Any = scan.points.astype(np.float32)
+            normals: Any = scan.normals.astype(np.float32)
             self._scans[k] = replace(scan, points=points, normals=normals, angles=_NOTHING, ranges=_NOTHING)
         self._compact = len(self._scans)
 

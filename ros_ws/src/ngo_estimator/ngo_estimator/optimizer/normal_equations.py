@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
 
-# Pivots stay on the diagonal. Without relaxed supernodes, which fill columns that have little in common: up to ten times
+# Pivots stay on the diagonal. No relaxed supernodes: they fill columns that have little in common, and are many times
 # slower in graphs of thousands of poses.
 _SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "options": {"SymmetricMode": True}}
 
