@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from ngo_common.settings import Settings, setting
 from ngo_sim.convex_shapes import Floats
 from ngo_sim.routes import CELL_M, RouteMap
 
@@ -20,31 +21,22 @@ _PATROL_ROOMS = (3, 8)
 
 
 @dataclass(frozen=True)
-class BuildingDriverConfig:
+class BuildingDriverConfig(Settings):
     """Who drives and how."""
 
-    driver: str = "any"  # random rooms, the same rooms over and over, or one of the two by chance [wander, patrol, any]
-    radius_m: float = 0.22  # of the robot, m [0.05 to 0.3]
-    speed_mps: float = 0.7  # highest speed, m/s [0.05 to 2]
-    turn_rate_rps: float = 1.2  # highest turn rate, rad/s [0.1 to 3]
-    acceleration_mps2: float = 0.7  # highest change of speed, m/s^2; of the turn rate 4 rad/s^2 [0.1 to 3]
-    stand: float = 0.3  # chance to stand for some seconds, now and then minutes, at a goal [0 to 1]
-    spin: float = 0.25  # chance to turn on the spot at a goal [0 to 1]
-
-    def __post_init__(self) -> None:
-        if self.driver not in DRIVERS:
-            raise ValueError(f"driver is {self.driver!r}; it must be one of {', '.join(DRIVERS)}")
-        for name, low, high in (
-            ("radius_m", 0.05, 0.3),
-            ("speed_mps", 0.05, 2.0),
-            ("turn_rate_rps", 0.1, 3.0),
-            ("acceleration_mps2", 0.1, 3.0),
-            ("stand", 0.0, 1.0),
-            ("spin", 0.0, 1.0),
-        ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
+    driver: str = setting(
+        "any", "Random rooms, the same rooms over and over, or one of the two by chance.", choices=DRIVERS
+    )
+    radius_m: float = setting(0.22, "Of the robot, m.", minimum=0.05, maximum=0.3)
+    speed_mps: float = setting(0.7, "Highest speed, m/s.", minimum=0.05, maximum=2.0)
+    turn_rate_rps: float = setting(1.2, "Highest turn rate, rad/s.", minimum=0.1, maximum=3.0)
+    acceleration_mps2: float = setting(
+        0.7, "Highest change of speed, m/s^2; of the turn rate 4 rad/s^2.", minimum=0.1, maximum=3.0
+    )
+    stand: float = setting(
+        0.3, "Chance to stand for some seconds, now and then minutes, at a goal.", minimum=0.0, maximum=1.0
+    )
+    spin: float = setting(0.25, "Chance to turn on the spot at a goal.", minimum=0.0, maximum=1.0)
 
 
 class BuildingDriver:

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from ngo_common.settings import Settings, setting
 from ngo_sim.convex_shapes import Floats, counter_clockwise, lane, overlap, rectangle, union_walls
 from ngo_sim.corridors import LAYOUTS, Corridor, Layout
 from ngo_sim.furniture import (
@@ -33,25 +34,21 @@ _MARGIN_M = 2.0
 
 
 @dataclass(frozen=True)
-class FloorPlanConfig:
+class FloorPlanConfig(Settings):
     """What kind of building is drawn."""
 
-    layout: str = "any"  # form of the corridors [any, ring, wings, arc, hall or ladder; aliased takes ladder for any]
-    scale: float = 1.0  # factor on the length of the corridors; rooms keep their size [0.3 to 3]
-    aliased: bool = False  # whether rooms repeat, furniture included, along the corridors
-    glass: float = 0.12  # share of the rooms with a glass front; twice that share have windows [0 to 0.5]
-    clutter: float = 1.0  # factor on furniture in rooms and things in corridors; 0: empty rooms [0 to 2]
-    people: int = 3  # people who walk from room to room [0 to 50]
-
-    def __post_init__(self) -> None:
-        if self.layout != "any" and self.layout not in LAYOUTS:
-            raise ValueError(f"layout is {self.layout!r}; it must be any, {', '.join(LAYOUTS)}")
-        for name, low, high in (("scale", 0.3, 3.0), ("glass", 0.0, 0.5), ("clutter", 0.0, 2.0), ("people", 0, 50)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
-        if not isinstance(self.people, int):
-            raise ValueError(f"people is {self.people!r}; it must be a whole number from 0 to 50")
+    layout: str = setting("any", "Form of the corridors.", choices=("any", *LAYOUTS))
+    scale: float = setting(
+        1.0, "Factor on the length of the corridors; rooms keep their size.", minimum=0.3, maximum=3.0
+    )
+    aliased: bool = setting(False, "Whether rooms repeat, furniture included, along the corridors.")
+    glass: float = setting(
+        0.12, "Share of the rooms with a glass front; twice that share have windows.", minimum=0.0, maximum=0.5
+    )
+    clutter: float = setting(
+        1.0, "Factor on furniture in rooms and things in corridors; 0: empty rooms.", minimum=0.0, maximum=2.0
+    )
+    people: int = setting(3, "People who walk from room to room.", minimum=0, maximum=50)
 
 
 @dataclass(frozen=True, eq=False)

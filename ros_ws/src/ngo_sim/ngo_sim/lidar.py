@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from ngo_common.settings import BadParameter, Settings, setting
 from ngo_sim.convex_shapes import Floats
 
 Bools = npt.NDArray[np.bool_]
@@ -21,54 +22,43 @@ NO_RETURNS = ("inf", "max", "zero")
 
 
 @dataclass(frozen=True)
-class ScannerConfig:
+class ScannerConfig(Settings):
     """A scanner and its mounting on the robot."""
 
-    rays: int = 360  # in one scan [1 to 10000]
-    field_of_view_deg: float = 270.0  # from the first ray to the last; at 360 none is seen twice [1 to 360]
-    range_min_m: float = 0.05  # nearer things give no return, m [0 to 1]
-    range_max_m: float = 30.0  # farther things give no return, m [1 to 200]
-    scan_period_s: float = 0.1  # from one scan to the next, s [0.005 to 1]
-    sweep: float = 0.0  # share of the period in which the rays are cast, one after the other [0 to 1]
-    clockwise: bool = False  # whether the first ray is the leftmost, with a negative increment
-    noise_m: float = 0.01  # standard deviation of a range, m [0 to 1]
-    noise_per_m: float = 0.001  # what the standard deviation gains with each metre of range [0 to 0.1]
-    dropout: float = 0.002  # share of the rays without a return [0 to 1]
-    glass_seen: float = 0.15  # share of the rays that a pane reflects [0 to 1]
-    glass_lost: float = 0.15  # share of the rays that a pane takes; all others pass [0 to 1 - glass_seen]
-    resolution_m: float = 0.0  # step in which ranges are given, m; 0: no rounding [0 to 0.1]
-    no_return: str = "inf"  # range of a ray without a return: infinity, 0.1 m above range_max_m, or 0 [inf, max, zero]
-    increment_error: float = 0.0  # by which share the stated increment is wrong [-0.05 to 0.05]
-    laser_x_m: float = 0.0  # of the scanner, forward of the robot's middle, m [-0.2 to 0.2]
-    laser_y_m: float = 0.0  # of the scanner, left of the robot's middle, m [-0.1 to 0.1]
-    laser_yaw_deg: float = 0.0  # by which the scanner is turned to the left [-180 to 180]
-    upside_down: bool = False  # whether the scanner hangs: its left is the robot's right
+    rays: int = setting(360, "In one scan.", minimum=1, maximum=10000)
+    field_of_view_deg: float = setting(
+        270.0, "From the first ray to the last; at 360 none is seen twice.", minimum=1.0, maximum=360.0
+    )
+    range_min_m: float = setting(0.05, "Nearer things give no return, m.", minimum=0.0, maximum=1.0)
+    range_max_m: float = setting(30.0, "Farther things give no return, m.", minimum=1.0, maximum=200.0)
+    scan_period_s: float = setting(0.1, "From one scan to the next, s.", minimum=0.005, maximum=1.0)
+    sweep: float = setting(
+        0.0, "Share of the period in which the rays are cast, one after the other.", minimum=0.0, maximum=1.0
+    )
+    clockwise: bool = setting(False, "Whether the first ray is the leftmost, with a negative increment.")
+    noise_m: float = setting(0.01, "Standard deviation of a range, m.", minimum=0.0, maximum=1.0)
+    noise_per_m: float = setting(
+        0.001, "What the standard deviation gains with each metre of range.", minimum=0.0, maximum=0.1
+    )
+    dropout: float = setting(0.002, "Share of the rays without a return.", minimum=0.0, maximum=1.0)
+    glass_seen: float = setting(0.15, "Share of the rays that a pane reflects.", minimum=0.0, maximum=1.0)
+    glass_lost: float = setting(0.15, "Share of the rays that a pane takes; all others pass.", minimum=0.0, maximum=1.0)
+    resolution_m: float = setting(0.0, "Step in which ranges are given, m; 0: no rounding.", minimum=0.0, maximum=0.1)
+    no_return: str = setting(
+        "inf", "Range of a ray without a return: infinity, 0.1 m above range_max_m, or 0.", choices=NO_RETURNS
+    )
+    increment_error: float = setting(0.0, "By which share the stated increment is wrong.", minimum=-0.05, maximum=0.05)
+    laser_x_m: float = setting(0.0, "Of the scanner, forward of the robot's middle, m.", minimum=-0.2, maximum=0.2)
+    laser_y_m: float = setting(0.0, "Of the scanner, left of the robot's middle, m.", minimum=-0.1, maximum=0.1)
+    laser_yaw_deg: float = setting(0.0, "By which the scanner is turned to the left.", minimum=-180.0, maximum=180.0)
+    upside_down: bool = setting(False, "Whether the scanner hangs: its left is the robot's right.")
 
     def __post_init__(self) -> None:
-        if isinstance(self.rays, bool) or not isinstance(self.rays, int) or not 1 <= self.rays <= 10_000:
-            raise ValueError(f"rays is {self.rays!r}; it must be a whole number from 1 to 10000")
-        if self.no_return not in NO_RETURNS:
-            raise ValueError(f"no_return is {self.no_return!r}; it must be one of {', '.join(NO_RETURNS)}")
-        for name, low, high in (
-            ("field_of_view_deg", 1.0, 360.0),
-            ("range_min_m", 0.0, 1.0),
-            ("range_max_m", 1.0, 200.0),
-            ("scan_period_s", 0.005, 1.0),
-            ("sweep", 0.0, 1.0),
-            ("noise_m", 0.0, 1.0),
-            ("noise_per_m", 0.0, 0.1),
-            ("dropout", 0.0, 1.0),
-            ("glass_seen", 0.0, 1.0),
-            ("glass_lost", 0.0, 1.0 - self.glass_seen),
-            ("resolution_m", 0.0, 0.1),
-            ("increment_error", -0.05, 0.05),
-            ("laser_x_m", -0.2, 0.2),
-            ("laser_y_m", -0.1, 0.1),
-            ("laser_yaw_deg", -180.0, 180.0),
-        ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
+        super().__post_init__()
+        if self.glass_lost > 1.0 - self.glass_seen:
+            raise BadParameter(
+                f"parameter 'glass_lost' is {self.glass_lost!r}; allowed: a number from 0 to 1 - glass_seen"
+            )
 
     @property
     def increment_rad(self) -> float:

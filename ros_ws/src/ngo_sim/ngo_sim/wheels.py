@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from ngo_common.settings import Settings, setting
 from ngo_sim.convex_shapes import Floats
 
 # Seconds and metres that an event lasts, drawn evenly.
@@ -17,34 +18,33 @@ _SLIP_SHARE = (-0.6, 0.6)
 
 
 @dataclass(frozen=True)
-class WheelsConfig:
+class WheelsConfig(Settings):
     """Errors of the wheel odometry."""
 
-    track_m: float = 0.4  # distance between the wheels, m [0.05 to 2]
-    left_bias: float = 0.0  # by which share the left wheel counts too much [-0.2 to 0.2]
-    right_bias: float = 0.0  # by which share the right wheel counts too much [-0.2 to 0.2]
-    wheel_noise: float = 0.01  # standard deviation of a wheel's way after 1 m, growing with its root, m [0 to 1]
-    slips_per_km: float = 0.0  # bursts of 0.3 to 1.5 s in which one wheel miscounts by up to 60 % [0 to 10000]
-    freezes_per_hour: float = 0.0  # times that the odometry stands still for about a second, then jumps [0 to 3600]
-    jumps_per_hour: float = 0.0  # times that the odometry leaps by jump_m without any motion [0 to 3600]
-    jump_m: float = 0.3  # standard deviation of such a leap along x and y, m; 0.3 rad a metre of it in yaw [0 to 2]
-    lag_s: float = 0.0  # by which scans are older than their stamps, against the odometry, s [-0.2 to 0.2]
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("track_m", 0.05, 2.0),
-            ("left_bias", -0.2, 0.2),
-            ("right_bias", -0.2, 0.2),
-            ("wheel_noise", 0.0, 1.0),
-            ("slips_per_km", 0.0, 10_000.0),
-            ("freezes_per_hour", 0.0, 3600.0),
-            ("jumps_per_hour", 0.0, 3600.0),
-            ("jump_m", 0.0, 2.0),
-            ("lag_s", -0.2, 0.2),
-        ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
+    track_m: float = setting(0.4, "Distance between the wheels, m.", minimum=0.05, maximum=2.0)
+    left_bias: float = setting(0.0, "By which share the left wheel counts too much.", minimum=-0.2, maximum=0.2)
+    right_bias: float = setting(0.0, "By which share the right wheel counts too much.", minimum=-0.2, maximum=0.2)
+    wheel_noise: float = setting(
+        0.01, "Standard deviation of a wheel's way after 1 m, growing with its root, m.", minimum=0.0, maximum=1.0
+    )
+    slips_per_km: float = setting(
+        0.0, "Bursts of 0.3 to 1.5 s in which one wheel miscounts by up to 60 %.", minimum=0.0, maximum=10000.0
+    )
+    freezes_per_hour: float = setting(
+        0.0, "Times that the odometry stands still for about a second, then jumps.", minimum=0.0, maximum=3600.0
+    )
+    jumps_per_hour: float = setting(
+        0.0, "Times that the odometry leaps by jump_m without any motion.", minimum=0.0, maximum=3600.0
+    )
+    jump_m: float = setting(
+        0.3,
+        "Standard deviation of such a leap along x and y, m; 0.3 rad a metre of it in yaw.",
+        minimum=0.0,
+        maximum=2.0,
+    )
+    lag_s: float = setting(
+        0.0, "By which scans are older than their stamps, against the odometry, s.", minimum=-0.2, maximum=0.2
+    )
 
 
 def draw_wheels(rng: np.random.Generator) -> WheelsConfig:

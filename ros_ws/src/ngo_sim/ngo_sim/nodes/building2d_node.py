@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import inspect
 import math
 import sys
 import time
@@ -12,7 +13,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -20,6 +20,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.nodes.process import run_node
+from ngo_common.settings import BadParameter, SettingsType, usage
 from ngo_sim.building2d import Building2d, BuildingFrame
 from ngo_sim.building_drivers import BuildingDriverConfig
 from ngo_sim.building_node_config import BuildingNodeConfig
@@ -29,13 +32,12 @@ from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.lidar import ScannerConfig
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
-from ngo_sim.nodes.parameters import BadParameter, ConfigParameters
-from ngo_sim.nodes.process import run_simulator
 from ngo_sim.simulation import yaw_quaternion_zw
 from ngo_sim.wheels import WheelsConfig
 
 _LOOK_AT_GRAPH_S = 0.1
 _IDLE_S = 0.05
+_SETTINGS = (BuildingNodeConfig, FloorPlanConfig, BuildingDriverConfig, ScannerConfig, WheelsConfig)
 
 
 class Building2dNode(Node):
@@ -45,15 +47,10 @@ class Building2dNode(Node):
     """
 
     def __init__(self, name: str) -> None:
-        try:
-            super().__init__(name)
-        except InvalidParameterTypeException as error:
-            raise BadParameter(str(error)) from None
-        parameters = ConfigParameters(self)
-        self.config = parameters.declare(BuildingNodeConfig)
-        plan, driver = parameters.declare(FloorPlanConfig), parameters.declare(BuildingDriverConfig)
-        scanner, wheels = parameters.declare(ScannerConfig), parameters.declare(WheelsConfig)
-        parameters.finish()
+        super().__init__(name)
+        self.config = self._declared(BuildingNodeConfig)
+        plan, driver = self._declared(FloorPlanConfig), self._declared(BuildingDriverConfig)
+        scanner, wheels = self._declared(ScannerConfig), self._declared(WheelsConfig)
         drawn = self.config.draw_robot
         self._building = Building2d(plan, None if drawn else scanner, None if drawn else wheels, driver)
         try:
@@ -76,6 +73,12 @@ class Building2dNode(Node):
         self._pacer = Pacer()
         self._published = 0
         self._looked_s = 0.0
+
+    def _declared(self, settings_type: type[SettingsType]) -> SettingsType:
+        """Declare the parameters of one part; none changes while the node runs."""
+        live = LiveSettings(self, settings_type, beside=_SETTINGS)
+        live.lock()
+        return live.values
 
     def destroy_node(self) -> None:
         """End the recording, too."""
@@ -118,14 +121,18 @@ class Building2dNode(Node):
         self.outputs.set_time(stamp_ns)
         if self._clock_out is not None:
             self._clock_out.publish(Clock(clock=stamp))
-        wheels = _odometry(frame.wheel_pose_xyyaw, wheel_stamp, config.odom_frame, config.base_frame)
+        wheels = _odometry(
+            frame.wheel_pose_xyyaw, wheel_stamp, config.framed(config.odom_frame), config.framed(config.base_frame)
+        )
         self._odometry.publish(wheels)
         if self._tf is not None:
-            moved = TransformStamped(header=wheels.header, child_frame_id=config.base_frame)
+            moved = TransformStamped(header=wheels.header, child_frame_id=config.framed(config.base_frame))
             moved.transform.translation.x, moved.transform.translation.y = frame.wheel_pose_xyyaw[:2].tolist()
             moved.transform.rotation = wheels.pose.pose.orientation
             self._tf.publish(TFMessage(transforms=[moved]))
-        truth = _odometry(frame.true_pose_xyyaw, stamp, config.ground_truth_frame, config.base_frame)
+        truth = _odometry(
+            frame.true_pose_xyyaw, stamp, config.framed(config.ground_truth_frame), config.framed(config.base_frame)
+        )
         truth.twist.twist.linear.x, truth.twist.twist.angular.z = frame.twist.tolist()
         self._truth.publish(truth)
         scanner = self._building.scanner
@@ -139,7 +146,7 @@ class Building2dNode(Node):
             range_min=scanner.range_min_m,
             range_max=scanner.range_max_m,
         )
-        scan.header.stamp, scan.header.frame_id = stamp, config.laser_frame
+        scan.header.stamp, scan.header.frame_id = stamp, config.framed(config.laser_frame)
         scan.ranges = array.array("f", frame.ranges_m.tobytes())
         self._scan.publish(scan)
         self._published += 1
@@ -148,8 +155,8 @@ class Building2dNode(Node):
 
     def _mounting(self) -> TransformStamped:
         scanner, config = self._building.scanner, self.config
-        mounted = TransformStamped(child_frame_id=config.laser_frame)
-        mounted.header.frame_id, mounted.header.stamp = config.base_frame, _time(config.stamp_ns(0.0))
+        mounted = TransformStamped(child_frame_id=config.framed(config.laser_frame))
+        mounted.header.frame_id, mounted.header.stamp = config.framed(config.base_frame), _time(config.stamp_ns(0.0))
         mounted.transform.translation.x, mounted.transform.translation.y = scanner.laser_x_m, scanner.laser_y_m
         z, w = yaw_quaternion_zw(math.radians(scanner.laser_yaw_deg))
         # Turned over its own x axis first: the product of a turn about z and half a turn about x.
@@ -173,7 +180,9 @@ def _odometry(pose_xyyaw: Floats, stamp: Time, frame: str, child: str) -> Odomet
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return run_simulator(Building2dNode, "building2d", args)
+    summary = (inspect.getdoc(Building2dNode) or "").partition("\n\n")[0]
+    text = usage("ngo_sim", "building2d", summary, *_SETTINGS)
+    return run_node("building2d", lambda: Building2dNode("building2d"), text, lambda node, ended: node.run(ended), args)
 
 
 if __name__ == "__main__":
