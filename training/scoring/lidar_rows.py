@@ -17,7 +17,7 @@ import numpy as np
 import ngo_estimator
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
-from ngo_estimator.online.online_trajectory import Trajectory
+from ngo_estimator.online.corrected_trajectory import Trajectory
 from ngo_estimator.online.scan_graph import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses
