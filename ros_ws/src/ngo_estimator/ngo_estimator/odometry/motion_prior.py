@@ -109,9 +109,7 @@ class MotionPrior:
         moves = not doubted and bool(step.any())
         total = np.diag(deviations**2)
         step_covariance = np.diag(step_deviations**2) if moves else None
-        return Prediction(
-            mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance
-        )
+        return Prediction(mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance)
 
     def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
         config = self.config

@@ -30,8 +30,8 @@ class ScanOdometryConfig:
     ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side,
     at most ``largest_window_m`` and ``largest_window_deg``. Where fewer than
     ``good_share`` of the points lie on lines, or where no wheels lead and the prediction may be ``wide_m`` wrong, a
-    ``wide`` search follows. Where fewer than ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that
-    is ``farthest_deviations`` from the prediction is no better than it.
+    ``wide`` search follows. Where fewer than ``least_share`` do, or ``least_points``, the prediction stands. A
+    registration of less than ``good_share`` that is ``farthest_deviations`` from the prediction is no better than it.
     """
 
     key_distance_m: float = 0.3
@@ -186,9 +186,7 @@ class ScanOdometry:
                 best = again
         return best, None if prediction.measured else place.doubt, True
 
-    def _best(
-        self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float
-    ) -> Registration:
+    def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float) -> Registration:
         """The registration, among those from all starts, that fits most points."""
         best = self._icp(scan, starts[0], prior, open_share)
         for start in starts[1:]:
