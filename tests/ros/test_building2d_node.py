@@ -53,9 +53,12 @@ def test_it_publishes_what_the_core_gives(probe: Probe) -> None:
     with NodeProcess("ngo_sim", "building2d", parameters) as node:
         probe.spin_until(lambda: not node.running, "the node's end")
         assert node.wait() == 0, node.log
+        (ready,) = (line for line in node.lines if "ready: " in line)
         for messages in (scans, wheels, truth, clock, tf):
             probe.spin_until(lambda messages=messages: len(messages) == FRAMES, "all messages")
         probe.spin_until(lambda: mounted, "the mounting")
+    assert "ready: /building2d, seed 5, as fast as the scans are taken, publishes /clock, /ground_truth, /scan" in ready
+    assert ready.endswith("/wheels; waits for 1 subscribers of the scan")
     world = Building2d(FloorPlanConfig(**PLAN), ScannerConfig(**SCANNER), WheelsConfig(**WHEELS))  # type: ignore[arg-type]
     world.reset(5)
     frames = [world.step() for _ in range(FRAMES)]

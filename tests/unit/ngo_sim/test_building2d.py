@@ -29,7 +29,7 @@ def drive() -> BuildingDrive:
 
 
 def test_the_same_seed_gives_the_same_drive_to_the_byte() -> None:
-    world = Building2d(PLAN)  # scanner and wheels are drawn, too
+    world = Building2d(PLAN)  # scanner and wheels are drawn as well
     first, other, again = (world.record(seed, 15.0) for seed in (2, 3, 2))
     assert first.scanner == again.scanner != other.scanner
     for name in ("stamps_s", "ranges_m", "wheel_stamps_s", "wheel_poses_xyyaw", "true_poses_xyyaw", "twists"):

@@ -25,18 +25,18 @@ class BuildingDriverConfig(Settings):
     """Who drives and how."""
 
     driver: str = setting(
-        "any", "Random rooms, the same rooms over and over, or one of the two by chance.", choices=DRIVERS
+        "any",
+        "Chooses the goals. wander: random rooms; patrol: a fixed tour of rooms; any: drawn from the seed.",
+        choices=DRIVERS,
     )
-    radius_m: float = setting(0.22, "Of the robot, m.", minimum=0.05, maximum=0.3)
+    radius_m: float = setting(0.22, "Radius of the robot, m.", minimum=0.05, maximum=0.3)
     speed_mps: float = setting(0.7, "Highest speed, m/s.", minimum=0.05, maximum=2.0)
     turn_rate_rps: float = setting(1.2, "Highest turn rate, rad/s.", minimum=0.1, maximum=3.0)
-    acceleration_mps2: float = setting(
-        0.7, "Highest change of speed, m/s^2; of the turn rate 4 rad/s^2.", minimum=0.1, maximum=3.0
-    )
+    acceleration_mps2: float = setting(0.7, "Highest acceleration, m/s^2.", minimum=0.1, maximum=3.0)
     stand: float = setting(
-        0.3, "Chance to stand for some seconds, now and then minutes, at a goal.", minimum=0.0, maximum=1.0
+        0.3, "Probability of a stop at a goal. Most stops last seconds, a few last minutes.", minimum=0.0, maximum=1.0
     )
-    spin: float = setting(0.25, "Chance to turn on the spot at a goal.", minimum=0.0, maximum=1.0)
+    spin: float = setting(0.25, "Probability of a turn on the spot at a goal.", minimum=0.0, maximum=1.0)
 
 
 class BuildingDriver:

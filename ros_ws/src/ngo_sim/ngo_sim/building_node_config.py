@@ -12,10 +12,10 @@ class BuildingNodeConfig(FramedSettings):
     """Settings of the node; building, scanner, wheels and driver have their own."""
 
     seed: int = setting(
-        0, "Building, people, doors, drive and noise are functions of this number.", minimum=0, maximum=2147483647
+        0, "Seed of everything random: building, people, doors, drive, noise.", minimum=0, maximum=2147483647
     )
     draw_robot: bool = setting(
-        False, "Whether scanner and wheels are drawn from the seed; their parameters then do not count."
+        False, "Whether scanner and wheels are drawn from the seed. Their own parameters then have no effect."
     )
     rate: float = setting(
         10.0,
@@ -24,31 +24,42 @@ class BuildingNodeConfig(FramedSettings):
         maximum=10000.0,
     )
     frames: int = setting(
-        0, "Scans to publish before the node ends with exit code 0; 0: endless.", minimum=0, maximum=2147483647
+        0, "Number of scans after which the node ends with exit code 0; 0: endless.", minimum=0, maximum=2147483647
     )
     wait_for_subscribers: int = setting(
-        0, "Subscribers that the scan must have before the first is published.", minimum=0, maximum=100
+        0, "Number of subscribers of the scan that the first scan waits for.", minimum=0, maximum=100
+    )
+    wait_for_flow_control: bool = setting(
+        False, "Whether the first scan waits until each of flow_control_topics has a publisher."
     )
     flow_control_topics: tuple[str, ...] = topics(
-        ("ngo/pose",), "Stamped answers; at rate 0 the node waits for the slowest."
+        ("ngo/pose",),
+        "Stamped topics of the nodes that process the scans. At rate 0 the simulator stays at most max_in_flight scans "
+        "ahead of the slowest one that has a publisher.",
     )
     max_in_flight: int = setting(
-        4, "Scans at rate 0 that the slowest flow control topic may be behind.", minimum=1, maximum=1000
+        4, "Number of scans that the slowest flow control topic may be behind at rate 0.", minimum=1, maximum=1000
     )
     stall_timeout_s: float = setting(
-        10.0, "Wall time at rate 0 without an answer until it goes on; 0: for ever.", minimum=0.0, maximum=3600.0
+        10.0,
+        "Wall time without a message on the flow control topics after which the simulator takes its scans for lost "
+        "and goes on, at rate 0; 0: never.",
+        minimum=0.0,
+        maximum=3600.0,
     )
     start_time_s: float = setting(1.0, "Stamp of the first scan in simulated time.", minimum=0.3, maximum=2000000000.0)
     publish_clock: bool = setting(False, "Whether /clock is published with the stamp of every scan.")
-    wheel_odometry_topic: str = topic("wheel_odom", "Topic of the wheel odometry.")
-    publish_tf: bool = setting(False, "Whether the wheel odometry goes on TF, too, from odom_frame to base_frame.")
+    wheel_odometry_topic: str = topic("wheel_odom", "Odometry of the wheels, with their errors.")
+    publish_tf: bool = setting(False, "Whether /tf has the wheel odometry, from odom_frame to base_frame.")
     record: str = setting(
-        "", "Recording of all topics: a new .mcap file, or a new folder for rosbag2's layout; empty: none."
+        "",
+        "File for a recording of everything that is published: a new .mcap file, or a new folder for the layout of "
+        "rosbag2; empty: no recording.",
     )
-    ground_truth_frame: str = frame("building", "Frame of the ground truth, which is not on TF.")
+    ground_truth_frame: str = frame("building", "Frame of the ground truth: origin at the corner of the floor plan.")
     odom_frame: str = frame("odom", "Frame of the wheel odometry.")
-    base_frame: str = frame("base_link", "Frame of the robot's middle.")
-    laser_frame: str = frame("laser", "Frame of the scan; /tf_static has its mounting.")
+    base_frame: str = frame("base_link", "Frame of the robot: its centre.")
+    laser_frame: str = frame("laser", "Frame of the scan. /tf_static has its mounting on base_frame.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

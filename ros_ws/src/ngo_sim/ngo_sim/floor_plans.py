@@ -37,18 +37,20 @@ _MARGIN_M = 2.0
 class FloorPlanConfig(Settings):
     """What kind of building is drawn."""
 
-    layout: str = setting("any", "Form of the corridors.", choices=("any", *LAYOUTS))
-    scale: float = setting(
-        1.0, "Factor on the length of the corridors; rooms keep their size.", minimum=0.3, maximum=3.0
+    layout: str = setting(
+        "any", "Shape of the network of corridors; any: drawn from the seed.", choices=("any", *LAYOUTS)
     )
-    aliased: bool = setting(False, "Whether rooms repeat, furniture included, along the corridors.")
+    scale: float = setting(
+        1.0, "Factor on the length of the corridors. Rooms keep their size.", minimum=0.3, maximum=3.0
+    )
+    aliased: bool = setting(False, "Whether rooms along the corridors look alike, furniture included.")
     glass: float = setting(
-        0.12, "Share of the rooms with a glass front; twice that share have windows.", minimum=0.0, maximum=0.5
+        0.12, "Share of the rooms with a glass front. Twice that share have windows.", minimum=0.0, maximum=0.5
     )
     clutter: float = setting(
-        1.0, "Factor on furniture in rooms and things in corridors; 0: empty rooms.", minimum=0.0, maximum=2.0
+        1.0, "Amount of furniture and of objects in corridors; 0: empty rooms, 1: usual.", minimum=0.0, maximum=2.0
     )
-    people: int = setting(3, "People who walk from room to room.", minimum=0, maximum=50)
+    people: int = setting(3, "Number of people who walk from room to room.", minimum=0, maximum=50)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,33 +25,44 @@ NO_RETURNS = ("inf", "max", "zero")
 class ScannerConfig(Settings):
     """A scanner and its mounting on the robot."""
 
-    rays: int = setting(360, "In one scan.", minimum=1, maximum=10000)
+    rays: int = setting(360, "Rays of one scan.", minimum=1, maximum=10000)
     field_of_view_deg: float = setting(
-        270.0, "From the first ray to the last; at 360 none is seen twice.", minimum=1.0, maximum=360.0
+        270.0,
+        "Angle from the first ray to the last. At 360 the last ray ends one increment before the first.",
+        minimum=1.0,
+        maximum=360.0,
     )
-    range_min_m: float = setting(0.05, "Nearer things give no return, m.", minimum=0.0, maximum=1.0)
-    range_max_m: float = setting(30.0, "Farther things give no return, m.", minimum=1.0, maximum=200.0)
-    scan_period_s: float = setting(0.1, "From one scan to the next, s.", minimum=0.005, maximum=1.0)
+    range_min_m: float = setting(0.05, "Shortest range that gives a return, m.", minimum=0.0, maximum=1.0)
+    range_max_m: float = setting(30.0, "Longest range that gives a return, m.", minimum=1.0, maximum=200.0)
+    scan_period_s: float = setting(0.1, "Time from one scan to the next, s.", minimum=0.005, maximum=1.0)
     sweep: float = setting(
-        0.0, "Share of the period in which the rays are cast, one after the other.", minimum=0.0, maximum=1.0
+        0.0, "Share of scan_period_s that one scan takes; 0: all rays at the same time.", minimum=0.0, maximum=1.0
     )
-    clockwise: bool = setting(False, "Whether the first ray is the leftmost, with a negative increment.")
-    noise_m: float = setting(0.01, "Standard deviation of a range, m.", minimum=0.0, maximum=1.0)
+    clockwise: bool = setting(False, "Whether a scan runs from left to right, with a negative increment.")
+    noise_m: float = setting(0.01, "Standard deviation of a range near the scanner, m.", minimum=0.0, maximum=1.0)
     noise_per_m: float = setting(
-        0.001, "What the standard deviation gains with each metre of range.", minimum=0.0, maximum=0.1
+        0.001, "Increase of the standard deviation per metre of range.", minimum=0.0, maximum=0.1
     )
-    dropout: float = setting(0.002, "Share of the rays without a return.", minimum=0.0, maximum=1.0)
-    glass_seen: float = setting(0.15, "Share of the rays that a pane reflects.", minimum=0.0, maximum=1.0)
-    glass_lost: float = setting(0.15, "Share of the rays that a pane takes; all others pass.", minimum=0.0, maximum=1.0)
-    resolution_m: float = setting(0.0, "Step in which ranges are given, m; 0: no rounding.", minimum=0.0, maximum=0.1)
+    dropout: float = setting(0.002, "Share of the rays that get no return at random.", minimum=0.0, maximum=1.0)
+    glass_seen: float = setting(0.15, "Share of the rays on glass that the pane reflects.", minimum=0.0, maximum=1.0)
+    glass_lost: float = setting(
+        0.15, "Share of the rays on glass that get no return. The rest passes through.", minimum=0.0, maximum=1.0
+    )
+    resolution_m: float = setting(0.0, "Step to which ranges are rounded, m; 0: no rounding.", minimum=0.0, maximum=0.1)
     no_return: str = setting(
-        "inf", "Range of a ray without a return: infinity, 0.1 m above range_max_m, or 0.", choices=NO_RETURNS
+        "inf", "Range of a ray without a return. inf: infinity; max: range_max_m + 0.1 m; zero: 0.", choices=NO_RETURNS
     )
-    increment_error: float = setting(0.0, "By which share the stated increment is wrong.", minimum=-0.05, maximum=0.05)
-    laser_x_m: float = setting(0.0, "Of the scanner, forward of the robot's middle, m.", minimum=-0.2, maximum=0.2)
-    laser_y_m: float = setting(0.0, "Of the scanner, left of the robot's middle, m.", minimum=-0.1, maximum=0.1)
-    laser_yaw_deg: float = setting(0.0, "By which the scanner is turned to the left.", minimum=-180.0, maximum=180.0)
-    upside_down: bool = setting(False, "Whether the scanner hangs: its left is the robot's right.")
+    increment_error: float = setting(
+        0.0, "Relative error of the published angle increment.", minimum=-0.05, maximum=0.05
+    )
+    laser_x_m: float = setting(
+        0.0, "Position of the scanner forward of the robot's centre, m.", minimum=-0.2, maximum=0.2
+    )
+    laser_y_m: float = setting(0.0, "Position of the scanner left of the robot's centre, m.", minimum=-0.1, maximum=0.1)
+    laser_yaw_deg: float = setting(
+        0.0, "Direction of the scanner, counter-clockwise from straight ahead, degrees.", minimum=-180.0, maximum=180.0
+    )
+    upside_down: bool = setting(False, "Whether the scanner is mounted upside down.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

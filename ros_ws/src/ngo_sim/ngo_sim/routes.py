@@ -67,7 +67,7 @@ class RouteMap:
         start, goal = (self._nearest(np.asarray(point, dtype=np.float64)) for point in (start_xy, goal_xy))
         cells = _a_star(self.clearance_m, self.area, start, goal)
         if not len(cells):
-            raise ValueError(f"no way joins {start_xy} and {goal_xy}")
+            raise ValueError(f"no way joins {start_xy!r} and {goal_xy!r}")
         points = (cells[:, ::-1].astype(np.float64) + 0.5) * CELL_M
         for window in (15, 9, 5, 3):
             smooth = np.asarray(uniform_filter1d(points, window, axis=0, mode="nearest"))

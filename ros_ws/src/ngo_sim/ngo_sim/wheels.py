@@ -22,28 +22,40 @@ class WheelsConfig(Settings):
     """Errors of the wheel odometry."""
 
     track_m: float = setting(0.4, "Distance between the wheels, m.", minimum=0.05, maximum=2.0)
-    left_bias: float = setting(0.0, "By which share the left wheel counts too much.", minimum=-0.2, maximum=0.2)
-    right_bias: float = setting(0.0, "By which share the right wheel counts too much.", minimum=-0.2, maximum=0.2)
+    left_bias: float = setting(0.0, "Share by which the left wheel counts too much.", minimum=-0.2, maximum=0.2)
+    right_bias: float = setting(0.0, "Share by which the right wheel counts too much.", minimum=-0.2, maximum=0.2)
     wheel_noise: float = setting(
-        0.01, "Standard deviation of a wheel's way after 1 m, growing with its root, m.", minimum=0.0, maximum=1.0
+        0.01,
+        "Standard deviation of a wheel's distance after 1 m, m. It grows with the root of the distance.",
+        minimum=0.0,
+        maximum=1.0,
     )
     slips_per_km: float = setting(
-        0.0, "Bursts of 0.3 to 1.5 s in which one wheel miscounts by up to 60 %.", minimum=0.0, maximum=10000.0
+        0.0,
+        "Slips of one wheel per km. A slip lasts 0.3 to 1.5 s and miscounts by up to 60 %.",
+        minimum=0.0,
+        maximum=10000.0,
     )
     freezes_per_hour: float = setting(
-        0.0, "Times that the odometry stands still for about a second, then jumps.", minimum=0.0, maximum=3600.0
+        0.0,
+        "Freezes of the odometry per hour. A freeze lasts about 1 s; then the pose catches up.",
+        minimum=0.0,
+        maximum=3600.0,
     )
     jumps_per_hour: float = setting(
-        0.0, "Times that the odometry leaps by jump_m without any motion.", minimum=0.0, maximum=3600.0
+        0.0, "Jumps of the odometry per hour, without any motion of the robot.", minimum=0.0, maximum=3600.0
     )
     jump_m: float = setting(
         0.3,
-        "Standard deviation of such a leap along x and y, m; 0.3 rad a metre of it in yaw.",
+        "Standard deviation of a jump in x and in y, m. In yaw it is 0.3 rad per metre of that.",
         minimum=0.0,
         maximum=2.0,
     )
     lag_s: float = setting(
-        0.0, "By which scans are older than their stamps, against the odometry, s.", minimum=-0.2, maximum=0.2
+        0.0,
+        "Time by which the stamps of the odometry are earlier than those of the scans, s.",
+        minimum=-0.2,
+        maximum=0.2,
     )
 
 

@@ -81,7 +81,7 @@ class Building2dNode(Node):
         return live.values
 
     def destroy_node(self) -> None:
-        """End the recording, too."""
+        """End the recording."""
         self.outputs.close()
         super().destroy_node()
 
@@ -89,6 +89,7 @@ class Building2dNode(Node):
         """Publish scans until there are enough and all are taken, or until ``ended`` says so."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
+        self.get_logger().info(self._ready_line())
         while not ended():
             now_s = time.monotonic()
             if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
@@ -105,11 +106,22 @@ class Building2dNode(Node):
             self.outputs.flush_if_due()
             executor.spin_once(timeout_sec=idle_s)
 
+    def _ready_line(self) -> str:
+        """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""
+        config, topics = self.config, ", ".join(sorted(self.outputs.topic_names))
+        pace = f"{config.rate:g} scans a second" if config.rate else "as fast as the scans are taken"
+        subscribers = f"; waits for {config.wait_for_subscribers} subscribers of the scan"
+        waits = subscribers if config.wait_for_subscribers else ""
+        return f"ready: {self.get_fully_qualified_name()}, seed {config.seed}, {pace}, publishes {topics}{waits}"
+
     def _idle_s(self, now_s: float) -> float:
-        """How long nothing is to be done before the next scan, 0 where it is due."""
+        """Time until the next scan, 0 if it is due."""
         config = self.config
         if self._published == 0:
-            return _IDLE_S if self._scan.publisher.get_subscription_count() < config.wait_for_subscribers else 0.0
+            awaited = self._scan.publisher.get_subscription_count() < config.wait_for_subscribers or (
+                config.wait_for_flow_control and not self._consumers.complete()
+            )
+            return _IDLE_S if awaited else 0.0
         if config.rate > 0:
             return min(_IDLE_S, self._pacer.remaining_s(now_s))
         return 0.0 if self._consumers.may_publish(now_s, config.stall_timeout_s) else _IDLE_S
