@@ -139,7 +139,8 @@ def resident_mb() -> float:
 
 def stored_path_mb(core: OnlineTrajectory) -> float:
     """What of the trajectory has to be kept for every frame."""
-    rows = [value for part in (core, core._graph) for value in vars(part).values() if isinstance(value, GrowingRows)]
+    parts = (core, core._log, core._graph)
+    rows = [value for part in parts for value in vars(part).values() if isinstance(value, GrowingRows)]
     return sum(each.values.nbytes for each in rows) / 2**20
 
 

@@ -126,19 +126,30 @@ def measure(world_name: str, args: Arguments) -> Measurement:
     finally:
         world.close()
     steps = args.steps * args.repeats
-    return Measurement(world=world_name, steps=steps, cpu_steps_per_s=steps / cpu_total_s,
-                       wall_steps_per_s=args.steps / min(walls_s), reset_ms=1e3 * min(resets_s),
-                       driver_us=1e6 * driver_s / steps, metres_per_step=metres / steps,
-                       bar_steps_per_s=BARS_STEPS_PER_S[world_name])
+    return Measurement(
+        world=world_name,
+        steps=steps,
+        cpu_steps_per_s=steps / cpu_total_s,
+        wall_steps_per_s=args.steps / min(walls_s),
+        reset_ms=1e3 * min(resets_s),
+        driver_us=1e6 * driver_s / steps,
+        metres_per_step=metres / steps,
+        bar_steps_per_s=BARS_STEPS_PER_S[world_name],
+    )
 
 
 def table(measurements: list[Measurement]) -> str:
     """One line a world."""
-    lines = [f"{'world':8}{'steps':>8}{'cpu steps/s':>13}{'wall steps/s':>14}{'bar':>8}{'cpu / bar':>11}"
-             f"{'driver us':>11}{'reset ms':>10}{'m a step':>10}"]
-    lines += [f"{m.world:8}{m.steps:8d}{m.cpu_steps_per_s:13,.0f}{m.wall_steps_per_s:14,.0f}"
-              f"{m.bar_steps_per_s:8,d}{m.ratio:11.2f}{m.driver_us:11.1f}{m.reset_ms:10.1f}"
-              f"{m.metres_per_step:10.3f}" for m in measurements]
+    lines = [
+        f"{'world':8}{'steps':>8}{'cpu steps/s':>13}{'wall steps/s':>14}{'bar':>8}{'cpu / bar':>11}"
+        f"{'driver us':>11}{'reset ms':>10}{'m a step':>10}"
+    ]
+    lines += [
+        f"{m.world:8}{m.steps:8d}{m.cpu_steps_per_s:13,.0f}{m.wall_steps_per_s:14,.0f}"
+        f"{m.bar_steps_per_s:8,d}{m.ratio:11.2f}{m.driver_us:11.1f}{m.reset_ms:10.1f}"
+        f"{m.metres_per_step:10.3f}"
+        for m in measurements
+    ]
     return "\n".join(lines)
 
 

@@ -26,6 +26,7 @@ ALL_TOPICS = {
     "image": "sensor_msgs/msg/Image",
 }
 
+
 class StampTimes:
     """Remembers for each header stamp of a topic when its message was published and received: a listener."""
 

@@ -1,4 +1,4 @@
-"""Parameters, topics and services of the four nodes, as they declare them and as docs/reference lists them.
+"""Parameters, topics and services of the five nodes, as they declare them and as docs/reference lists them.
 
 python -m tests.ros.readme_tables      # writes the nodes' parameters into docs/reference/parameters.md
 """
@@ -21,7 +21,13 @@ from .processes import NodeProcess, Probe
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
 PARAMETERS = REFERENCE / "parameters.md"
 TOPICS_AND_SERVICES = REFERENCE / "topics_and_services.md"
-NODES = {"maze2d": "ngo_sim", "maze3d": "ngo_sim", "local_node": "ngo_estimator", "ngo_node": "ngo_estimator"}
+NODES = {
+    "maze2d": "ngo_sim",
+    "maze3d": "ngo_sim",
+    "building2d": "ngo_sim",
+    "local_node": "ngo_estimator",
+    "ngo_node": "ngo_estimator",
+}
 BEGIN = "<!-- Written by `python -m tests.ros.readme_tables`; a test compares it with the nodes. -->\n"
 END = "<!-- End of the parameters. -->\n"
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
@@ -88,7 +94,7 @@ class NodeFacts:
 
 @contextmanager
 def running_nodes() -> Iterator[dict[str, NodeFacts]]:
-    """All four nodes, in one graph."""
+    """All five nodes, in one graph."""
     probe = Probe()
     facts: dict[str, NodeFacts] = {}
     processes: list[NodeProcess] = []
@@ -98,11 +104,12 @@ def running_nodes() -> Iterator[dict[str, NodeFacts]]:
             facts[name] = NodeFacts(probe, name)
 
         def complete() -> bool:
-            """The simulators are when they listen to the answers of both estimators."""
+            """The mazes listen to the answers of both estimators, the building to those of ngo_node."""
             for process in processes:
                 assert process.running, process.log
-            estimators = all("ready: " in process.log for process in processes[2:])
-            return estimators and all(probe.node.count_subscribers(topic) == 2 for topic in ("/odom", "/ngo/pose"))
+            ready = all("ready: " in process.log for process in processes)
+            listeners = {"/odom": 2, "/ngo/pose": 3}
+            return ready and all(probe.node.count_subscribers(topic) == count for topic, count in listeners.items())
 
         probe.spin_until(complete, "all nodes")
         yield facts

@@ -353,9 +353,7 @@ def parameter_arguments(parameters: dict[str, Any]) -> tuple[str, ...]:
     return tuple(word for name, value in parameters.items() for word in ("-p", f"{name}:={value}"))
 
 
-@pytest.mark.parametrize(
-    ("executable", "flag"), [("maze3d", "--help"), ("local_node", "-h"), ("ngo_node", "--help")]
-)
+@pytest.mark.parametrize(("executable", "flag"), [("maze3d", "--help"), ("local_node", "-h"), ("ngo_node", "--help")])
 def test_help_lists_the_parameters_and_starts_no_node(executable: str, flag: str) -> None:
     package = "ngo_sim" if executable.startswith("maze") else "ngo_estimator"
     with NodeProcess(package, executable, {}, ("--", flag)) as node:

@@ -1,20 +1,32 @@
 """The launch files and the parameters that they load; the real launch has no wheels."""
 
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
+from ngo_common.settings import Settings
+from ngo_estimator.nodes.settings import LocalNodeSettings, NgoNodeSettings
+from ngo_sim.building_drivers import BuildingDriverConfig
+from ngo_sim.building_node_config import BuildingNodeConfig
+from ngo_sim.floor_plans import FloorPlanConfig
+from ngo_sim.lidar import ScannerConfig
 from ngo_sim.maze2d import Maze2DConfig
 from ngo_sim.maze3d import Maze3DConfig
 from ngo_sim.simulator_config import SimulatorConfig
+from ngo_sim.wheels import WheelsConfig
 from tests.unit.launch_stand_in import SRC, FindPackageShare, Launched, PathJoinSubstitution, Shutdown, install
 
 GRAPH, MAZE = SRC / "ngo_bringup/launch/graph.launch.py", SRC / "ngo_bringup/launch/maze.launch.py"
 # The names by which the files were documented first.
 FORWARDED = {GRAPH: SRC / "ngo_estimator/launch/graph.launch.py", MAZE: SRC / "ngo_sim/launch/maze.launch.py"}
 ARGUMENTS = ["world", "parameters", "namespace", "seed", "record", "use_sim_time"]
+SETTINGS: dict[str, tuple[type[Settings], ...]] = {
+    "maze2d": (SimulatorConfig, Maze2DConfig),
+    "maze3d": (SimulatorConfig, Maze3DConfig),
+    "building2d": (BuildingNodeConfig, FloorPlanConfig, BuildingDriverConfig, ScannerConfig, WheelsConfig),
+}
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +39,7 @@ def test_every_launch_file_is_tested() -> None:
 
 
 @pytest.mark.parametrize("path", [*FORWARDED, *FORWARDED.values()], ids=lambda path: f"{path.parts[-3]}-{path.stem}")
-@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
+@pytest.mark.parametrize("world", SETTINGS)
 def test_nodes_start_with_the_shipped_parameters(path: Path, world: str) -> None:
     launched = Launched(path, world=world, namespace="red")
     assert launched.arguments == ARGUMENTS
@@ -46,12 +58,13 @@ def test_nodes_start_with_the_shipped_parameters(path: Path, world: str) -> None
         assert isinstance(launched.nodes[-1].on_exit[0], Shutdown), "when the simulator ends, everything ends"
 
 
+@pytest.mark.parametrize("world", SETTINGS)
 @pytest.mark.parametrize("path", FORWARDED, ids=lambda path: path.stem)
-def test_arguments_become_parameters_of_the_nodes_that_have_them(path: Path) -> None:
-    launched = Launched(path, seed="7", record="drive.mcap", use_sim_time="true", parameters="/own.yaml")
-    *estimators, maze = launched.nodes
-    assert maze.parameters == {"seed": 7, "record": "drive.mcap", "publish_clock": True}
-    SimulatorConfig(**maze.parameters)
+def test_arguments_become_parameters_of_the_nodes_that_have_them(path: Path, world: str) -> None:
+    launched = Launched(path, world=world, seed="7", record="drive.mcap", use_sim_time="true", parameters="/own.yaml")
+    *estimators, simulator = launched.nodes
+    assert simulator.parameters == {"seed": 7, "record": "drive.mcap", "publish_clock": True}
+    SETTINGS[world][0](**simulator.parameters)
     assert all(node.parameters == {"use_sim_time": True} for node in estimators)
     assert {launched.context.text(parts) for node in launched.nodes for parts in node.files} == {"/own.yaml"}
 
@@ -67,13 +80,22 @@ def test_the_stand_in_refuses_a_list_within_a_list_as_launch_3_4_0_does() -> Non
         PathJoinSubstitution([FindPackageShare("ngo_sim"), "config", ["graph_", ".yaml"]])  # type: ignore[list-item]
 
 
-@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
+@pytest.mark.parametrize("world", SETTINGS)
 @pytest.mark.parametrize("name", ["ngo_sim/config/{}.yaml", "ngo_bringup/config/graph_{}.yaml"])
 def test_shipped_parameters_are_those_of_the_simulator(world: str, name: str) -> None:
     values = yaml.safe_load((SRC / name.format(world)).read_text())[f"/**/{world}"]["ros__parameters"]
-    world_type = {"maze2d": Maze2DConfig, "maze3d": Maze3DConfig}[world]
-    split: tuple[dict[str, Any], dict[str, Any]] = ({}, {})
-    for key, value in values.items():
-        split[key in world_type.__dataclass_fields__][key] = value
-    SimulatorConfig(**split[0])
-    world_type(**split[1])
+    for settings_type in SETTINGS[world]:
+        own = {field.name for field in fields(settings_type)}
+        settings_type(**{key: values.pop(key) for key in own & values.keys()})
+    assert values == {}, "no part has these"
+
+
+@pytest.mark.parametrize("world", SETTINGS)
+def test_shipped_parameters_are_those_of_the_estimators(world: str) -> None:
+    values = yaml.safe_load((SRC / f"ngo_bringup/config/graph_{world}.yaml").read_text())
+    local, ngo = (values[f"/**/{name}"]["ros__parameters"] for name in ("local_node", "ngo_node"))
+    settings = LocalNodeSettings(**local)
+    assert settings.world == NgoNodeSettings(**ngo).world == ("scan" if world == "building2d" else world)
+    if world == "building2d":
+        assert settings.robot_odometry == "topic"
+        assert settings.robot_odometry_topic == BuildingNodeConfig().wheel_odometry_topic

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import config_from_dict
+from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.observations import observation
 from ngo_recordings.errors import RecordingError

@@ -8,11 +8,7 @@ from ngo_sim.drivers import Action, PathDriver, RandomDriver
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.mazes import Maze, kruskal_maze
 
-PICTURE = ("#######",
-           "#     #",
-           "##### #",
-           "#     #",
-           "#######")
+PICTURE = ("#######", "#     #", "##### #", "#     #", "#######")
 HOOK = Maze(np.array([[block == "#" for block in row] for row in PICTURE]))
 
 
@@ -41,8 +37,9 @@ class HeavyRobot:
         self.pose_xyyaw = np.array((*position, math.remainder(yaw + self._turn_rate, math.tau)))
 
 
-def drive(world: str, seed: int, steps: int, goals: str = "corners",
-          random_action_probability: float = 0.05) -> tuple[PathDriver, np.ndarray, np.ndarray]:
+def drive(
+    world: str, seed: int, steps: int, goals: str = "corners", random_action_probability: float = 0.05
+) -> tuple[PathDriver, np.ndarray, np.ndarray]:
     """The driver, the poses (steps + 1, 3) and the actions (steps,) of one drive."""
     rng = np.random.default_rng(seed)
     if world == "2d":
@@ -116,8 +113,8 @@ def test_corners_come_in_rounds_of_four_and_never_twice_in_a_row() -> None:
     goals = driver.goals_reached
     assert len(goals) > 100
     assert all(first != second for first, second in zip(goals[:-1], goals[1:], strict=True))
-    assert all(set(goals[start:start + 4]) == set(centers) for start in range(0, len(goals) - 3, 4))
-    assert len({tuple(goals[start:start + 4]) for start in range(0, len(goals) - 3, 4)}) > 5
+    assert all(set(goals[start : start + 4]) == set(centers) for start in range(0, len(goals) - 3, 4))
+    assert len({tuple(goals[start : start + 4]) for start in range(0, len(goals) - 3, 4)}) > 5
 
 
 def test_random_goals_are_all_over_the_maze() -> None:
@@ -184,8 +181,12 @@ def test_unknown_names_and_values_are_refused() -> None:
         make_driver("walls", HOOK, rng)
     with pytest.raises(ValueError, match="goals is 'walls'; it must be 'corners' or 'random'"):
         PathDriver(HOOK, rng, "walls")
-    for name, value in (("random_action_probability", 1.5), ("lookahead_blocks", 2.0),
-                        ("turn_coast_steps", -1.0), ("travel_coast_steps", math.nan),
-                        ("turn_per_action_rad", 0.0)):
+    for name, value in (
+        ("random_action_probability", 1.5),
+        ("lookahead_blocks", 2.0),
+        ("turn_coast_steps", -1.0),
+        ("travel_coast_steps", math.nan),
+        ("turn_per_action_rad", 0.0),
+    ):
         with pytest.raises(ValueError, match=f"{name} is {value!r}; it must be from "):
             PathDriver(HOOK, rng, **{name: value})

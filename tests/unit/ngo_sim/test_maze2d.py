@@ -15,17 +15,21 @@ from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.mazes import Maze
 
 # Two straight corridors, free for x in [1, 12] and y in [1, 2] or [3, 4], joined at x in [3, 4].
-CORRIDOR = Maze(np.array([[block == "#" for block in row] for row in ("#############",
-                                                                      "#           #",
-                                                                      "### #########",
-                                                                      "#           #",
-                                                                      "#############")]))
+CORRIDOR = Maze(
+    np.array(
+        [
+            [block == "#" for block in row]
+            for row in ("#############", "#           #", "### #########", "#           #", "#############")
+        ]
+    )
+)
 CORRIDOR_CONFIG = Maze2DConfig(rows=2, cols=6, actuation_noise=0.0)
 FORWARD, LEFT, RIGHT = Action.FORWARD, Action.TURN_LEFT, Action.TURN_RIGHT
 
 
-def in_corridor(x: float, y: float, yaw_deg: float,
-                config: Maze2DConfig = CORRIDOR_CONFIG) -> tuple[Maze2D, np.ndarray, dict[str, Any]]:
+def in_corridor(
+    x: float, y: float, yaw_deg: float, config: Maze2DConfig = CORRIDOR_CONFIG
+) -> tuple[Maze2D, np.ndarray, dict[str, Any]]:
     env = Maze2D(config)
     options = {"maze": CORRIDOR, "pose_xyyaw": (x, y, math.radians(yaw_deg))}
     return env, *env.reset(seed=0, options=options)
@@ -155,11 +159,17 @@ def test_the_body_turns_on_in_contact() -> None:
     assert math.degrees(info["pose_xyyaw"][2] - before) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("config", [
-    Maze2DConfig(), Maze2DConfig(actuation_noise=1.0), Maze2DConfig(thrust_m=0.3, extra_openings=10),
-    Maze2DConfig(block_m=3.0, radius_m=0.5, thrust_m=0.2), Maze2DConfig(radius_m=0.45),
-    Maze2DConfig(radius_m=0.05),
-])
+@pytest.mark.parametrize(
+    "config",
+    [
+        Maze2DConfig(),
+        Maze2DConfig(actuation_noise=1.0),
+        Maze2DConfig(thrust_m=0.3, extra_openings=10),
+        Maze2DConfig(block_m=3.0, radius_m=0.5, thrust_m=0.2),
+        Maze2DConfig(radius_m=0.45),
+        Maze2DConfig(radius_m=0.05),
+    ],
+)
 def test_the_body_never_enters_a_wall(config: Maze2DConfig) -> None:
     env = Maze2D(config)
     rng = np.random.default_rng(0)
@@ -199,8 +209,13 @@ def test_a_seed_gives_the_same_bytes_whatever_came_before() -> None:
     first, other, again = (digest(seed, env) for seed in (3, 4, 3))
     assert first == again == digest(3, Maze2D())
     assert first != other
-    result = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True,
-                            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    result = subprocess.run(
+        [sys.executable, __file__],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
     assert result.stdout.strip() == first
 
 
@@ -257,17 +272,27 @@ def test_the_picture_shows_walls_and_robot_with_y_up() -> None:
     assert Maze2D(CORRIDOR_CONFIG).render() is None
 
 
-@pytest.mark.parametrize(("field", "value", "allowed"), [
-    ("rows", 1, "an integer from 2 to 100"),
-    ("rows", 1_000_000, "an integer from 2 to 100"), ("cols", 2.5, "an integer from 2 to 100"),
-    ("extra_openings", 37, "an integer from 0 to 36"), ("block_m", 0.0, "a number from 0.01 to 100"),
-    ("actuation_noise", -0.1, "a number from 0 to 1"), ("actuation_noise", math.nan, "a number from 0 to 1"),
-    ("period_s", 0.0, "a number from 0.001 to 10"), ("thrust_m", -1.0, "a number from 0 to 1"),
-    ("travel_decay", 1.0, "a number from 0 to 0.99"), ("turn_deg", "6", "a number from 0 to 90"),
-    ("turn_decay", -0.5, "a number from 0 to 0.99"), ("radius_m", 0.5, "a number from 0.001 to 0.45"),
-    ("rays", 1, "an integer from 2 to 10000"), ("rays", True, "an integer from 2 to 10000"),
-    ("field_of_view_deg", 361.0, "a number from 1 to 360"),
-])
+@pytest.mark.parametrize(
+    ("field", "value", "allowed"),
+    [
+        ("rows", 1, "an integer from 2 to 100"),
+        ("rows", 1_000_000, "an integer from 2 to 100"),
+        ("cols", 2.5, "an integer from 2 to 100"),
+        ("extra_openings", 37, "an integer from 0 to 36"),
+        ("block_m", 0.0, "a number from 0.01 to 100"),
+        ("actuation_noise", -0.1, "a number from 0 to 1"),
+        ("actuation_noise", math.nan, "a number from 0 to 1"),
+        ("period_s", 0.0, "a number from 0.001 to 10"),
+        ("thrust_m", -1.0, "a number from 0 to 1"),
+        ("travel_decay", 1.0, "a number from 0 to 0.99"),
+        ("turn_deg", "6", "a number from 0 to 90"),
+        ("turn_decay", -0.5, "a number from 0 to 0.99"),
+        ("radius_m", 0.5, "a number from 0.001 to 0.45"),
+        ("rays", 1, "an integer from 2 to 10000"),
+        ("rays", True, "an integer from 2 to 10000"),
+        ("field_of_view_deg", 361.0, "a number from 1 to 360"),
+    ],
+)
 def test_a_bad_setting_is_named_with_what_is_allowed(field: str, value: Any, allowed: str) -> None:
     with pytest.raises(ValueError) as error:
         Maze2DConfig(**{field: value})

@@ -19,11 +19,7 @@ def maze_of(*rows_from_above: str, block_m: float = 1.0) -> Maze:
     return Maze(np.array([[block == "#" for block in row] for row in reversed(rows_from_above)]), block_m)
 
 
-HOOK = ("#######",
-        "#     #",
-        "##### #",
-        "#     #",
-        "#######")
+HOOK = ("#######", "#     #", "##### #", "#     #", "#######")
 
 
 @pytest.mark.parametrize("make", ALGORITHMS)
@@ -129,8 +125,16 @@ def test_a_path_needs_free_ends_that_are_joined() -> None:
 
 def test_wall_segments_of_a_hook() -> None:
     # Outer walls inside, then both faces of the bar in the middle and its end.
-    expected = {((1, 1), (6, 1)), ((1, 4), (6, 4)), ((1, 2), (5, 2)), ((1, 3), (5, 3)),
-                ((1, 1), (1, 2)), ((1, 3), (1, 4)), ((6, 1), (6, 4)), ((5, 2), (5, 3))}
+    expected = {
+        ((1, 1), (6, 1)),
+        ((1, 4), (6, 4)),
+        ((1, 2), (5, 2)),
+        ((1, 3), (5, 3)),
+        ((1, 1), (1, 2)),
+        ((1, 3), (1, 4)),
+        ((6, 1), (6, 4)),
+        ((5, 2), (5, 3)),
+    }
     segments = maze_of(*HOOK, block_m=2.0).wall_segments() / 2.0
     assert {tuple(sorted(tuple(map(int, end)) for end in segment)) for segment in segments} == expected
     assert len(segments) == len(expected)
@@ -139,8 +143,11 @@ def test_wall_segments_of_a_hook() -> None:
 def test_wall_segments_have_every_face_once() -> None:
     for seed in range(5):
         maze = prim_maze(5, 7, np.random.default_rng(seed), extra_openings=4)
-        faces = sum(bool(maze.walls[row + down, col + right])
-                    for row, col in maze.free_blocks() for down, right in ((1, 0), (-1, 0), (0, 1), (0, -1)))
+        faces = sum(
+            bool(maze.walls[row + down, col + right])
+            for row, col in maze.free_blocks()
+            for down, right in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        )
         lengths = np.linalg.norm(np.diff(maze.wall_segments(), axis=1)[:, 0], axis=1)
         assert lengths.sum() == faces
 
@@ -151,14 +158,17 @@ def test_a_maze_cannot_be_changed() -> None:
         maze.walls[1, 1] = True
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    ((1, 7), "rows is 1; it must be an integer from 2 to 100"),
-    ((7, 2.5), "cols is 2.5; it must be an integer from 2 to 100"),
-    ((7, True), "cols is True; "),
-    ((3, 4, 7), "extra_openings is 7; it must be an integer from 0 to 6 in a maze of 3 x 4 cells"),
-    ((3, 4, -1), "extra_openings is -1; "),
-    ((3, 4, 0, 0.0), "block_m is 0.0; it must be a finite number above 0"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1, 7), "rows is 1; it must be an integer from 2 to 100"),
+        ((7, 2.5), "cols is 2.5; it must be an integer from 2 to 100"),
+        ((7, True), "cols is True; "),
+        ((3, 4, 7), "extra_openings is 7; it must be an integer from 0 to 6 in a maze of 3 x 4 cells"),
+        ((3, 4, -1), "extra_openings is -1; "),
+        ((3, 4, 0, 0.0), "block_m is 0.0; it must be a finite number above 0"),
+    ],
+)
 @pytest.mark.parametrize("make", ALGORITHMS)
 def test_impossible_mazes_are_refused(make: MakeMaze, arguments: tuple[float, ...], message: str) -> None:
     rows, cols, *rest = arguments

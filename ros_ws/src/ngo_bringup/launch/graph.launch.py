@@ -2,8 +2,8 @@
 
     ros2 launch ngo_bringup graph.launch.py world:=maze3d seed:=7 record:=drive.mcap
 
-The simulator begins when local_node listens to its images and ngo_node is up. When it ends, everything ends. In a
-namespace all topics, TF among them, are the robot's own: start it again with another one for a second robot.
+The simulator begins when local_node listens to its images or scans and ngo_node is up. When it ends, everything ends.
+In a namespace all topics, TF among them, are the robot's own: start it again with another one for a second robot.
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -19,9 +19,9 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     """The three nodes; arguments that are empty leave the file of parameters as it is."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ("world", "seed", "record", "use_sim_time")}
     world, simulated = given["world"], TRUTH_VALUES[given["use_sim_time"]]
-    maze = {"seed": int(given["seed"])} if given["seed"] else {}
-    maze |= {"record": given["record"]} if given["record"] else {}
-    maze |= {"publish_clock": True} if simulated else {}
+    simulator = {"seed": int(given["seed"])} if given["seed"] else {}
+    simulator |= {"record": given["record"]} if given["record"] else {}
+    simulator |= {"publish_clock": True} if simulated else {}
     estimator = {"use_sim_time": True} if simulated else {}
 
     def node(package: str, executable: str, own: dict, **options: object) -> Node:
@@ -39,7 +39,7 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     return [
         node("ngo_estimator", "local_node", estimator),
         node("ngo_estimator", "ngo_node", estimator),
-        node("ngo_sim", world, maze, on_exit=[Shutdown()]),
+        node("ngo_sim", world, simulator, on_exit=[Shutdown()]),
     ]
 
 
@@ -47,7 +47,9 @@ def generate_launch_description() -> LaunchDescription:
     # PathJoinSubstitution takes no nested lists before launch 3.4.5: texts side by side are concatenated instead.
     shipped = [FindPackageShare("ngo_bringup"), "/config/graph_", LaunchConfiguration("world"), ".yaml"]
     arguments = [
-        DeclareLaunchArgument("world", default_value="maze3d", choices=["maze2d", "maze3d"], description="simulator"),
+        DeclareLaunchArgument(
+            "world", default_value="maze3d", choices=["maze2d", "maze3d", "building2d"], description="simulator"
+        ),
         DeclareLaunchArgument("parameters", default_value=shipped, description="YAML with parameters of all nodes"),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of all nodes; empty: none"),
         DeclareLaunchArgument("seed", default_value="", description="seed of the simulator; empty: of parameters"),

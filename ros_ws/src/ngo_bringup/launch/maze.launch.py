@@ -34,7 +34,9 @@ def generate_launch_description() -> LaunchDescription:
     # PathJoinSubstitution takes no nested lists before launch 3.4.5: texts side by side are concatenated instead.
     shipped = [FindPackageShare("ngo_sim"), "/config/", LaunchConfiguration("world"), ".yaml"]
     arguments = [
-        DeclareLaunchArgument("world", default_value="maze3d", choices=["maze2d", "maze3d"], description="simulator"),
+        DeclareLaunchArgument(
+            "world", default_value="maze3d", choices=["maze2d", "maze3d", "building2d"], description="simulator"
+        ),
         DeclareLaunchArgument("parameters", default_value=shipped, description="YAML with the simulator's parameters"),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the node; empty: none"),
         DeclareLaunchArgument("seed", default_value="", description="seed of the simulator; empty: of parameters"),

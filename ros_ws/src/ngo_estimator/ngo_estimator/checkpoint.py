@@ -3,10 +3,7 @@
 import dataclasses
 import hashlib
 import json
-import math
 import os
-import types
-import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,11 +12,13 @@ import safetensors
 from safetensors.torch import load, save
 from torch import nn
 
+from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.networks.step_deviation import StepDeviation, StepDeviationConfig
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 
 FORMAT = 1
@@ -29,25 +28,15 @@ LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "odometry_smoother",
     "neural_graph_optimizer",
 )
+STEP_DEVIATION = "step_deviation"
 RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
 """Settings of earlier versions, by the kind of network, with the only value that still means the same."""
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
-    "scan": ImageFormat(
-        height=1,
-        width=289,
-        channels=1,
-        dtype="float32",
-        field_of_view_deg=360.0,
-        depth_gain_m=1.5,
-        depth_softening_m=0.75,
-    ),
 }
-ACTION_WORLDS = ("maze2d", "maze3d")
 
 Network = TypeVar("Network", bound=nn.Module)
-Config = TypeVar("Config")
 
 
 class CheckpointError(ValueError):
@@ -68,46 +57,6 @@ class PlaceNetworks(nn.Module):
         changed = PlaceNetworks(dataclasses.replace(self.config, registration=None))
         changed.load_state_dict({k: v for k, v in self.state_dict().items() if not k.startswith("encoder.ranges.")})
         return changed
-
-
-def config_from_dict(kind: type[Config], values: Any) -> Config:
-    """Build a (nested) configuration dataclass from JSON values; unknown and missing keys are errors."""
-    if not isinstance(values, dict):
-        raise ValueError(f"{kind.__name__} is {values!r}; expected an object")
-    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if unknown := sorted(set(values) - set(fields)):
-        raise ValueError(f"{kind.__name__} has unknown keys {unknown}; expected among {sorted(fields)}")
-    hints = typing.get_type_hints(kind)
-    arguments = {}
-    for name, value in values.items():
-        try:
-            arguments[name] = _from_json(hints[name], value)
-        except ValueError as error:
-            raise ValueError(f"{kind.__name__}.{name}: {error}") from error
-    try:
-        return kind(**arguments)
-    except TypeError as error:
-        raise ValueError(f"{kind.__name__}: {error}") from error
-
-
-def _from_json(hint: Any, value: Any) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return config_from_dict(typing.cast("type[Any]", hint), value)
-    if typing.get_origin(hint) is types.UnionType:  # a value or None
-        (hint,) = (one for one in typing.get_args(hint) if one is not type(None))
-        return None if value is None else _from_json(hint, value)
-    if typing.get_origin(hint) is tuple:
-        items = typing.get_args(hint)
-        if not isinstance(value, list) or (items[-1] is not Ellipsis and len(value) != len(items)):
-            raise ValueError(f"{value!r} is given where {hint} is expected")
-        return tuple(_from_json(items[0], item) for item in value)
-    # JSON has one kind of number, and true is no number.
-    allowed = (int, float) if hint is float else hint
-    if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
-        raise ValueError(f"{value!r} is given where {hint.__name__} is expected")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{value!r} is given where a finite number is expected")
-    return value
 
 
 def save_checkpoint(
@@ -235,6 +184,12 @@ def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraph
     return load_network(path, OPTIMIZER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig, world)
 
 
+def load_step_deviation(weights: Path, world: str | None = None) -> StepDeviation:
+    """The network in the folder ``weights`` that scales deviations of a lidar's steps."""
+    path = weights / f"{STEP_DEVIATION}.safetensors"
+    return load_network(path, STEP_DEVIATION, StepDeviation, StepDeviationConfig, world)[0]
+
+
 def write_untrained(weights: Path, world: str, image: ImageFormat | None = None) -> None:
     """Write freshly initialised networks for ``world`` into a folder: what training starts from, and tests use.
 
@@ -250,7 +205,7 @@ def write_untrained(weights: Path, world: str, image: ImageFormat | None = None)
         LocalPoseConfig(
             image=image,
             width=0.125,
-            actions=3 if world in ACTION_WORLDS else 0,
+            actions=3 if world in WORLD_IMAGES else 0,
             period_s=2 / 35 if world == "maze3d" else 0.1,
             relative_std=std,
         )

@@ -86,6 +86,11 @@ def find_mounting(recording: Recording, topics: RecordingTopics) -> Mounting | N
     return None
 
 
+def mounting_in(tree: TransformTree, base: str, scan_frame: str, source: str = "/tf_static") -> Mounting | None:
+    """Where `scan_frame` sits on `base`, by the static transforms of a tree; None where they do not join the two."""
+    return _lookup(tree, [base], scan_frame, source)
+
+
 def _scan_frame(recording: Recording, topics: RecordingTopics) -> str:
     first = next(iter(recording.messages([topics.image])))
     return str(first.value.header.frame_id).strip("/")

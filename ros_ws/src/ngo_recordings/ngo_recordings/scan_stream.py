@@ -148,7 +148,9 @@ def scan_stream(
         is_scan = message.topic == topics.image
         try:
             found: list[LidarScan | WheelPose] = (
-                [_scan(message, angle_increment)] if is_scan else list(wheels.read(message, lost) if wheels else ())
+                [scan_of(message.value, message.topic, angle_increment)]
+                if is_scan
+                else list(wheels.read(message, lost) if wheels else ())
             )
         except AttributeError as error:
             raise RecordingError(f"a message of {message.topic} is not what its type should be ({error})") from None
@@ -228,9 +230,13 @@ class _Wheels:
             yield WheelPose(known_ns, found.planar()[0])
 
 
-def _scan(message: Message, angle_increment: float | None) -> LidarScan:
-    value = message.value
-    angles = scan_angles(value, message.topic)
+def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> LidarScan:
+    """A LaserScan message as a record; its angles are those of `scan_angles`, the increment one's own where given.
+
+    Raises:
+        RecordingError: the scan has no angles, or no stamp.
+    """
+    angles = scan_angles(value, topic)
     time_increment = float(value.time_increment)
     return LidarScan(
         header_stamp_ns(value),

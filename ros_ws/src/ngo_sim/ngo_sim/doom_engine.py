@@ -89,9 +89,7 @@ class DoomEngine:
         game.set_episode_timeout(0)
         game.set_seed(_ENGINE_SEED)
         game.set_available_buttons([Button.MOVE_FORWARD_BACKWARD_DELTA, Button.TURN_LEFT_RIGHT_DELTA, Button.USE])
-        game.set_available_game_variables(
-            [GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE]
-        )
+        game.set_available_game_variables([GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE])
         # The camera of a walking player goes up and down by default.
         game.set_game_args("+movebob 0 +stillbob 0" + (" -nomonsters" if self._harmless else ""))
         with _WORKING_DIRECTORY_LOCK:
@@ -120,9 +118,7 @@ class DoomEngine:
             raise RuntimeError(f"the engine's field of view is {given}, not {wanted} degrees")
         return observed
 
-    def advance(
-        self, thrust: int, turn_deg: float, use: bool = False
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    def advance(self, thrust: int, turn_deg: float, use: bool = False) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """Let a step pass; return the picture (2 height, 2 width, 3) and the pose (3,) at its end.
 
         use: open the door ahead; counts where the step before was without.
@@ -162,6 +158,6 @@ def _launcher(folder: Path) -> Path:
     if setpriv is None:
         return engine
     script = folder / "engine.sh"
-    script.write_text(f"#!/bin/sh\nexec {shlex.quote(setpriv)} --pdeathsig KILL -- {shlex.quote(str(engine))} \"$@\"\n")
+    script.write_text(f'#!/bin/sh\nexec {shlex.quote(setpriv)} --pdeathsig KILL -- {shlex.quote(str(engine))} "$@"\n')
     script.chmod(0o700)
     return script

@@ -71,17 +71,27 @@ class PathDriver:
     bends a little.
     """
 
-    def __init__(self, maze: Maze, rng: np.random.Generator, goals: str = "corners", *,
-                 random_action_probability: float = 0.05, turn_per_action_rad: float = math.radians(9.0),
-                 turn_coast_steps: float = 1.2, travel_coast_steps: float = 3.0,
-                 lookahead_blocks: float = 0.9) -> None:
+    def __init__(
+        self,
+        maze: Maze,
+        rng: np.random.Generator,
+        goals: str = "corners",
+        *,
+        random_action_probability: float = 0.05,
+        turn_per_action_rad: float = math.radians(9.0),
+        turn_coast_steps: float = 1.2,
+        travel_coast_steps: float = 3.0,
+        lookahead_blocks: float = 0.9,
+    ) -> None:
         if goals not in ("corners", "random"):
             raise ValueError(f"goals is {goals!r}; it must be 'corners' or 'random'")
-        for name, value, low, high in (("random_action_probability", random_action_probability, 0.0, 1.0),
-                                       ("turn_per_action_rad", turn_per_action_rad, 1e-3, math.pi),
-                                       ("turn_coast_steps", turn_coast_steps, 0.0, 100.0),
-                                       ("travel_coast_steps", travel_coast_steps, 0.0, 100.0),
-                                       ("lookahead_blocks", lookahead_blocks, 0.1, 1.0)):
+        for name, value, low, high in (
+            ("random_action_probability", random_action_probability, 0.0, 1.0),
+            ("turn_per_action_rad", turn_per_action_rad, 1e-3, math.pi),
+            ("turn_coast_steps", turn_coast_steps, 0.0, 100.0),
+            ("travel_coast_steps", travel_coast_steps, 0.0, 100.0),
+            ("lookahead_blocks", lookahead_blocks, 0.1, 1.0),
+        ):
             if not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
         self.goals_reached: list[tuple[int, int]] = []
@@ -150,8 +160,9 @@ class PathDriver:
         if self._returning and math.hypot(x - center_x, y - center_y) < near:
             self._returning = False
 
-    def _target(self, x: float, y: float, ahead_x: float, ahead_y: float,
-                block: tuple[int, int]) -> tuple[float, float]:
+    def _target(
+        self, x: float, y: float, ahead_x: float, ahead_y: float, block: tuple[int, int]
+    ) -> tuple[float, float]:
         """The point to steer for, in blocks: on the path, beyond where the robot coasts to."""
         index = self._path_index[block]
         along = float(index) + self._offset_along(x, y, index)

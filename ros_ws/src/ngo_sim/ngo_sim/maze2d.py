@@ -106,8 +106,9 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         """Who drives where nobody is named."""
         return "corners"
 
-    def reset(self, *, seed: int | None = None,
-              options: dict[str, Any] | None = None) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Draw a maze, colours and a start, standing still; see the class for the options."""
         super().reset(seed=seed)
         options = options or {}
@@ -118,8 +119,10 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         drawn = prim_maze(config.rows, config.cols, rng, config.extra_openings, config.block_m)
         self.maze = options.get("maze", drawn)
         if self.maze.walls.shape != drawn.walls.shape or self.maze.block_m != drawn.block_m:
-            raise ValueError(f"options['maze'] has {self.maze.walls.shape} blocks of {self.maze.block_m} m; "
-                             f"the config asks for {drawn.walls.shape} blocks of {drawn.block_m} m")
+            raise ValueError(
+                f"options['maze'] has {self.maze.walls.shape} blocks of {self.maze.block_m} m; "
+                f"the config asks for {drawn.walls.shape} blocks of {drawn.block_m} m"
+            )
         self.colors = rng.random((*drawn.walls.shape, 3), dtype=np.float32)
         start_cell = 2 * rng.integers((config.rows, config.cols)) + 1
         start = (*self.maze.block_center(start_cell), rng.uniform(-math.pi, math.pi))
@@ -127,8 +130,7 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         self._velocity_m, self._turn_rate_rad, self._frame = (0.0, 0.0), 0.0, 0
         return self._scan(), self._info()
 
-    def step(self, action: np.int64 | int
-             ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64 | int) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Take one of the three actions and let period_s pass.
 
         Raises ValueError for another action, RuntimeError before the first reset.
@@ -192,8 +194,17 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
 
     def _scan(self) -> npt.NDArray[np.float32]:
         scan = np.empty((self.config.rays, 4), dtype=np.float32)
-        cast_rays(self.maze.walls, self.config.block_m, self._x, self._y, self._yaw, self._ray_cos,
-                  self._ray_sin, self.colors, scan)
+        cast_rays(
+            self.maze.walls,
+            self.config.block_m,
+            self._x,
+            self._y,
+            self._yaw,
+            self._ray_cos,
+            self._ray_sin,
+            self.colors,
+            scan,
+        )
         return scan
 
     def _info(self) -> dict[str, Any]:
@@ -209,8 +220,9 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         nearest = np.clip(pose[:2], wall, wall + self.config.block_m)
         gap = np.linalg.norm(pose[:2] - nearest, axis=1).min()
         if self.maze.walls[self.maze.block_at(x, y)] or gap < self.config.radius_m:
-            raise ValueError(f"pose_xyyaw is {[x, y, yaw]}; it must be {self.config.radius_m} m or more from "
-                             "every wall")
+            raise ValueError(
+                f"pose_xyyaw is {[x, y, yaw]}; it must be {self.config.radius_m} m or more from every wall"
+            )
         return x, y, yaw
 
     def _place_body(self, x: float, y: float, yaw: float) -> None:
@@ -218,8 +230,9 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         space = pymunk.Space()
         space.collision_slop = _COLLISION_SLOP_M
         space.collision_bias = 0.0  # take all of an overlap back in the next substep
-        walls = [pymunk.Segment(space.static_body, start, end, 0.0)
-                 for start, end in self.maze.wall_segments().tolist()]
+        walls = [
+            pymunk.Segment(space.static_body, start, end, 0.0) for start, end in self.maze.wall_segments().tolist()
+        ]
         self._body = pymunk.Body(mass=1.0, moment=math.inf)
         self._body.position = (x, y)
         self._body.angle = yaw

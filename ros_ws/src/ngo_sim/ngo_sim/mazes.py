@@ -60,7 +60,7 @@ class Maze:
         graph.add_nodes_from(map(tuple, np.argwhere(free).tolist()))
         for step in ((0, 1), (1, 0)):
             height, width = free.shape[0] - step[0], free.shape[1] - step[1]
-            pairs = np.argwhere(free[:height, :width] & free[step[0]:, step[1]:])
+            pairs = np.argwhere(free[:height, :width] & free[step[0] :, step[1] :])
             graph.add_edges_from(((row, col), (row + step[0], col + step[1])) for row, col in pairs.tolist())
         return graph
 
@@ -118,12 +118,13 @@ def check_maze_size(rows: int, cols: int, extra_openings: int) -> None:
     most = (rows - 1) * (cols - 1)
     integer = isinstance(extra_openings, (int, np.integer)) and not isinstance(extra_openings, bool)
     if not (integer and 0 <= extra_openings <= most):
-        raise ValueError(f"extra_openings is {extra_openings!r}; it must be an integer from 0 to {most} "
-                         f"in a maze of {rows} x {cols} cells")
+        raise ValueError(
+            f"extra_openings is {extra_openings!r}; it must be an integer from 0 to {most} "
+            f"in a maze of {rows} x {cols} cells"
+        )
 
 
-def prim_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: int = 0,
-              block_m: float = 1.0) -> Maze:
+def prim_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: int = 0, block_m: float = 1.0) -> Maze:
     """A random maze grown by Prim's algorithm with random weights: many short dead ends.
 
     extra_openings walls are opened on top of the spanning tree; each adds exactly one cycle.
@@ -146,8 +147,7 @@ def prim_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: in
     return _build(rows, cols, tree, rng, extra_openings, block_m)
 
 
-def kruskal_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: int = 0,
-                 block_m: float = 1.0) -> Maze:
+def kruskal_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings: int = 0, block_m: float = 1.0) -> Maze:
     """A random maze by Kruskal's algorithm with random weights: longer, winding corridors.
 
     extra_openings walls are opened on top of the spanning tree; each adds exactly one cycle.
@@ -173,8 +173,13 @@ def draw_maze(axes: Axes, maze: Maze, colors: npt.ArrayLike | None = None) -> No
     if wall.shape != (*maze.walls.shape, 3):
         raise ValueError(f"colors has shape {wall.shape}; it must be {(*maze.walls.shape, 3)}")
     width_m, height_m = maze.size_m
-    axes.imshow(np.where(maze.walls[..., None], wall, 1.0), origin="lower", interpolation="nearest", zorder=0,
-                extent=(0.0, width_m, 0.0, height_m))
+    axes.imshow(
+        np.where(maze.walls[..., None], wall, 1.0),
+        origin="lower",
+        interpolation="nearest",
+        zorder=0,
+        extent=(0.0, width_m, 0.0, height_m),
+    )
     axes.set(aspect="equal", xlim=(0.0, width_m), ylim=(0.0, height_m), xlabel="x [m]", ylabel="y [m]")
 
 
@@ -201,8 +206,9 @@ def _all_edges(rows: int, cols: int) -> list[Edge]:
     return along_x + along_y
 
 
-def _build(rows: int, cols: int, tree: list[Edge], rng: np.random.Generator, extra_openings: int,
-           block_m: float) -> Maze:
+def _build(
+    rows: int, cols: int, tree: list[Edge], rng: np.random.Generator, extra_openings: int, block_m: float
+) -> Maze:
     """Carve the tree's edges and extra_openings of the edges it leaves."""
     used = {frozenset(edge) for edge in tree}
     spare = [edge for edge in _all_edges(rows, cols) if frozenset(edge) not in used]

@@ -8,9 +8,17 @@ from numba import njit
 
 
 @njit(cache=True)
-def cast_rays(walls: npt.NDArray[np.bool_], block_m: float, x: float, y: float, yaw: float,
-              ray_cos: npt.NDArray[np.float64], ray_sin: npt.NDArray[np.float64],
-              colors: npt.NDArray[np.float32], scan: npt.NDArray[np.float32]) -> None:
+def cast_rays(
+    walls: npt.NDArray[np.bool_],
+    block_m: float,
+    x: float,
+    y: float,
+    yaw: float,
+    ray_cos: npt.NDArray[np.float64],
+    ray_sin: npt.NDArray[np.float64],
+    colors: npt.NDArray[np.float32],
+    scan: npt.NDArray[np.float32],
+) -> None:
     """Write r, g, b and depth in metres of the first wall along every ray into scan (rays, 4).
 
     walls: bool (height, width), its outer ring all wall. x, y, yaw: the eye in the maze's frame, m, m, rad.

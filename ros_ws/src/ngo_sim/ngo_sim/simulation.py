@@ -69,9 +69,7 @@ class Simulation:
         self.external = ExternalActions()
         observation, info = world.reset(seed=seed)
         name = world.default_driver if driver == "auto" else driver
-        self._driver: Driver | None = (
-            None if name == "none" else make_driver(name, world.maze, driver_generator(seed))
-        )
+        self._driver: Driver | None = None if name == "none" else make_driver(name, world.maze, driver_generator(seed))
         self.frame = Frame(0, observation, info["pose_xyyaw"], np.zeros(3))
 
     def choose_action(self, now_s: float, timeout_s: float, hold: bool) -> Action | None:

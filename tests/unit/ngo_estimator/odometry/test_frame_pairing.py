@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.odometry.frame_pairing import FramePairing
-from ngo_estimator.odometry.local_odometry import DuplicateFrame, LateFrame
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
 
 STEP_NS = 100_000_000
 IMAGE = np.zeros((1, 8, 4), np.float32)

@@ -11,14 +11,8 @@ from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local,
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
-from ngo_estimator.odometry.local_odometry import (
-    DuplicateFrame,
-    LateFrame,
-    LocalEstimate,
-    LocalOdometry,
-    RejectedFrame,
-    UnusableImage,
-)
+from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame, UnusableImage
 from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations, place_config
 
 PERIOD_NS = 100_000_000

@@ -9,12 +9,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ngo_estimator.checkpoint import WORLD_IMAGES, PlaceNetworks
-from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RejectedStep, RelativeStep
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.odometry.frame_pairing import FramePairing
-from ngo_estimator.odometry.local_odometry import RESTART_AFTER_NS, LocalEstimate, LocalOdometry, RejectedFrame
-from ngo_estimator.online.online_trajectory import OnlineTrajectory, TrajectoryUpdate
+from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
+from ngo_estimator.odometry.rejected_frames import RejectedFrame
+from ngo_estimator.online.corrected_trajectory import TrajectoryUpdate
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.samples import local_config, place_config, small_optimizer
 
 PERIOD_NS = 100_000_000

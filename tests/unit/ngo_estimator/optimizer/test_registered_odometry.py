@@ -11,9 +11,10 @@ from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.networks.pose_aggregation import block_variances, poses_in_blocks
-from ngo_estimator.online.online_trajectory import OnlineTrajectory, optimize_offline
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.registered_odometry import registered_steps
+from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from tests.unit.ngo_estimator.rooms import CONFIG, drive_in_the_room, registering_pair_head
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
 

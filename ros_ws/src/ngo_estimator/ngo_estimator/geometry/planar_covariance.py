@@ -3,6 +3,7 @@
 import numpy as np
 
 _PLANAR = np.array([0, 1, 5])  # x, y and yaw among x, y, z, roll, pitch, yaw
+_VARIANCES = (1e-10, 1e4)  # farther apart, rounding would make some negative
 
 
 def propagate(
@@ -25,6 +26,13 @@ def propagate(
     shift_x, shift_y = rotation[:2, :2] @ relative_xyyaw[:2]
     lever = np.array([[1.0, 0.0, -shift_y], [0.0, 1.0, shift_x], [0.0, 0.0, 1.0]])
     return np.asarray(lever @ covariance @ lever.T + rotation @ relative_covariance @ rotation.T)
+
+
+def bounded(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric covariance ``(3, 3)`` whose variances, along all axes, are between as good as exact and unknown."""
+    values, vectors = np.linalg.eigh(0.5 * covariance + 0.5 * covariance.T)
+    result: np.ndarray = (vectors * np.clip(values, *_VARIANCES)) @ vectors.T
+    return result
 
 
 def to_spatial(covariance: np.ndarray) -> np.ndarray:

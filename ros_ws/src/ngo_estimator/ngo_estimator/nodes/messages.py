@@ -17,7 +17,7 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry
-from ngo_msgs.msg import RelativePose, Trajectory
+from ngo_msgs.msg import KeyScan, RelativePose, Trajectory
 from std_msgs.msg import ColorRGBA, Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
@@ -25,9 +25,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ngo_estimator.geometry.planar_covariance import to_planar, to_spatial
 
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
-    from ngo_estimator.data.relative_step import RelativeStep
-    from ngo_estimator.odometry.local_odometry import LocalEstimate
-    from ngo_estimator.online.online_trajectory import Trajectory as WholeTrajectory
+    from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+    from ngo_estimator.geometry import key_scan
+    from ngo_estimator.online.corrected_trajectory import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
 _LOOP_WIDTH_M = 0.03
@@ -50,7 +50,7 @@ def stamped_twist(message: Twist | TwistStamped | Odometry, now_ns: int) -> tupl
     return stamp_ns, np.array([twist.linear.x, twist.linear.y, twist.angular.z])
 
 
-def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> RelativePose:
+def relative_pose_message(estimate: "RelativeStep", base_frame: str) -> RelativePose:
     """One step of the local odometry, stamped with its newer frame."""
     x, y, yaw = estimate.relative_xyyaw.tolist()
     odom_x, odom_y, odom_yaw = estimate.odom_xyyaw.tolist()
@@ -68,11 +68,52 @@ def relative_pose_message(estimate: "LocalEstimate", base_frame: str) -> Relativ
         motion_feature=array("f", estimate.motion_feature.tobytes()),
         place_code=array("f", estimate.place_code.tobytes()),
         from_place_code=array("f", b"" if estimate.from_place_code is None else estimate.from_place_code.tobytes()),
+        key_scan=[] if estimate.key is None else [_key_scan_message(estimate.key.scan, estimate.key)],
+        origin_scan=[] if estimate.origin_scan is None else [_key_scan_message(estimate.origin_scan, None)],
+        robot_odom=[] if estimate.robot_odom_xyyaw is None else estimate.robot_odom_xyyaw.tolist(),
     )
 
 
+def _key_scan_message(scan: "key_scan.KeyScan", step: "KeyScanStep | None") -> KeyScan:
+    message = KeyScan(
+        stamp=to_time(scan.stamp_ns),
+        from_stamp=to_time(scan.stamp_ns if step is None else step.from_key_stamp_ns),
+        points=_singles(scan.points),
+        normals=_singles(scan.normals),
+        angles=_singles(scan.angles),
+        ranges=_singles(scan.ranges),
+        max_range=scan.max_range,
+        sensor=scan.sensor_xyyaw,
+    )
+    if step is not None:
+        message.x, message.y, message.yaw = step.relative_xyyaw.tolist()
+        message.covariance = step.covariance.ravel()
+        message.factors = step.factors
+    return message
+
+
+def _key_scan(message: KeyScan) -> "key_scan.KeyScan":
+    from ngo_estimator.geometry.key_scan import KeyScan as Scan
+
+    points, normals, angles, ranges = (
+        np.array(values, np.float64) for values in (message.points, message.normals, message.angles, message.ranges)
+    )
+    if len(points) % 2 or len(normals) != len(points):
+        raise ValueError(f"key scan has {len(points)} and {len(normals)} coordinates; expected as many, in pairs")
+    sensor = np.array(message.sensor)
+    pairs = points.reshape(-1, 2), normals.reshape(-1, 2)
+    return Scan(to_ns(message.stamp), *pairs, sensor, angles, ranges, float(message.max_range))
+
+
+def _key_scan_step(message: KeyScan) -> "KeyScanStep":
+    from ngo_estimator.data.relative_step import KeyScanStep
+
+    relative, covariance = np.array([message.x, message.y, message.yaw]), np.array(message.covariance).reshape(3, 3)
+    return KeyScanStep(_key_scan(message), to_ns(message.from_stamp), relative, covariance, np.array(message.factors))
+
+
 def relative_step(message: RelativePose) -> "RelativeStep":
-    """The input of ``OnlineTrajectory`` from a message."""
+    """What ``OnlineTrajectory`` takes, from a message; raises ``ValueError`` for a key scan that is none."""
     from ngo_estimator.data.relative_step import RelativeStep
 
     return RelativeStep(
@@ -85,10 +126,13 @@ def relative_step(message: RelativePose) -> "RelativeStep":
         motion_feature=np.array(message.motion_feature, np.float32),
         place_code=np.array(message.place_code, np.float32),
         from_place_code=np.array(message.from_place_code, np.float32) if message.from_place_code else None,
+        key=_key_scan_step(message.key_scan[0]) if message.key_scan else None,
+        origin_scan=_key_scan(message.origin_scan[0]) if message.origin_scan else None,
+        robot_odom_xyyaw=np.array(message.robot_odom) if len(message.robot_odom) else None,
     )
 
 
-def odometry_message(estimate: "LocalEstimate", covariance: np.ndarray, odom_frame: str, base_frame: str) -> Odometry:
+def odometry_message(estimate: "RelativeStep", covariance: np.ndarray, odom_frame: str, base_frame: str) -> Odometry:
     """The pose in ``odom_frame`` with its covariance ``(3, 3)``, and the mean velocity of the last step."""
     message = Odometry(header=Header(stamp=to_time(estimate.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame)
     message.pose.pose = planar_pose(estimate.odom_xyyaw)
@@ -158,6 +202,10 @@ def trajectory_message(trajectory: "WholeTrajectory", frame: str) -> Trajectory:
         yaw=_doubles(trajectory.poses_xyyaw[:, 2]),
         moved=_doubles(trajectory.moved_m),
     )
+
+
+def _singles(values: np.ndarray) -> "array[float]":
+    return array("f", values.astype(np.float32).tobytes())
 
 
 def _doubles(values: np.ndarray) -> "array[float]":

@@ -24,6 +24,7 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import run_node
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
+from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
@@ -34,7 +35,7 @@ from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.trajectory.files import edges_of, write_trajectory
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.online_trajectory import Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
@@ -118,9 +119,12 @@ class NgoNode(LifecycleNode):
         # Imported here because torch takes seconds: a bad parameter is said at once.
         from ngo_estimator.online.map_origin import MapOrigin
         from ngo_estimator.online.online_trajectory import OnlineTrajectory
+        from ngo_estimator.online.scan_trajectory import ScanTrajectory
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
-        def load(folder: Path, world: str) -> OnlineTrajectory:
+        def load(folder: Path, world: str) -> OnlineTrajectory | ScanTrajectory:
+            if is_lidar(folder):
+                return ScanTrajectory.load(folder, world, settings.iterations_per_step)
             return OnlineTrajectory.load(
                 folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
             )
@@ -130,6 +134,7 @@ class NgoNode(LifecycleNode):
         self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
         self._paused = False
         self._gaps = self._restarts = self._new_gaps = 0
+        self._fault = ""
         self._begin_anew()
         self._live.lock()
         built.callback(self._live.lock, False)
@@ -205,8 +210,8 @@ class NgoNode(LifecycleNode):
         self._smoothing.reset()
 
     def _on_relative_pose(self, message: RelativePose) -> None:
-        step = messages.relative_step(message)
         try:
+            step = messages.relative_step(message)
             with self._status.timed("time an update"):
                 update = self._core.update(step, optimize=not self._paused)
         except ValueError as error:
@@ -228,15 +233,16 @@ class NgoNode(LifecycleNode):
             )
         self._gaps += update.gap
         self._new_gaps += update.gap
+        self._fault = update.fault or self._fault
         if update.optimized:
             self._last_correction_m = update.largest_move_m
             self._status.took("time an optimisation", self._core.optimization_s)
         begins = self._latest is None
         self._latest = update
-        self._publish(update, step.odom_xyyaw)
+        self._publish(update, step.tf_odom_xyyaw)
         # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last one.
         self._whole.changed(loops=update.optimized or begins)
-        self._odom_xyyaw = step.odom_xyyaw
+        self._odom_xyyaw = step.tf_odom_xyyaw
         if self._core.unfinished:
             self._pending.reset()
         else:
@@ -346,6 +352,9 @@ class NgoNode(LifecycleNode):
         if self._new_gaps:
             found.append(f"{self._new_gaps} gaps in the relative poses, bridged by the odometry")
             self._new_gaps = 0
+        if self._fault:
+            found.append(f"internal fault, the trajectory goes on by odometry: {self._fault}")
+            self._fault = ""
         if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:
             found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
         return found

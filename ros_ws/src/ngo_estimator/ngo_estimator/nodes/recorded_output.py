@@ -83,7 +83,7 @@ class RecordedOutput:
         odometry = messages.odometry_message(local, self._covariance, odom, frames["base"])
         pose = messages.pose_message(stamp_ns, map_frame, update.pose_xyyaw, update.covariance)
         transforms = messages.transform_message(stamp_ns, map_frame, odom, update.map_from_odom_xyyaw)
-        below = messages.transform_message(stamp_ns, odom, frames["base"], local.odom_xyyaw)
+        below = messages.transform_message(stamp_ns, odom, frames["base"], local.tf_odom_xyyaw)
         transforms.transforms = [*transforms.transforms, *below.transforms]
         for topic, message in ((ODOMETRY, odometry), (POSE, pose), (TF, transforms)):
             self._writer.write(topic, self._serialise(message, _TYPES[topic]), stamp_ns)
@@ -111,7 +111,7 @@ class RecordedOutput:
             in_map = _seen_by(truth, SpatialPoses.from_planar(stamps_ns, estimates["corrected"]))
             self._write_path(PATHS["truth"], self._frames["map"], truth.stamps_ns, in_map)
         shown = {name: estimates[name] for name in ("odometry", "corrected")}
-        save_plot(self.folder / "plot.png", title, shown, in_map)
+        save_plot(self.folder / "plot.png", title, shown, in_map, run.walls)
         if truth is None:
             return {}
         reports = {

@@ -1,28 +1,32 @@
 """Estimate the trajectory of a recording, as fast as the machine computes, with the results of the live nodes.
 
+    ros2 run ngo_estimator run_recording lidar.bag --out results
     ros2 run ngo_estimator run_recording drive.mcap --world maze3d --out results
     ros2 run ngo_estimator run_recording bag_folder --weights my_weights --image /camera/image_raw --out results
 
-RECORDINGS are .mcap files or rosbag2 folders, several as one. OUT gets odometry.tum, online.tum (each corrected pose as
-it was when its frame was the newest), corrected.tum, trajectories.mcap (odometry, poses, transforms and paths),
-plot.png and run.json; where the recording holds the truth, also truth.tum and metrics.json. The same recording gives
-the same bytes.
+RECORDINGS are .mcap files, rosbag2 folders, ROS 1 bags or CARMEN logs, several as one. Laser scans need no --world. OUT
+gets odometry.tum, online.tum (each corrected pose as it was when its frame was the newest), corrected.tum,
+trajectories.mcap (odometry, poses, transforms and paths), plot.png and run.json; where the recording holds the truth,
+also truth.tum and metrics.json. The same recording gives the same bytes.
 """
 
 import json
 import math
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 from ament_index_python.packages import get_package_share_directory
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
 from ngo_recordings.images import SCAN_TYPE
@@ -31,9 +35,13 @@ from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_topics
 
 if TYPE_CHECKING:
     from ngo_estimator.odometry.local_odometry import LocalOdometry
-    from ngo_estimator.offline.recording_run import RecordingRun
+    from ngo_estimator.offline.lidar_run import LidarRun
+    from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, RecordingRun
+
+    Started = tuple[str, RecordingTopics, RecordingRun | LidarRun, Iterator[RecordedStep | RecordedRun]]
 
 NAME = "run_recording"
+LIDAR_WORLD = "scan"
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ class Arguments:
     out: Path
     """Folder for the results, new or empty."""
     world: str | None = None
-    """World whose weights are used: maze2d, maze3d or scan (any 2D lidar) ship with the package."""
+    """World whose weights are used: maze2d, maze3d or scan (any 2D lidar), the default for laser scans."""
     weights: Path | None = None
     """Folder of weights of your own, instead of those of a world."""
     topics: tyro.conf.OmitArgPrefixes[TopicArguments] = field(default_factory=TopicArguments)
@@ -57,7 +65,7 @@ class Arguments:
     iterations_per_step: int = 1
     """Iterations of an optimisation at each frame, which spreads it over frames; 0 for all at once."""
     scan_yaw_deg: float = 0.0
-    """Where a laser scanner's angle 0 points, counter-clockwise from straight ahead."""
+    """Where a scanner's angle 0 points, counter-clockwise from straight ahead; 0: as the recording's transforms say."""
     base_frame: str = "base_link"
     """Frame of the robot in trajectories.mcap."""
     odom_frame: str = "odom"
@@ -74,21 +82,25 @@ class Arguments:
     def check(self) -> None:
         """Raise ``ValueError`` for arguments that contradict each other."""
         if not self.recordings:
-            raise ValueError("no recording was given; expected .mcap files or rosbag2 folders")
-        if (self.world is None) == (self.weights is None):
-            raise ValueError("expected either --world (maze2d, maze3d or scan) or --weights FOLDER")
+            raise ValueError("no recording was given; expected .mcap files, rosbag2 folders, .bag, .log or .clf files")
+        if self.world is not None and self.weights is not None:
+            raise ValueError("expected either --world (maze2d, maze3d or scan) or --weights FOLDER, not both")
         if self.out.exists() and not self.out.is_dir():
             raise ValueError(f"{self.out} is a file; expected a folder for the results")
         if self.out.is_dir() and any(self.out.iterdir()) and not self.overwrite:
             raise ValueError(f"{self.out} is not empty; give a new folder, or --overwrite")
 
-    @property
-    def weights_folder(self) -> Path:
-        """The folder with the networks; raises ``ValueError`` where there is none."""
+    def weights_folder(self, recording: Recording) -> Path:
+        """The folder with the weights; raises ``ValueError`` where there is none, or none was named for images."""
         shipped = Path(get_package_share_directory("ngo_estimator"), "weights")
-        folder = self.weights if self.weights is not None else shipped / str(self.world)
+        world = self.world
+        if world is None and self.weights is None:
+            if not any(info.type_name == SCAN_TYPE and info.count for info in recording.topics.values()):
+                raise ValueError("expected --world (maze2d or maze3d) or --weights FOLDER: there are no laser scans")
+            world = LIDAR_WORLD
+        folder = self.weights if self.weights is not None else shipped / str(world)
         if not folder.is_dir():
-            there = "" if self.world is None else f"; worlds: {', '.join(sorted(p.name for p in shipped.iterdir()))}"
+            there = "" if world is None else f"; worlds: {', '.join(sorted(p.name for p in shipped.iterdir()))}"
             raise ValueError(f"there is no folder of weights {folder}{there}")
         return folder
 
@@ -108,24 +120,14 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     arguments.check()
     settings = arguments.report_settings
     with open_recording(arguments.recordings) as recording:
-        # Imported here because torch takes seconds: a file that is not there is said at once.
-        import torch
-
-        from ngo_estimator.odometry.local_odometry import LocalOdometry
-        from ngo_estimator.offline.recording_run import RecordingRun
-        from ngo_estimator.online.online_trajectory import OnlineTrajectory
-
-        torch.set_num_threads(1)
-        folder = arguments.weights_folder
-        local = LocalOdometry.load(folder, arguments.world)
-        bounds = (arguments.key_frames, arguments.iterations_per_step)
-        online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, *bounds)
-        topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
-        _check_side_information(topics, local)
-        console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
-        core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
+        folder = arguments.weights_folder(recording)
+        core: RecordingRun | LidarRun
+        if is_lidar(folder):
+            world, topics, core, events = _lidar(arguments, folder, recording, console)
+        else:
+            world, topics, core, events = _networks(arguments, folder, recording, console)
         began_s = time.monotonic()
-        trajectories = _run(arguments, settings, recording, topics, core, console)
+        trajectories = _run(arguments, settings, recording, topics, core, events, console)
     took_s = time.monotonic() - began_s
     if not trajectories:
         why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
@@ -135,7 +137,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     console.print(f"{core.frames} frames in {took_s:.1f} s, {core.frames / took_s:.0f} frames/s", highlight=False)
     result = {
         "recordings": [str(path) for path in arguments.recordings],
-        "weights": local.world,
+        "weights": world,
         "window_frames": arguments.window_frames,
         "key_frames": arguments.key_frames,
         "iterations_per_step": arguments.iterations_per_step,
@@ -143,6 +145,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         "frames": core.frames,
         "not_used": dict(core.rejected),
         "gaps": core.gaps,
+        **core.facts,
         "trajectories": trajectories,
     }
     (arguments.out / "run.json").write_text(json.dumps(result, indent=1) + "\n")
@@ -154,13 +157,13 @@ def _run(
     settings: ReportSettings,
     recording: Recording,
     topics: RecordingTopics,
-    core: "RecordingRun",
+    core: "RecordingRun | LidarRun",
+    events: "Iterator[RecordedStep | RecordedRun]",
     console: Console,
 ) -> list[dict[str, Any]]:
     """Run over all frames; for each trajectory the folder of its results and how many poses it has."""
     from ngo_estimator.nodes.recorded_output import PART, RecordedOutput, remove_results
     from ngo_estimator.offline.recording_run import RecordedStep
-    from ngo_recordings.frames import frames as frames_of
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     found: list[dict[str, Any]] = []
@@ -170,7 +173,7 @@ def _run(
     bar = Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal)
     with ExitStack() as stack, bar as progress:
         task = progress.add_task(topics.image, total=recording.topics[topics.image].count)
-        for event in core.run(frames_of(recording, topics, core.rejected)):
+        for event in events:
             if output is None:
                 folder = arguments.out if not found else arguments.out / f"{PART}{len(found) + 1}"
                 names = arguments.base_frame, arguments.odom_frame, arguments.map_frame
@@ -198,6 +201,59 @@ def _run(
                     console.print(line, soft_wrap=True, highlight=False)
             output = None
     return found
+
+
+def _networks(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":
+    """Networks for images or resampled scans."""
+    # Imported here because torch takes seconds: a file that is not there is said at once.
+    import torch
+
+    from ngo_estimator.odometry.local_odometry import LocalOdometry
+    from ngo_estimator.offline.recording_run import RecordingRun
+    from ngo_estimator.online.online_trajectory import OnlineTrajectory
+    from ngo_recordings.frames import frames as frames_of
+
+    torch.set_num_threads(1)
+    local = LocalOdometry.load(folder, arguments.world)
+    bounds = (arguments.key_frames, arguments.iterations_per_step)
+    online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, *bounds)
+    topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
+    _check_side_information(topics, local)
+    console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
+    core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
+    return local.world, topics, core, core.run(frames_of(recording, topics, core.rejected))
+
+
+def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":
+    """Registration of a lidar's scans, with the robot's odometry."""
+    from ngo_estimator.geometry.scan_points import Mounting
+    from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+    from ngo_estimator.offline.lidar_run import LidarRun
+    from ngo_estimator.offline.recording_run import Truth
+    from ngo_estimator.online.scan_trajectory import ScanTrajectory
+    from ngo_recordings.frames import frames as frames_of
+    from ngo_recordings.lidar_description import describe_lidar
+    from ngo_recordings.scan_stream import scan_stream
+
+    odometry = LidarOdometry.load(folder, arguments.world)
+    online = ScanTrajectory.load(folder, arguments.world, arguments.iterations_per_step)
+    scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
+    given = replace(arguments.topics, action="none", twist="none")
+    if given.image is None and len(scans) == 1:
+        given = replace(given, image=scans[0])
+    topics = choose_topics(recording, given)
+    described = describe_lidar(recording, topics)
+    for line in described.lines():
+        console.print(line, soft_wrap=True, highlight=False)
+    mounting = Mounting(np.array([0.0, 0.0, math.radians(arguments.scan_yaw_deg)]))
+    if described.mounting is not None and arguments.scan_yaw_deg == 0.0:
+        mounting = Mounting(described.mounting.base_from_scan_xyyaw, described.mounting.upside_down)
+    truth = Truth()
+    if topics.ground_truth is not None:
+        for frame in frames_of(recording, topics):
+            truth.add(frame)
+    core = LidarRun(odometry, online, mounting)
+    return LIDAR_WORLD, topics, core, core.run(scan_stream(recording, topics, skipped=core.rejected), truth)
 
 
 def _for_weights(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
@@ -228,6 +284,7 @@ def _words(topics: RecordingTopics) -> str:
     used = {
         "images": topics.image,
         "depth": topics.depth,
+        "wheels": topics.wheels,
         "actions": topics.action,
         "velocities": topics.twist,
         "truth": topics.ground_truth,
@@ -239,16 +296,17 @@ def _plain(value: object) -> str | float | None:
     return value if value is None or isinstance(value, float) else str(value)
 
 
-def _rejected(core: "RecordingRun") -> list[tuple[str, int]]:
+def _rejected(core: "RecordingRun | LidarRun") -> list[tuple[str, int]]:
     return [(reason, count) for reason, count in core.rejected.items() if count]
 
 
-def _losses(core: "RecordingRun", images: int) -> list[str]:
+def _losses(core: "RecordingRun | LidarRun", images: int) -> list[str]:
     """A line for each reason why images were not used, and one about gaps."""
     lines = []
     for reason, count in _rejected(core):
         example = core.examples.get(reason)
         lines.append(f"{count} of {images} images not used: {reason}{f' (first: {example})' if example else ''}")
+    lines += core.remarks()
     if core.gaps:
         lines.append(f"{core.gaps} steps span more than the time between two frames in training")
     return lines

@@ -7,19 +7,27 @@ from typing import TypeVar
 from ament_index_python.packages import get_package_share_directory
 
 from ngo_common.nodes.process import StartError
+from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.nodes.settings import EstimatorSettings
 
 Core = TypeVar("Core")
 
 
-def load_core(load: Callable[[Path, str], Core], settings: EstimatorSettings) -> Core:
-    """Load a core's networks as ``settings`` say; raises ``StartError`` where they cannot be used."""
-    import torch
-
-    torch.set_num_threads(settings.threads)
+def weights_folder(settings: EstimatorSettings) -> Path:
+    """The folder of weights that ``settings`` name; raises ``StartError`` where there is none."""
     folder = Path(settings.weights or Path(get_package_share_directory("ngo_estimator"), "weights", settings.world))
     if not folder.is_dir():
         raise StartError(f"weights: there is no folder '{folder}' (parameters 'weights' and 'world')")
+    return folder
+
+
+def load_core(load: Callable[[Path, str], Core], settings: EstimatorSettings) -> Core:
+    """Load a core as ``settings`` say; raises ``StartError`` where its weights cannot be used."""
+    folder = weights_folder(settings)
+    if not is_lidar(folder):
+        import torch
+
+        torch.set_num_threads(settings.threads)
     try:
         return load(folder, settings.world)
     except ValueError as error:

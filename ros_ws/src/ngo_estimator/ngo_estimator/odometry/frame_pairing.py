@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
-from ngo_estimator.odometry.local_odometry import DuplicateFrame, LateFrame
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.odometry.twist_history import TwistHistory
 
 _ACTIONS_KEPT = 4096

@@ -11,22 +11,7 @@ from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
-
-
-class RejectedFrame(ValueError):
-    """A frame that cannot be used; the odometry is as it was before."""
-
-
-class DuplicateFrame(RejectedFrame):
-    """A frame with the stamp of the last one."""
-
-
-class LateFrame(RejectedFrame):
-    """A frame that is a little older than the last one."""
-
-
-class UnusableImage(RejectedFrame):
-    """An image of the wrong size or type, or with values that make no sense, or an unknown action or velocity."""
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 
 
 @dataclass(frozen=True)

@@ -4,19 +4,17 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ngo_estimator.data.observations import observation
-from ngo_estimator.data.relative_step import RESTART_AFTER_NS
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.odometry.frame_pairing import FramePairing
-from ngo_estimator.odometry.local_odometry import (
-    DuplicateFrame,
-    LateFrame,
-    LocalEstimate,
-    LocalOdometry,
-)
-from ngo_estimator.online.online_trajectory import OnlineTrajectory, Trajectory, TrajectoryUpdate
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
+from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.trajectory.files import SpatialPoses, seconds
 from ngo_recordings.frames import Frame
 
@@ -30,7 +28,7 @@ _REASONS: dict[type[ValueError], str] = {
 class RecordedStep:
     """What came out of one frame: its motion since the frame before, and the trajectory after it."""
 
-    local: LocalEstimate
+    local: RelativeStep
     update: TrajectoryUpdate
 
 
@@ -39,12 +37,13 @@ class RecordedRun:
     """A whole trajectory, and the truth about its frames, where there is any.
 
     ``truth_residual`` ``(frames, 3)`` is what the projection to the plane leaves out of the truth (z m, roll rad, pitch
-    rad).
+    rad). ``walls`` ``(n, 2)``: points of a lidar's scans at corrected poses.
     """
 
     trajectory: Trajectory
     truth: SpatialPoses | None
     truth_residual: np.ndarray
+    walls: np.ndarray | None = None
 
 
 class RecordingRun:
@@ -75,6 +74,15 @@ class RecordingRun:
         self.gaps = 0
         """Steps that span more than the usual time between two frames."""
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What else is worth keeping of the run."""
+        return {}
+
+    def remarks(self) -> list[str]:
+        """What a person should know of the run, a line each."""
+        return []
+
     def run(self, frames: Iterable[Frame]) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.
 
@@ -87,12 +95,12 @@ class RecordingRun:
         self._local.reset()
         self._online.reset()
         self._pairing.reset()
-        truth, before_ns = _Truth(), None
+        truth, before_ns = Truth(), None
         for frame in frames:
             self.frames += 1
             if before_ns is not None and frame.stamp_ns <= before_ns - RESTART_AFTER_NS:
                 yield from self._finished(truth)
-                truth, before_ns = _Truth(), None
+                truth, before_ns = Truth(), None
             # What led to a frame, stamped as in the messages: an action at the frame before, a velocity up to its own.
             if frame.action is not None and before_ns is not None and before_ns < frame.stamp_ns:
                 self._pairing.add_action(before_ns, frame.action)
@@ -139,7 +147,7 @@ class RecordingRun:
         self.rejected[reason] += 1
         self.examples.setdefault(reason, example)
 
-    def _finished(self, truth: "_Truth") -> Iterator[RecordedRun]:
+    def _finished(self, truth: "Truth") -> Iterator[RecordedRun]:
         """The trajectory that ends here, if there is one."""
         self._online.finish()
         trajectory = self._online.trajectory()
@@ -149,7 +157,7 @@ class RecordingRun:
             yield RecordedRun(trajectory, *truth.poses())
 
 
-class _Truth:
+class Truth:
     """The true poses of the frames of one trajectory, a few bytes each."""
 
     def __init__(self) -> None:
@@ -157,12 +165,17 @@ class _Truth:
         self._values = array("d")
 
     def add(self, frame: Frame) -> None:
+        """Take the true pose of a frame, where it is known."""
         if frame.pose_xyyaw is not None:
             residual = np.zeros(3) if frame.pose_residual is None else frame.pose_residual
             self._stamps_ns.append(frame.stamp_ns)
             self._values.extend((*frame.pose_xyyaw, *residual))
 
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
     def poses(self) -> tuple[SpatialPoses | None, np.ndarray]:
+        """All of them, and what their projection to the plane leaves out ``(frames, 3)``."""
         values = np.array(self._values).reshape(-1, 6)
         if len(values) == 0:
             return None, values[:, 3:]

@@ -14,7 +14,7 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.networks.pose_aggregation import block_variances, poses_in_blocks
+from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
@@ -70,6 +70,7 @@ class MetaGraph:
         self._std = SlidingRows((3,), np.float32, blocks_kept)
         self._optimized_std = SlidingRows((3,), np.float64, blocks_kept)
         self._features = SlidingRows((config.width,), np.float32, blocks_kept)
+        self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
         self._nodes = GrowingRows((3,), np.float64)
         self._nodes.append(np.zeros(3))
         self._first = 0  # node where the window begins
@@ -89,6 +90,8 @@ class MetaGraph:
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         self._running: _Running | None = None
+        self.optimized, self.fault = False, ""
+        """Whether an optimisation ended, and what failed, since the newest frame came."""
         self.took_s = 0.0
         """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
         self._active, self._before = np.zeros(0, np.int64), np.zeros((0, 3))
@@ -113,8 +116,12 @@ class MetaGraph:
         """Take the place code of the first frame, where it is known, before the first step."""
         self._origin_code = origin_code
 
-    def append(self, relative: np.ndarray, log_std: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
-        """Take a step ``(3,)`` with what belongs to it; returns whether it completed a block."""
+    def append(self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
+        """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block."""
+        self.optimized, self.fault = False, ""
+        log_std = 0.5 * np.log(variance)
+        self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
+        self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
         last = torch.from_numpy(self.odometry.values[-1])
         self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
         self._relative.append(relative)
@@ -124,8 +131,11 @@ class MetaGraph:
             self._loops.append(code)
         if (len(self.odometry) - 1) % self._block:
             return False
-        if self._running is not None:
-            self.advance(self._running.left)  # what comes now changes the nodes that it is about
+        if self._running is not None:  # what comes now changes the nodes that it is about
+            try:
+                self.advance(self._running.left)
+            except Exception as error:  # it may cost an optimisation, and nothing else
+                self.fail(error)
         self._complete_block()
         return True
 
@@ -296,7 +306,18 @@ class MetaGraph:
             return False
         self._running, self.took_s = None, running.took_s
         self._apply(running, running.result)
+        self._pose, self._covariance = self._newest()
+        self.optimized = True
         return True
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+        return self.running
+
+    def finish(self) -> bool:
+        """Run what is left of an optimisation that has begun; returns whether there was one."""
+        return self._running is not None and self.advance(self._running.left)
 
     def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> None:
         keys, first = running.keys, running.first
@@ -317,7 +338,28 @@ class MetaGraph:
         """Leave undone what has begun."""
         self._running = None
 
+    def fail(self, error: Exception) -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+        self.fault = f"an optimisation failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self.abandon()
+
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
+        return self._pose, self._covariance
+
+    def frame_poses(self, before: bool = False) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
+        nodes, odometry = torch.from_numpy(self.nodes(before)), torch.from_numpy(self.odometry.values)
+        starts = odometry[: len(nodes) * self._block : self._block].unsqueeze(1)
+        whole = (len(nodes) - 1) * self._block
+        in_blocks = se2.between(starts[:-1], odometry[1 : whole + 1].unflatten(0, (-1, self._block))).unsqueeze(0)
+        steps = se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
+        corrected = se2.compose(nodes[:-1].unsqueeze(1), in_block_poses(in_blocks, steps)[0]).flatten(0, 1)
+        tail = se2.compose(nodes[-1:], se2.between(starts[-1], odometry[whole + 1 :]))
+        poses: np.ndarray = torch.cat((nodes[:1], corrected, tail)).numpy()
+        return poses
+
+    def _newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
         whole = self.blocks * self._block
         odometry = torch.from_numpy(self.odometry.values[whole:])

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
 
-_SYMMETRIC = {"SymmetricMode": True}
+# Pivots stay on the diagonal. No relaxed supernodes: they fill columns that have little in common, and are many times
+# slower in graphs of thousands of poses.
+_SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "options": {"SymmetricMode": True}}
 
 
 class GraphStructure:
@@ -76,7 +78,7 @@ def _order_of_elimination(pairs: np.ndarray, count: int) -> np.ndarray:
     diagonal = np.arange(count)
     rows, columns = (np.concatenate((pairs[:, k], pairs[:, 1 - k], diagonal)) for k in (0, 1))
     matrix = csc_matrix((values, (rows, columns)), shape=(count, count))
-    order: np.ndarray = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=_SYMMETRIC).perm_c
+    order: np.ndarray = splu(matrix, permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC).perm_c
     return order.astype(np.int64)
 
 
@@ -90,7 +92,7 @@ class NormalEquations:
         self._right = torch.zeros(structure.count, 3, dtype=torch.float64)
         self._right.index_add_(0, nodes.flatten(), gradient.reshape(-1, 3))
         matrix = structure.matrix(hessian)
-        self._factor = splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=_SYMMETRIC)
+        self._factor = splu(matrix, permc_spec="NATURAL", **_SYMMETRIC)
 
     def step(self) -> Tensor:
         """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""

@@ -13,16 +13,30 @@ _COLORS = ("#2ca02c", "#ff7f0e", "#9467bd", "#d62728")
 _MOST_POINTS = 20_000
 
 
-def save_plot(path: Path, title: str, estimates: Mapping[str, np.ndarray], truth: np.ndarray | None = None) -> None:
-    """Write a PNG with a panel for each estimate, seen from above.
+def save_plot(
+    path: Path,
+    title: str,
+    estimates: Mapping[str, np.ndarray],
+    truth: np.ndarray | None = None,
+    walls: np.ndarray | None = None,
+) -> None:
+    """Write a PNG with a panel for each estimate, seen from above, and one for the walls where they are given.
 
     Args:
         estimates: poses ``(frames, 3)`` by name, all in one frame.
         truth: poses ``(frames, 3)`` in the same frame.
+        walls: points ``(n, 2)`` of all scans at the last estimate's poses.
     """
-    figure = Figure(figsize=(6.2 * len(estimates), 6.2))
+    count = len(estimates) + (walls is not None)
+    figure = Figure(figsize=(6.2 * count, 6.2))
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(estimates), sharex=True, sharey=True, squeeze=False)[0]
+    panels = figure.subplots(1, count, sharex=walls is None, sharey=walls is None, squeeze=False)[0]
+    if walls is not None:
+        # One dot a point: a wall that is drawn twice shows at once.
+        panels[-1].plot(walls[:, 0], walls[:, 1], ",", color="black", alpha=0.35)
+        panels[-1].plot(*list(estimates.values())[-1][:, :2].T, color=_COLORS[1], linewidth=0.6, alpha=0.7)
+        panels[-1].set_aspect("equal", adjustable="box")
+        panels[-1].set(title="all scans at corrected poses", xlabel="x (m)")
     for axes, (name, poses), color in zip(panels, estimates.items(), _COLORS, strict=False):
         if truth is not None:
             _draw(axes, truth, TRUTH, "truth")

@@ -1,0 +1,55 @@
+"""Configuration dataclasses from the values of a JSON file."""
+
+import dataclasses
+import math
+import types
+import typing
+from typing import Any, TypeVar
+
+Config = TypeVar("Config")
+
+
+def config_from_dict(kind: type[Config], values: Any) -> Config:
+    """Build a (nested) configuration dataclass from JSON values; unknown and missing keys are errors."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{kind.__name__} is {values!r}; expected an object")
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if unknown := sorted(set(values) - set(fields)):
+        raise ValueError(f"{kind.__name__} has unknown keys {unknown}; expected among {sorted(fields)}")
+    hints = typing.get_type_hints(kind)
+    arguments = {}
+    for name, value in values.items():
+        try:
+            arguments[name] = _from_json(hints[name], value)
+        except ValueError as error:
+            raise ValueError(f"{kind.__name__}.{name}: {error}") from error
+    try:
+        return kind(**arguments)
+    except TypeError as error:
+        raise ValueError(f"{kind.__name__}: {error}") from error
+
+
+def _from_json(hint: Any, value: Any) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return config_from_dict(typing.cast("type[Any]", hint), value)
+    if typing.get_origin(hint) is types.UnionType:  # a value or None
+        (hint,) = (one for one in typing.get_args(hint) if one is not type(None))
+        return None if value is None else _from_json(hint, value)
+    if typing.get_origin(hint) is tuple:
+        items = typing.get_args(hint)
+        if not isinstance(value, list) or (items[-1] is not Ellipsis and len(value) != len(items)):
+            raise ValueError(f"{value!r} is given where {hint} is expected")
+        return tuple(_from_json(items[0], item) for item in value)
+    # JSON has one kind of number, and true is no number.
+    allowed = (int, float) if hint is float else hint
+    if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
+        raise ValueError(f"{value!r} is given where {hint.__name__} is expected")
+    if hint is not float:
+        return value
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(f"{value!r} is given where a finite number is expected")
+    return number

@@ -1,0 +1,242 @@
+"""Exhaustive search of a scan's pose in a map: the best one of a window, and whether another fits nearly as well.
+
+Not in the paper. Branch and bound over pooled likelihood grids (Hess et al. 2016, section V): a cell of a coarse grid
+holds the largest likelihood of a block of fine cells, so that one look-up bounds the response of all poses of a block.
+The best block is split first; the first single pose that comes up is the best of the window.
+"""
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from ngo_estimator.geometry.planar_motion import transformed
+
+_REACH = 3.0
+"""Deviations around a point that have a likelihood."""
+
+
+@dataclass(frozen=True)
+class PooledGrid:
+    """Likelihoods of a map, and their maxima over blocks.
+
+    ``levels`` ``(depth + 1, rows, columns)``, uint8: cell ``(row, column)`` of level ``h`` holds the maximum over the
+    ``2 ** h`` cells from there on in x (columns) and y (rows), 255 for a likelihood of one. ``origin_m`` ``(2,)`` is
+    the corner of cell (0, 0), ``resolution_m`` the size of a cell.
+    """
+
+    levels: np.ndarray
+    origin_m: np.ndarray
+    resolution_m: float
+
+
+@dataclass(frozen=True)
+class SearchMatch:
+    """The best pose of a window.
+
+    ``pose`` ``(3,)`` is the pose of the points in the map (m, m, rad), ``response`` the mean likelihood of the points
+    there, 0 to 1. ``second`` is the largest response at poses that are well separated from the best one, or an upper
+    bound of it where the search was cut short. ``second_pose`` ``(3,)`` has that response; None where only the bound
+    is known.
+    """
+
+    pose: np.ndarray
+    response: float
+    second: float
+    second_pose: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How finely poses are searched.
+
+    ``resolution_m`` is the size of a cell and the step of positions, ``heading_step_deg`` the step of headings.
+    ``deviation_m`` is the deviation of a point from the wall it belongs to. Blocks have up to ``2 ** depth`` cells a
+    side. Poses farther than ``separation_m`` or ``separation_deg`` from the best are well separated. Responses below
+    ``least_response`` and second peaks below ``least_second`` of the first are not told apart. After ``most_blocks``
+    blocks the search is cut short.
+    """
+
+    resolution_m: float = 0.08
+    heading_step_deg: float = 2.0
+    deviation_m: float = 0.1
+    depth: int = 6
+    separation_m: float = 0.8
+    separation_deg: float = 15.0
+    least_response: float = 0.4
+    least_second: float = 0.7
+    most_blocks: int = 100_000
+
+    def __post_init__(self) -> None:
+        lengths = (self.resolution_m, self.heading_step_deg, self.deviation_m, self.separation_m, self.separation_deg)
+        if not all(0.0 < x < math.inf for x in lengths):
+            raise ValueError(
+                "resolution_m, heading_step_deg, deviation_m, separation_m, separation_deg are "
+                f"{lengths}; expected positive numbers"
+            )
+        if not (0 <= self.depth <= 10 and self.most_blocks >= 1):
+            raise ValueError(
+                f"depth, most_blocks are {self.depth}, {self.most_blocks}; expected 0 to 10, and at least 1"
+            )
+        if not (0.0 <= self.least_response < 1.0 and 0.0 <= self.least_second <= 1.0):
+            raise ValueError(
+                f"least_response, least_second are {self.least_response}, {self.least_second}; expected shares of one"
+            )
+
+
+def pooled_grid(config: SearchConfig, points: np.ndarray) -> PooledGrid:
+    """Likelihood grids of a map's points ``(n, 2)`` (m); raises ``ValueError`` where there are none."""
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
+        raise ValueError(f"points have the shape {points.shape}; expected (n, 2) with at least one point")
+    resolution = config.resolution_m
+    reach = math.ceil(_REACH * config.deviation_m / resolution)
+    # A look-up below the first cell is then a look-up of nothing: no block reaches from there to a point.
+    before = (1 << config.depth) + reach
+    origin = points.min(0) - before * resolution
+    columns, rows = (np.ceil((points.max(0) - origin) / resolution)).astype(np.int64) + reach + 1
+    levels = np.zeros((config.depth + 1, rows, columns), np.uint8)
+    _stamp(levels[0], points - origin, resolution, config.deviation_m, reach)
+    for h in range(config.depth):
+        step, fine, coarse = 1 << h, levels[h], levels[h + 1]
+        coarse[:] = fine
+        np.maximum(coarse[:, :-step], fine[:, step:], out=coarse[:, :-step])
+        coarse[:-step] = np.maximum(coarse[:-step], coarse[step:])
+    return PooledGrid(levels, origin, resolution)
+
+
+def search(
+    config: SearchConfig, grid: PooledGrid, points: np.ndarray, centre: np.ndarray, window: np.ndarray
+) -> SearchMatch | None:
+    """Best pose of points ``(n, 2)`` (m) within ``window`` to each side of ``centre``, both ``(3,)`` (m, m, rad).
+
+    Positions and headings are taken on a lattice around ``centre``. A window of pi and more in heading is a full turn.
+    Returns ``None`` where no response reaches ``least_response``, or the search was cut short before it found the best.
+    """
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
+        raise ValueError(f"points have the shape {points.shape}; expected (n, 2) with at least one point")
+    if centre.shape != (3,) or window.shape != (3,) or not (np.isfinite(centre).all() and (window >= 0.0).all()):
+        raise ValueError(f"centre, window are {centre}, {window}; expected three finite numbers and three from 0 on")
+    headings = centre[2] + _heading_offsets(config, float(window[2]))
+    cosine, sine = np.cos(headings)[:, None], np.sin(headings)[:, None]
+    x = cosine * points[:, 0] - sine * points[:, 1] + (centre[0] - grid.origin_m[0])
+    y = sine * points[:, 0] + cosine * points[:, 1] + (centre[1] - grid.origin_m[1])
+    cells = np.floor(np.stack((x, y), axis=-1) / grid.resolution_m).astype(np.int32)
+    half_x, half_y = (math.floor(w / grid.resolution_m + 1e-9) for w in window[:2])
+    apart = config.separation_m / grid.resolution_m
+    found = _best_first(
+        grid.levels, cells, headings, half_x, half_y, apart, math.radians(config.separation_deg),
+        config.least_response, config.least_second, config.most_blocks,
+    )  # fmt: skip
+    response, second, best, other = found
+    if response < 0.0:
+        return None
+
+    def pose(place: tuple[int, int, int]) -> np.ndarray:
+        angle, across, up = place
+        shift = np.array((across, up)) * grid.resolution_m
+        return np.array((centre[0] + shift[0], centre[1] + shift[1], headings[angle]))
+
+    return SearchMatch(pose(best), response, second, None if other[0] < 0 else pose(other))
+
+
+def response_at(grid: PooledGrid, points: np.ndarray, pose: np.ndarray) -> float:
+    """Mean likelihood of points ``(n, 2)`` (m) at a pose ``(3,)``, 0 to 1; raises ``ValueError`` without a point."""
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
+        raise ValueError(f"points have the shape {points.shape}; expected (n, 2) with at least one point")
+    cells = np.floor((transformed(pose, points) - grid.origin_m) / grid.resolution_m).astype(np.int32)
+    return float(_sum(grid.levels[0], cells, 0, 0) / (255.0 * len(points)))
+
+
+def _heading_offsets(config: SearchConfig, window: float) -> np.ndarray:
+    step = math.radians(config.heading_step_deg)
+    if window >= math.pi:
+        return np.linspace(-math.pi, math.pi, math.ceil(2.0 * math.pi / step), endpoint=False)
+    half = math.floor(window / step + 1e-9)
+    return step * np.arange(-half, half + 1)
+
+
+@njit(cache=True)
+def _stamp(grid: np.ndarray, points: np.ndarray, resolution: float, deviation: float, reach: int) -> None:
+    """Raise the cells around each point to its likelihood at their centres."""
+    scale = -0.5 * (resolution / deviation) ** 2
+    for k in range(len(points)):
+        x, y = points[k, 0] / resolution, points[k, 1] / resolution
+        column, row = math.floor(x), math.floor(y)
+        for i in range(row - reach, row + reach + 1):
+            for j in range(column - reach, column + reach + 1):
+                value = np.uint8(round(255.0 * math.exp(scale * ((j + 0.5 - x) ** 2 + (i + 0.5 - y) ** 2))))
+                grid[i, j] = max(grid[i, j], value)
+
+
+@njit(cache=True)
+def _sum(level: np.ndarray, cells: np.ndarray, across: int, up: int) -> int:
+    """Sum of the likelihoods at cells ``(n, 2)`` moved by ``across`` columns and ``up`` rows."""
+    rows, columns = level.shape
+    total = 0
+    for k in range(len(cells)):
+        column, row = cells[k, 0] + across, cells[k, 1] + up
+        if 0 <= column < columns and 0 <= row < rows:
+            total += level[row, column]
+    return total
+
+
+@njit(cache=True)
+def _best_first(
+    levels: np.ndarray, cells: np.ndarray, headings: np.ndarray, half_x: int, half_y: int, apart: float,
+    apart_rad: float, least_response: float, least_second: float, most_blocks: int,
+) -> tuple[float, float, tuple[int, int, int], tuple[int, int, int]]:  # fmt: skip
+    """Response, second response, and heading, column and row of both; -1 for what was not found."""
+    nowhere = (-1, 0, 0)
+    depth = len(levels) - 1
+    while depth > 0 and (1 << depth) > 2 * max(half_x, half_y) + 1:
+        depth -= 1
+    full = 255.0 * cells.shape[1]
+    step = 1 << depth
+    least = least_response * full
+    # A heap of the smallest: sums are negated. Heading, column, row and level make the order of equals definite.
+    heap = [(0, 0, 0, 0, 0) for _ in range(0)]
+    for angle in range(len(headings)):
+        for across in range(-half_x, half_x + 1, step):
+            for up in range(-half_y, half_y + 1, step):
+                bound = _sum(levels[depth], cells[angle], across, up)
+                if bound >= least:
+                    heap.append((-bound, depth, angle, across, up))
+    heapq.heapify(heap)
+    best, best_angle, best_across, best_up = -1.0, 0, 0, 0
+    blocks = 0
+    while len(heap) > 0:
+        negative, level, angle, across, up = heapq.heappop(heap)
+        if -negative < least:
+            break
+        found = best >= 0.0
+        # The farthest corner of the block: nearer than that, all of it belongs to the best peak.
+        last = (1 << level) - 1
+        if found:
+            far_x = max(abs(across - best_across), abs(min(across + last, half_x) - best_across))
+            far_y = max(abs(up - best_up), abs(min(up + last, half_y) - best_up))
+            turn = abs(headings[angle] - headings[best_angle])
+            turn = min(turn, 2.0 * math.pi - turn)
+            if far_x * far_x + far_y * far_y <= apart * apart and turn <= apart_rad:
+                continue
+        if level == 0:
+            if found:
+                return best / full, -negative / full, (best_angle, best_across, best_up), (angle, across, up)
+            best, best_angle, best_across, best_up = -float(negative), angle, across, up
+            least = max(least, least_second * best)
+            continue
+        blocks += 1
+        if blocks > most_blocks:
+            return best / full if found else -1.0, -negative / full, (best_angle, best_across, best_up), nowhere
+        size = 1 << (level - 1)
+        for i in range(2):
+            for j in range(2):
+                column, row = across + i * size, up + j * size
+                if column <= half_x and row <= half_y:
+                    bound = _sum(levels[level - 1], cells[angle], column, row)
+                    if bound >= least:
+                        heapq.heappush(heap, (-bound, level - 1, angle, column, row))
+    if best < 0.0:
+        return -1.0, 0.0, nowhere, nowhere
+    return best / full, least / full, (best_angle, best_across, best_up), nowhere

@@ -1,0 +1,118 @@
+"""Points with normals in a grid of cells: the lines that other scans are registered to."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
+
+CELL_M = 0.4
+"""Side of a cell, and how far along its line a point may be from the point that it is compared with."""
+
+_FARTHEST_M = 120.0
+"""Points farther than this from the middle point are left out, so that the grid's memory is bounded."""
+
+
+@dataclass(frozen=True, eq=False)
+class LineMap:
+    """Points ``(n, 2)`` that have normals ``(n, 2)``, in the order of their cells; those of cell ``c`` of ``shape``
+    (rows, columns) are ``first[c]`` to ``first[c + 1]``. ``corner`` ``(2,)`` is the grid's least x and y."""
+
+    points: Array
+    normals: Array
+    first: NDArray[np.int64]
+    corner: Array
+    shape: tuple[int, int]
+
+
+def line_map(scans: Sequence[KeyScan], poses: Sequence[Array]) -> LineMap:
+    """The lines of scans whose base frames have the given poses ``(3,)``, in the frame of these.
+
+    Raises:
+        ValueError: there are no scans, or not one pose a scan.
+    """
+    if not scans or len(scans) != len(poses):
+        raise ValueError(f"{len(scans)} scans and {len(poses)} poses given; expected as many of both, at least one")
+    return line_map_of_points(
+        np.concatenate([transformed(pose, scan.points) for scan, pose in zip(scans, poses, strict=True)]),
+        np.concatenate([rotated(pose[2], scan.normals) for scan, pose in zip(scans, poses, strict=True)]),
+    )
+
+
+def line_map_of_points(points: Array, normals: Array) -> LineMap:
+    """The lines at points ``(n, 2)`` with normals ``(n, 2)``, zero where there is none."""
+    has_line = (normals[:, 0] != 0.0) | (normals[:, 1] != 0.0)
+    points, normals = points[has_line], normals[has_line]
+    if len(points):
+        near = np.abs(points - np.median(points, axis=0)).max(axis=1) < _FARTHEST_M
+        points, normals = points[near], normals[near]
+    corner = points.min(axis=0) - CELL_M if len(points) else np.zeros(2)
+    extent = points.max(axis=0) - corner if len(points) else np.zeros(2)
+    shape = (int(extent[1] / CELL_M) + 2, int(extent[0] / CELL_M) + 2)
+    first, order = _cells(points, corner, shape[0], shape[1])
+    return LineMap(points[order], normals[order], first, corner, shape)
+
+
+@njit(cache=True)
+def averaged_lines(points: Array, normals: Array, side: float = 0.06) -> tuple[Array, Array]:
+    """Points and normals ``(m, 2)``, averaged over squares of a side (m) and an eighth of a turn of the normals.
+
+    Points without normals are left out. Averages are less noisy than single points, and fewer.
+    """
+    keys = np.empty(len(points), dtype=np.int64)
+    count = 0
+    for i in range(len(points)):
+        if normals[i, 0] == 0.0 and normals[i, 1] == 0.0:
+            keys[i] = -1
+            continue
+        row, column = math.floor(points[i, 1] / side), math.floor(points[i, 0] / side)
+        direction = math.floor((math.atan2(normals[i, 1], normals[i, 0]) / math.pi + 1.125) * 4.0) % 8
+        # 30 bits for either coordinate: thousands of kilometres.
+        keys[i] = (((row + (1 << 29)) << 30 | (column + (1 << 29))) << 3) | direction
+    order = np.argsort(keys)
+    mean_points, mean_normals = np.zeros_like(points), np.zeros_like(normals)
+    last, size = np.int64(-1), 0
+    for i in order:
+        if keys[i] < 0:
+            continue
+        if keys[i] != last:
+            if size:
+                _finish(mean_points, mean_normals, count - 1, size)
+            last, size, count = keys[i], 0, count + 1
+        for axis in range(2):
+            mean_points[count - 1, axis] += points[i, axis]
+            mean_normals[count - 1, axis] += normals[i, axis]
+        size += 1
+    if size:
+        _finish(mean_points, mean_normals, count - 1, size)
+    return mean_points[:count].copy(), mean_normals[:count].copy()
+
+
+@njit(cache=True)
+def _finish(points: Array, normals: Array, i: int, size: int) -> None:
+    points[i] /= size
+    normals[i] /= math.hypot(normals[i, 0], normals[i, 1])
+
+
+@njit(cache=True)
+def _cells(points: Array, corner: Array, rows: int, columns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    cells = np.empty(len(points), dtype=np.int64)
+    first = np.zeros(rows * columns + 1, dtype=np.int64)
+    for i in range(len(points)):
+        row = math.floor((points[i, 1] - corner[1]) / CELL_M)
+        column = math.floor((points[i, 0] - corner[0]) / CELL_M)
+        cells[i] = row * columns + column
+        first[cells[i] + 1] += 1
+    for c in range(rows * columns):
+        first[c + 1] += first[c]
+    place = first.copy()
+    order = np.empty(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        order[place[cells[i]]] = i
+        place[cells[i]] += 1
+    return first, order

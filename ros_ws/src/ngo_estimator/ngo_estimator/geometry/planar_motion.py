@@ -1,0 +1,62 @@
+"""Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: ``se2`` without torch.
+
+Poses have the shape ``(3,)``. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies in ``(-pi, pi]``.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True)
+def wrap(angle: float) -> float:
+    """An angle (rad) mapped into ``(-pi, pi]``."""
+    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
+
+
+@njit(cache=True)
+def compose(a: Array, b: Array) -> Array:
+    """The pose that applies ``b`` in the frame of ``a``."""
+    cos, sin = math.cos(a[2]), math.sin(a[2])
+    return np.array((a[0] + cos * b[0] - sin * b[1], a[1] + sin * b[0] + cos * b[1], wrap(a[2] + b[2])))
+
+
+@njit(cache=True)
+def between(a: Array, b: Array) -> Array:
+    """Pose ``b`` seen from pose ``a``: ``compose(a, between(a, b))`` is ``b``."""
+    cos, sin = math.cos(a[2]), math.sin(a[2])
+    x, y = b[0] - a[0], b[1] - a[1]
+    return np.array((cos * x + sin * y, -sin * x + cos * y, wrap(b[2] - a[2])))
+
+
+@njit(cache=True)
+def rotated(yaw: float, xy: Array) -> Array:
+    """Vectors ``(n, 2)`` turned by ``yaw``."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    result = np.empty_like(xy)
+    for i in range(len(xy)):
+        x, y = xy[i, 0], xy[i, 1]
+        result[i, 0], result[i, 1] = cos * x - sin * y, sin * x + cos * y
+    return result
+
+
+@njit(cache=True)
+def transformed(pose: Array, points: Array) -> Array:
+    """Points ``(n, 2)`` in the frame of ``pose`` as points of the frame that the pose is given in."""
+    result = rotated(pose[2], points)
+    for i in range(len(points)):
+        result[i, 0] += pose[0]
+        result[i, 1] += pose[1]
+    return result
+
+
+@njit(cache=True)
+def turned_covariance(yaw: float, covariance: Array) -> Array:
+    """A covariance ``(3, 3)`` of ``[x, y, yaw]`` whose axes of x and y are turned by ``yaw``."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    return turn @ covariance @ turn.T

@@ -1,0 +1,146 @@
+"""The input of ``local_node`` where networks estimate the motion: images or resampled scans, actions, velocities."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from ngo_msgs.msg import DiscreteAction
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from ngo_common.nodes.process import StartError
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.listening import Listening
+from ngo_estimator.nodes.sensors import sensor_array, sensor_topic
+from ngo_estimator.nodes.settings import LocalNodeSettings
+from ngo_estimator.nodes.status import NodeStatus
+from ngo_estimator.nodes.weights import load_core
+from ngo_estimator.odometry.frame_pairing import FramePairing
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+
+_ACTIONS = (DiscreteAction.FORWARD, DiscreteAction.TURN_LEFT, DiscreteAction.TURN_RIGHT)
+_TWISTS = {"TwistStamped": TwistStamped, "Twist": Twist, "Odometry": Odometry}
+_DEPTH = 1000
+
+
+class ImageInput:
+    """Subscribes to the inputs of the networks in the weights, and hands on an estimate for each pair of frames.
+
+    Args:
+        publish: takes each estimate, and None where the odometry starts anew.
+    """
+
+    def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
+        self._node, self._settings, self._publish = node, settings, publish
+        self._core = load_core(LocalOdometry.load, settings)
+        image_format = self._core.image_format
+        topics = settings.image_topic, settings.scan_topic
+        try:
+            self._sensor_type, topic = sensor_topic(image_format, *topics, settings.image_transport == "compressed")
+        except ValueError as error:
+            raise StartError(f"parameter 'image_transport': {error}") from error
+        self._sensor_topic, self._sensor = topic, "scan" if image_format.is_scan else "image"
+        self._observe: Callable[[Any], np.ndarray] = partial(
+            sensor_array, image_format=image_format, topic=topic, scan_yaw_rad=math.radians(settings.scan_yaw_deg)
+        )
+        self._pairing = FramePairing(
+            self._core.uses_action,
+            int(settings.action_timeout_s * 1e9),
+            settings.action_capacity,
+            self._core.uses_twist,
+            int(settings.twist_tolerance_s * 1e9),
+        )
+        self._missed = self._newly_missed = 0
+
+    @property
+    def description(self) -> str:
+        """What the input listens to, in words."""
+        return f"{self._sensor_type.__name__} on '{self._node.resolve_topic_name(self._sensor_topic)}'"
+
+    def listen(self, listening: Listening, status: NodeStatus) -> None:
+        """Subscribe to everything that the networks take."""
+        self._status, settings = status, self._settings
+        reliability = ReliabilityPolicy[settings.image_reliability.upper()]
+        image_qos = QoSProfile(depth=settings.image_depth, reliability=reliability)
+        listening.to(self._sensor_type, self._sensor_topic, self._on_sensor, image_qos)
+        if self._core.uses_action:
+            listening.to(DiscreteAction, settings.action_topic, self._on_action, QoSProfile(depth=_DEPTH))
+        if self._core.uses_twist:
+            listening.to(_TWISTS[settings.twist_type], settings.twist_topic, self._on_twist, QoSProfile(depth=_DEPTH))
+
+    def _on_sensor(self, message: Any) -> None:
+        stamp_ns = messages.to_ns(message.header.stamp)
+        try:
+            self._pairing.add_frame(stamp_ns, self._observe(message))
+        except ValueError as error:
+            self._status.dropped(self._sensor, error)
+            return
+        self._status.received(stamp_ns)
+        self._update()
+
+    def _on_action(self, message: DiscreteAction) -> None:
+        if message.action not in _ACTIONS:
+            self._status.dropped("action", f"action is {message.action}; expected one of {_ACTIONS}")
+            return
+        self._pairing.add_action(messages.to_ns(message.header.stamp), message.action)
+        self._update()
+
+    def _on_twist(self, message: Twist | TwistStamped | Odometry) -> None:
+        stamp_ns, twist_xyyaw = messages.stamped_twist(message, self._node.get_clock().now().nanoseconds)
+        try:
+            self._pairing.add_twist(stamp_ns, twist_xyyaw)
+        except ValueError as error:
+            self._status.dropped("twist", error)
+            return
+        self._update()
+
+    def _update(self) -> None:
+        dropped, restarts = self._pairing.dropped, self._core.restarts
+        for pair in self._pairing.ready():
+            try:
+                with self._status.timed("time an update"):
+                    estimate = self._core.update(pair.stamp_ns, pair.image, pair.action, pair.twist)
+            except ValueError as error:
+                self._status.dropped(self._sensor, error)
+                continue
+            if estimate is not None:
+                self._missed += estimate.missed_frames
+                self._newly_missed += estimate.missed_frames
+            self._publish(estimate)
+        if self._pairing.dropped > dropped:
+            told = [f"action on '{self._settings.action_topic}'"] if self._core.uses_action else []
+            told += [f"velocity on '{self._settings.twist_topic}'"] if self._core.uses_twist else []
+            kind = f"{self._sensor} without {'action' if self._core.uses_action else 'velocity'}"
+            reason = f"the {' or the '.join(told)} that led to it did not come"
+            self._status.dropped(kind, reason, self._pairing.dropped - dropped)
+        if self._core.restarts > restarts:
+            self._node.get_logger().info(
+                f"the {self._sensor}s' stamps jumped back: their source restarted, so the odometry starts anew"
+            )
+
+    def reset(self) -> str:
+        """Start anew with the next frame; returns what that means, in words."""
+        self._core.reset()
+        self._pairing.reset()
+        return "the next image is the new origin of the odometry"
+
+    def details(self) -> dict[str, str]:
+        """Values for diagnostics."""
+        waiting = f"{self._sensor}s waiting for {'velocities' if self._core.uses_twist else 'actions'}"
+        return {
+            waiting: str(self._pairing.waiting),
+            "missed frames": str(self._missed),
+            "restarts": str(self._core.restarts),
+        }
+
+    def problems(self) -> list[str]:
+        """A line for each thing that was wrong since the last call."""
+        if not self._newly_missed:
+            return []
+        missed, self._newly_missed = self._newly_missed, 0
+        return [f"{missed} frames missing between images, bridged with a larger covariance"]

@@ -1,0 +1,73 @@
+"""The last key scans at their poses, as lines to register to and as a field to search in."""
+
+import math
+from collections import deque
+
+import numpy as np
+
+from ngo_estimator.geometry import branch_and_bound
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.likelihood_field import LikelihoodField, SearchConfig, draw, joined, likelihood_field
+from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points
+from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
+
+_REDRAWN_SCANS = 10
+_REDRAWN_M = 5.0
+"""The field is drawn anew after so many scans or metres; scans that left the submap stay in it until then."""
+
+
+_WIDE_SCANS = 10
+"""So many of the newest scans make the grid of wide searches."""
+
+
+class LocalSubmap:
+    """At most ``most_scans`` key scans in the odometry's frame; lines and field are made when first asked for."""
+
+    def __init__(self, most_scans: int, search: SearchConfig) -> None:
+        self._points: deque[Array] = deque(maxlen=most_scans)
+        self._normals: deque[Array] = deque(maxlen=most_scans)
+        self._search = search
+        self._last = np.zeros(2)
+        self._middle = np.zeros(2)
+        self._lines: LineMap | None = None
+        self._field: LikelihoodField | None = None
+        self._grid: branch_and_bound.PooledGrid | None = None
+        self._undrawn = 0
+        self._drawn = 0
+
+    def add(self, scan: KeyScan, pose: Array) -> None:
+        """Add a scan whose base frame has the pose ``(3,)``; the oldest leaves where there are too many."""
+        self._points.append(transformed(pose, scan.points))
+        self._normals.append(rotated(pose[2], scan.normals))
+        self._last = pose[:2].copy()
+        self._lines = self._grid = None
+        self._undrawn += 1
+
+    @property
+    def lines(self) -> LineMap:
+        """The lines of all scans, averaged where they lie on each other."""
+        if self._lines is None:
+            points, normals = np.concatenate(self._points), np.concatenate(self._normals)
+            self._lines = line_map_of_points(*averaged_lines(points, normals))
+        return self._lines
+
+    def grid(self, config: branch_and_bound.SearchConfig) -> branch_and_bound.PooledGrid:
+        """The pooled grid of the newest scans, for wide searches; the same until a scan is added."""
+        if self._grid is None:
+            points = np.concatenate(list(self._points)[-_WIDE_SCANS:])
+            normals = np.concatenate(list(self._normals)[-_WIDE_SCANS:])
+            self._grid = branch_and_bound.pooled_grid(config, joined(points, normals, config.resolution_m))
+        return self._grid
+
+    @property
+    def field(self) -> LikelihoodField:
+        """The likelihood field of all scans, round the last one or near it."""
+        moved = math.dist(self._last, self._middle)
+        if self._field is None or self._drawn + self._undrawn > _REDRAWN_SCANS or moved > _REDRAWN_M:
+            self._middle, self._drawn, self._undrawn = self._last, 0, 0
+            points, normals = np.concatenate(self._points), np.concatenate(self._normals)
+            self._field = likelihood_field(points, normals, self._middle, self._search)
+        while self._undrawn:
+            draw(self._field, self._points[-self._undrawn], self._normals[-self._undrawn])
+            self._drawn, self._undrawn = self._drawn + 1, self._undrawn - 1
+        return self._field

@@ -1,0 +1,134 @@
+"""Where the next scan is expected: by the wheels, and by the velocity that the scans measured last.
+
+The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
+Wheels that stand still while the scans moved (frozen), or that run away from them (a jump), are doubted: the prior
+widens by the disagreement until the next key scan, and both predictions are tried.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.geometry.planar_motion import Array, compose, wrap
+from ngo_estimator.odometry.wheel_odometry import WheelOdometry
+
+
+@dataclass(frozen=True)
+class MotionPriorConfig:
+    """How far predictions may be wrong.
+
+    Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
+    ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
+    zero. Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``
+    allow, or where they stand exactly still while constant velocity moves by ``frozen_m``.
+    """
+
+    still_m: float = 0.03
+    still_deg: float = 1.5
+    acceleration_m_s2: float = 2.0
+    acceleration_rad_s2: float = 4.0
+    largest_m: float = 1.0
+    largest_deg: float = 45.0
+    longest_s: float = 1.5
+    doubt_m: float = 0.1
+    doubt_m_s2: float = 4.0
+    frozen_m: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} is {value}; expected a positive number")
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The prior of a scan's pose in the odometry's frame: ``mean`` ``(3,)`` with ``covariance`` and ``information``
+    ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``by_wheels`` says that wheels made it, and
+    ``measured`` that they are not doubted. Where these moved, ``step_covariance`` ``(3, 3)`` is that of their motion
+    since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen."""
+
+    mean: Array
+    covariance: Array
+    information: Array
+    starts: tuple[Array, ...]
+    by_wheels: bool = False
+    measured: bool = False
+    step_covariance: Array | None = None
+
+
+class MotionPrior:
+    """Keeps the last motion, and the last key scan's pose with the wheels' pose there."""
+
+    def __init__(self, config: MotionPriorConfig) -> None:
+        self.config = config
+        self._stamp_ns = 0
+        self._velocity = np.zeros(3)
+        self._anchor = np.zeros(3)
+        self._anchor_wheels: Array | None = None
+        self._last_wheels: Array | None = None
+        self._now_wheels: Array | None = None
+        self._doubt = 0.0  # m since the last key scan
+        self._doubt_rad = 0.0
+
+    def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
+        """The first scan is a key scan at this pose."""
+        self._stamp_ns, self._anchor = stamp_ns, pose
+        self._last_wheels = self._anchor_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
+
+    def predict(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry | None) -> Prediction:
+        """The prior of the scan at a stamp, after the last one had the pose ``last`` ``(3,)``.
+
+        ``covariance`` ``(3, 3)`` is that of ``last`` against the last key scans. It counts where wheels do not lead
+        back to a key scan.
+        """
+        elapsed = (stamp_ns - self._stamp_ns) * 1e-9
+        constant = self._velocity * elapsed if elapsed <= self.config.longest_s else np.zeros(3)
+        self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
+        if wheels is None or self._now_wheels is None or self._last_wheels is None:
+            return self._without_wheels(last, covariance, constant, elapsed)
+        step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
+        starts = [compose(last, step)]
+        off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
+        way = math.hypot(constant[0], constant[1])
+        frozen = not step.any() and (way > self.config.frozen_m or off_rad > math.radians(self.config.still_deg))
+        jumped = off > self.config.doubt_m + self.config.doubt_m_s2 * elapsed**2
+        if frozen or jumped:
+            self._doubt += off
+            self._doubt_rad += off_rad
+            starts.append(compose(last, constant))
+        if self._anchor_wheels is None:
+            self._anchor, self._anchor_wheels = last, self._last_wheels
+        moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
+        deviations = deviations + np.array((self._doubt, self._doubt, self._doubt_rad))
+        mean = compose(self._anchor, moved)
+        if frozen or jumped or self._doubt:
+            # The wheels' way since the key scan is wrong by what was doubted: go on from the last scan.
+            mean = starts[0]
+        doubted = self._doubt > 0.0
+        moves = not doubted and bool(step.any())
+        total = np.diag(deviations**2)
+        step_covariance = np.diag(step_deviations**2) if moves else None
+        return Prediction(mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance)
+
+    def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
+        config = self.config
+        position = min(config.still_m + 0.5 * config.acceleration_m_s2 * elapsed**2, config.largest_m)
+        heading = math.radians(config.still_deg) + 0.5 * config.acceleration_rad_s2 * elapsed**2
+        deviations = np.array((position, position, min(heading, math.radians(config.largest_deg))))
+        mean = compose(last, constant)
+        total = np.diag(deviations**2) + covariance
+        information = np.linalg.inv(total).astype(np.float64)
+        return Prediction(mean, total, information, (mean,))
+
+    def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool, unsure: bool) -> None:
+        """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before.
+
+        A step that is ``unsure`` is no measured velocity: without wheels the last one is believed less and less.
+        """
+        measured = not unsure or self._now_wheels is not None
+        self._velocity = step / ((stamp_ns - self._stamp_ns) * 1e-9) if measured else 0.5 * self._velocity
+        self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
+        if is_key:
+            self._anchor, self._anchor_wheels = pose, self._now_wheels
+            self._doubt = self._doubt_rad = 0.0

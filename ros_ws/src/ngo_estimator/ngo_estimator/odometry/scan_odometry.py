@@ -1,0 +1,265 @@
+"""The local estimator of a 2D lidar without learning: prior, search where the prior is poor, registration.
+
+Each scan is registered to the last key scans, so that scans between two keys add no drift. The wheels' motion since the
+last key scan is the prior, by its covariance: where the walls leave a direction open, the wheels decide it.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.likelihood_field import SearchConfig, search
+from ngo_estimator.geometry.planar_motion import Array, between, turned_covariance, wrap
+from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
+from ngo_estimator.networks.step_deviation import STEP_EVIDENCE
+from ngo_estimator.odometry.local_submap import LocalSubmap
+from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
+from ngo_estimator.odometry.step_evidence import StepScaling, step_evidence
+from ngo_estimator.odometry.wheel_odometry import WheelOdometry
+from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
+
+
+@dataclass(frozen=True)
+class ScanOdometryConfig:
+    """How scans become odometry.
+
+    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one; ``submap_scans`` of these are what
+    the next scan is registered to. A search precedes the registration where the prediction may be ``poor_m`` or
+    ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
+    ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
+    where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
+    ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that is
+    ``farthest_deviations`` from the prediction is no better than it.
+    """
+
+    key_distance_m: float = 0.3
+    key_turn_deg: float = 15.0
+    submap_scans: int = 30
+    poor_m: float = 0.1
+    poor_deg: float = 5.0
+    search_deviations: float = 2.0
+    good_share: float = 0.5
+    sure_share: float = 0.7
+    wide_m: float = 0.5
+    largest_window_m: float = 1.0
+    largest_window_deg: float = 30.0
+    least_share: float = 0.2
+    least_points: int = 15
+    farthest_deviations: float = 3.5
+    open_share: float = 0.01
+    icp: IcpConfig = field(default_factory=IcpConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    wide: WideSearchConfig = field(default_factory=WideSearchConfig)
+    prior: MotionPriorConfig = field(default_factory=MotionPriorConfig)
+
+    def __post_init__(self) -> None:
+        positive = (
+            self.key_distance_m, self.key_turn_deg, self.poor_m, self.poor_deg, self.search_deviations, self.wide_m,
+            self.farthest_deviations, self.largest_window_m, self.largest_window_deg,
+        )  # fmt: skip
+        if not all(0.0 < value < math.inf for value in positive):
+            raise ValueError(f"the distances, angles and deviations are {positive}; expected positive numbers")
+        if self.submap_scans < 1 or self.least_points < 3:
+            raise ValueError(
+                f"submap_scans, least_points are {self.submap_scans}, {self.least_points}; expected at least 1 and 3"
+            )
+        if not 0.0 < self.least_share <= self.good_share <= self.sure_share <= 1.0:
+            raise ValueError(
+                f"least_share, good_share, sure_share are {self.least_share}, {self.good_share}, {self.sure_share}; "
+                "expected 0 < least_share <= good_share <= sure_share <= 1"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class ScanEstimate:
+    """Where a scan was taken.
+
+    Attributes:
+        stamp_ns: stamp of the scan.
+        step: pose ``(3,)`` seen from that of the last scan (m, m, rad), and ``step_covariance`` ``(3, 3)`` of its
+            components.
+        pose: pose ``(3,)`` in the odometry's frame, in which the first scan has the identity.
+        since_key: pose ``(3,)`` seen from that of the last key scan before this one, and ``since_key_covariance``
+            ``(3, 3)`` of its components.
+        is_key: this scan became a key scan.
+        share: share of the scan's points that lie on lines of the last key scans.
+        searched: a search over a window preceded the registration.
+        unsure: the scan does not say where it was taken: the prediction stands for it, or a second place is as likely.
+        evidence: ``(12,)``, columns as named in ``STEP_EVIDENCE``; zeros for the first scan.
+        factors: ``(3,)`` on the deviations (x, y, yaw), by the trained network; ones without it. They are in
+            ``step_covariance`` and not in ``since_key_covariance``.
+    """
+
+    stamp_ns: int
+    step: Array
+    step_covariance: Array
+    pose: Array
+    since_key: Array
+    since_key_covariance: Array
+    is_key: bool
+    share: float
+    searched: bool
+    unsure: bool
+    evidence: Array
+    factors: Array
+
+
+class ScanOdometry:
+    """Takes scans one by one, and estimates each as it comes; bounded memory."""
+
+    def __init__(self, config: ScanOdometryConfig | None = None, scaling: StepScaling | None = None) -> None:
+        self.config = config or ScanOdometryConfig()
+        self._scaling = scaling
+        self._submap = LocalSubmap(self.config.submap_scans, self.config.search)
+        self._prior = MotionPrior(self.config.prior)
+        self._pose = np.zeros(3)
+        self._covariance = np.zeros((3, 3))
+        self._key = np.zeros(3)
+        self._stamp_ns: int | None = None
+
+    def update(self, scan: KeyScan, wheels: WheelOdometry | None = None) -> ScanEstimate:
+        """Estimate where a scan was taken.
+
+        Args:
+            scan: newer than the last one.
+            wheels: the wheels' poses so far, where the robot has wheels. The turns that the scans measure are given to
+                it, from which it learns its lag.
+
+        Raises:
+            ValueError: the scan is not newer than the last one.
+        """
+        if self._stamp_ns is None:
+            return self._begin(scan, wheels)
+        if scan.stamp_ns <= self._stamp_ns:
+            raise ValueError(f"the scan's stamp is {scan.stamp_ns}; expected one after {self._stamp_ns}")
+        prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
+        found, doubt, searched = self._register(scan, prediction)
+        unsure = self._is_unsure(found, prediction)
+        pose, covariance = (prediction.mean, prediction.covariance) if unsure else (found.pose, found.covariance)
+        if doubt is not None and not unsure:
+            covariance, unsure = covariance + doubt, True
+        return self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
+
+    def _begin(self, scan: KeyScan, wheels: WheelOdometry | None) -> ScanEstimate:
+        self._submap.add(scan, self._pose)
+        self._stamp_ns = scan.stamp_ns
+        self._prior.begin(scan.stamp_ns, self._pose, wheels)
+        zero, none = np.zeros(3), np.zeros((3, 3))
+        nothing = np.zeros(len(STEP_EVIDENCE))
+        return ScanEstimate(
+            scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False, nothing, np.ones(3)
+        )  # fmt: skip
+
+    def _register(self, scan: KeyScan, prediction: Prediction) -> tuple[Registration, Array | None, bool]:
+        """The best registration, the covariance of its doubt where there is any, and whether a search was needed."""
+        config = self.config
+        deviation = np.sqrt(prediction.covariance.diagonal())
+        deviation_m = float(max(deviation[0], deviation[1]))
+        poor = deviation_m > config.poor_m or deviation[2] > math.radians(config.poor_deg)
+        prior = (prediction.mean, prediction.information)
+        starts = list(prediction.starts)
+        open_share = 0.0 if prediction.by_wheels else config.open_share
+        on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
+        if poor:
+            window = (
+                min(config.search_deviations * deviation_m, config.largest_window_m),
+                min(config.search_deviations * float(deviation[2]), math.radians(config.largest_window_deg)),
+            )
+            starts.append(search(self._submap.field, on_lines, starts[0], prior, window)[0])
+        best = self._best(scan, starts, prior, open_share)
+        lost = best.share < config.good_share or (not prediction.by_wheels and deviation_m > config.wide_m)
+        if not lost or len(on_lines) < config.least_points:
+            return best, None, poor
+        place = wide_place(
+            config.wide, self._submap.grid(config.wide.search), on_lines, prediction.mean, deviation_m, best.pose
+        )
+        if place is None:
+            return best, None, True
+        if place.better:
+            if prediction.step_covariance is None:
+                # Nothing measured this motion, and it led to no fit.
+                prior = (place.pose, np.diag((1.0, 1.0, 1.0)))
+            again = self._best(scan, [place.pose], prior, open_share)
+            if again.share > best.share and not self._is_unsure(again, prediction):
+                best = again
+        return best, None if prediction.measured else place.doubt, True
+
+    def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float) -> Registration:
+        """The registration, among those from all starts, that fits most points."""
+        best = self._icp(scan, starts[0], prior, open_share)
+        for start in starts[1:]:
+            other = self._icp(scan, start, prior, open_share)
+            if other.share > best.share + 0.02:
+                best = other
+        return best
+
+    def _icp(self, scan: KeyScan, start: Array, prior: tuple[Array, Array], open_share: float) -> Registration:
+        mean, information = prior
+        found = icp(self._submap.lines, scan.points, scan.normals, start, prior, self.config.icp, open_share)
+        far = _squared_deviations(found.pose, mean, information)
+        if found.share >= self.config.good_share and far > 9.0:
+            # Scans that fit, far from the prior: wheels that slipped or froze must not pull.
+            found = icp(
+                self._submap.lines, scan.points, scan.normals, found.pose, (mean, information * 9.0 / far),
+                self.config.icp, open_share,
+            )  # fmt: skip
+        return found
+
+    def _is_unsure(self, found: Registration, prediction: Prediction) -> bool:
+        config = self.config
+        if found.share < config.least_share or found.fitted < config.least_points:
+            return True
+        far = _squared_deviations(found.pose, prediction.mean, prediction.information) > config.farthest_deviations**2
+        return far and found.share < (config.sure_share if prediction.measured else config.good_share)
+
+    def _accept(
+        self,
+        scan: KeyScan,
+        wheels: WheelOdometry | None,
+        prediction: Prediction,
+        pose: Array,
+        covariance: Array,
+        found: Registration,
+        searched: bool,
+        unsure: bool,
+    ) -> ScanEstimate:
+        assert self._stamp_ns is not None
+        step, since_key = between(self._pose, pose), between(self._key, pose)
+        both = covariance + self._covariance
+        if prediction.step_covariance is not None:
+            # Both poses share the errors of the submap, and of the prior where the walls say nothing.
+            both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
+        if wheels is not None and not unsure and found.share >= self.config.good_share:
+            wheels.observe_turn(self._stamp_ns, scan.stamp_ns, float(step[2]))
+        distance, turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
+        is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
+        evidence = step_evidence(since_key, found, prediction, searched, unsure)
+        factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
+        estimate = ScanEstimate(
+            scan.stamp_ns,
+            step,
+            turned_covariance(-self._pose[2], both) * np.outer(factors, factors),
+            pose,
+            since_key,
+            turned_covariance(-self._key[2], covariance),
+            is_key,
+            found.share,
+            searched,
+            unsure,
+            evidence,
+            factors,
+        )
+        self._prior.accept(scan.stamp_ns, pose, step, is_key, unsure)
+        self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
+        if is_key:
+            self._key, self._covariance = pose, np.zeros((3, 3))
+            self._submap.add(scan, pose)
+        return estimate
+
+
+def _squared_deviations(pose: Array, mean: Array, information: Array) -> float:
+    away = pose - mean
+    away[2] = wrap(away[2])
+    return float(away @ information @ away)

@@ -1,0 +1,120 @@
+"""Wheel odometry as the action of the local estimator: motion between two scans, and how far it may be wrong.
+
+The wheels need no calibration: their deviations allow for it. Their stamps may be late or early against the scans',
+which ``WheelLag`` finds out. They may freeze and jump.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ngo_estimator.geometry.planar_motion import Array, between, wrap
+from ngo_estimator.odometry.wheel_lag import WheelLag, WheelLagConfig
+
+
+@dataclass(frozen=True)
+class WheelOdometryConfig:
+    """How far wheels may be wrong, and how long poses are kept.
+
+    The position's deviation is ``still_m``, and ``distance_share`` of the way, and ``turn_m`` a radian of turn; the
+    heading's is ``still_deg``, and ``distance_deg`` a metre, and ``turn_share`` of the turn. ``kept`` poses are held.
+    A pose is extrapolated by at most ``extrapolated_s``; later the wheels are silent.
+    """
+
+    still_m: float = 0.03
+    distance_share: float = 0.1
+    turn_m: float = 0.05
+    still_deg: float = 1.0
+    distance_deg: float = 4.0
+    turn_share: float = 0.2
+    kept: int = 1024
+    extrapolated_s: float = 0.5
+    lag: WheelLagConfig = field(default_factory=WheelLagConfig)
+
+    def __post_init__(self) -> None:
+        if not (self.still_m > 0.0 and self.still_deg > 0.0):
+            raise ValueError(f"still_m, still_deg are {self.still_m}, {self.still_deg}; expected positive deviations")
+        shares = (self.distance_share, self.turn_m, self.distance_deg, self.turn_share, self.extrapolated_s)
+        if not all(0.0 <= share < math.inf for share in shares) or self.kept < 2:
+            raise ValueError(
+                f"distance_share, turn_m, distance_deg, turn_share, extrapolated_s are {shares} and kept is "
+                f"{self.kept}; expected numbers of at least 0, and at least 2 poses"
+            )
+
+    def deviations(self, motion: Array) -> Array:
+        """Deviations ``(3,)`` of a motion ``(3,)`` (m, m, rad)."""
+        way, turn = math.hypot(motion[0], motion[1]), abs(motion[2])
+        position = self.still_m + self.distance_share * way + self.turn_m * turn
+        heading = math.radians(self.still_deg + self.distance_deg * way) + self.turn_share * turn
+        return np.array((position, position, heading))
+
+
+class WheelOdometry:
+    """Stamped poses of the wheels, and the pose at any time among them; bounded memory."""
+
+    def __init__(self, config: WheelOdometryConfig | None = None) -> None:
+        self.config = config or WheelOdometryConfig()
+        self.lag = WheelLag(self.config.lag)
+        self._rows = np.empty((2 * self.config.kept, 4))  # stamp in s since the first pose, x, y, unwrapped yaw
+        self._count = 0
+        self._origin_ns: int | None = None
+
+    @property
+    def lag_s(self) -> float:
+        """How much older scans are than their stamps (s), by the wheels' clock; negative where wheels are older."""
+        return self.lag.lag_s
+
+    def add(self, stamp_ns: int, pose: Array) -> None:
+        """Take the wheels' pose ``(3,)`` in their own frame; a stamp that is not newer than the last is dropped.
+
+        Raises:
+            ValueError: the pose has another shape or is not finite.
+        """
+        pose = np.asarray(pose, dtype=np.float64)
+        if pose.shape != (3,) or not np.isfinite(pose).all():
+            raise ValueError(f"the pose is {pose}; expected three finite numbers")
+        if self._origin_ns is None:
+            self._origin_ns = stamp_ns
+        stamp_s = (stamp_ns - self._origin_ns) * 1e-9
+        yaw = pose[2]
+        if self._count:
+            last = self._rows[self._count - 1]
+            if stamp_s <= last[0]:
+                return
+            yaw = last[3] + wrap(yaw - last[3])
+        if self._count == len(self._rows):
+            self._rows[: self.config.kept] = self._rows[self.config.kept :].copy()
+            self._count = self.config.kept
+        self._rows[self._count] = stamp_s, pose[0], pose[1], yaw
+        self._count += 1
+
+    def pose_at(self, stamp_ns: int) -> Array | None:
+        """The wheels' pose ``(3,)`` when a scan of this stamp was taken; None where they were silent."""
+        if self._origin_ns is None:
+            return None
+        at = (stamp_ns - self._origin_ns) * 1e-9 - self.lag_s
+        rows = self._rows[: self._count]
+        if not rows[0, 0] - 1e-6 <= at <= rows[-1, 0] + self.config.extrapolated_s:
+            return None
+        after = int(np.clip(np.searchsorted(rows[:, 0], at), 1, max(self._count - 1, 1)))
+        if self._count == 1:
+            return rows[0, 1:].copy()
+        (t0, *_), (t1, *_) = rows[after - 1], rows[after]
+        share = (at - t0) / (t1 - t0)
+        result: Array = rows[after - 1, 1:] + share * (rows[after, 1:] - rows[after - 1, 1:])
+        result[2] = wrap(result[2])
+        return result
+
+    def observe_turn(self, start_ns: int, end_ns: int, turn: float) -> None:
+        """Take a turn (rad) that scans measured between their stamps: it tells the lag."""
+        if self._origin_ns is None:
+            return
+        self.lag.observe((start_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9, turn)
+        rows = self._rows[: self._count]
+        self.lag.update(rows[:, 0], rows[:, 3])
+
+    def motion(self, start: Array, end: Array) -> tuple[Array, Array]:
+        """Motion ``(3,)`` between two of the wheels' poses, and the deviations ``(3,)`` of it."""
+        moved = between(start, end)
+        return moved, self.config.deviations(moved)

@@ -1,0 +1,119 @@
+"""A lidar's estimators over the scans and wheels of a recording, as the live nodes compute (no ROS here)."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
+from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, Truth
+from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.trajectory.files import seconds
+from ngo_recordings.scan_stream import LidarScan, WheelPose
+
+_REASONS: dict[type[ValueError], str] = {
+    DuplicateFrame: "the stamp came twice",
+    LateFrame: "older than the scan before",
+}
+_MOST_WALL_POINTS = 400_000
+
+
+class LidarRun:
+    """Feeds scans and wheel poses through both estimators as the nodes do with messages.
+
+    Args:
+        odometry, online: the estimators, which begin anew.
+        mounting: where the scanner sits on the robot.
+    """
+
+    def __init__(self, odometry: LidarOdometry, online: ScanTrajectory, mounting: Mounting) -> None:
+        self._odometry, self._online, self._mounting = odometry, online, mounting
+        self.frames = 0
+        """Scans that came."""
+        self.rejected: Counter[str] = Counter()
+        """Scans that were not used, by the reason."""
+        self.examples: dict[str, str] = {}
+        """For each reason the first such scan, in words."""
+        self.gaps = 0
+        """Steps that bridge scans that were lost."""
+        self.unsure = 0
+        """Scans that did not say where they were taken."""
+        self.faults: list[str] = []
+        """What failed inside, in words; the trajectory went on by odometry there."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What else is worth keeping of the run."""
+        return {"unsure": self.unsure, "lag_s": self._odometry.lag_s, "faults": len(self.faults)}
+
+    def remarks(self) -> list[str]:
+        """What a person should know of the run, a line each."""
+        lines = []
+        if lag_s := self._odometry.lag_s:
+            lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
+        if self.unsure:
+            lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
+        if self.faults:
+            lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
+        return lines
+
+    def run(
+        self, records: Iterable[LidarScan | WheelPose], truth: Truth | None = None
+    ) -> Iterator[RecordedStep | RecordedRun]:
+        """Every step, and after the last one of a trajectory the whole of it.
+
+        A recording whose stamps jump back by a second or more holds several trajectories.
+        """
+        self._odometry.reset()
+        self._online.reset()
+        self._odometry.mounting = self._mounting
+        for record in records:
+            if isinstance(record, WheelPose):
+                try:
+                    self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+                except ValueError as error:
+                    self._reject("wheel pose not usable", f"{seconds(record.stamp_ns)} s: {error}")
+            else:
+                self.frames += 1
+                restarts = self._odometry.restarts
+                try:
+                    self._odometry.add_scan(record)
+                except ValueError as error:
+                    self._reject(_REASONS.get(type(error), "not usable"), f"{seconds(record.stamp_ns)} s: {error}")
+                if self._odometry.restarts != restarts:
+                    yield from self._finished(truth)
+            yield from self._steps(at_end=False)
+        yield from self._steps(at_end=True)
+        yield from self._finished(truth)
+
+    def _steps(self, at_end: bool) -> Iterator[RecordedStep]:
+        while True:
+            try:
+                for step in self._odometry.ready(at_end):
+                    update = self._online.update(step)
+                    self.gaps += update.gap
+                    self.unsure += step.unsure
+                    self._note_fault()
+                    yield RecordedStep(step, update)
+                return
+            except ValueError as error:
+                self._reject("not usable", str(error))
+
+    def _note_fault(self) -> None:
+        if self._online.fault:
+            self.faults.append(self._online.fault)
+
+    def _reject(self, reason: str, example: str) -> None:
+        self.rejected[reason] += 1
+        self.examples.setdefault(reason, example)
+
+    def _finished(self, truth: Truth | None) -> Iterator[RecordedRun]:
+        """The trajectory that ends here, if there is one."""
+        if self._online.finish() is None:
+            self._note_fault()
+        trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
+        self._online.reset()
+        if trajectory is not None:
+            true, residual = (truth or Truth()).poses()
+            yield RecordedRun(trajectory, true, residual, walls)

@@ -1,0 +1,270 @@
+"""The state of a trajectory that is corrected online: one log of steps, one graph that owns poses and covariance."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.geometry import se2
+from ngo_estimator.online.step_log import StepLog, TakenStep
+
+
+@dataclass(frozen=True)
+class TrajectoryUpdate:
+    """What a step changed; its size does not depend on how long the trajectory is.
+
+    ``pose_xyyaw`` (3,) of the newest frame, corrected, in ``map``, whose origin is the first frame, with its
+    ``covariance`` (3, 3), that of the first frame being zero; ``map_from_odom_xyyaw`` (3,). ``frames``
+    counts all of the trajectory. ``optimized`` says whether this step ended an optimisation, ``restarted`` whether it
+    began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
+    ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
+    optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. ``fault`` says
+    what failed inside, empty where nothing did: the trajectory goes on by odometry then. The arrays are read-only and
+    stay as they are.
+    """
+
+    stamp_ns: int
+    pose_xyyaw: np.ndarray
+    covariance: np.ndarray
+    map_from_odom_xyyaw: np.ndarray
+    frames: int
+    optimized: bool
+    restarted: bool
+    gap: bool
+    largest_move_m: float
+    closed_loops: int
+    window_fill: float
+    fault: str
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The whole trajectory: ``n`` frames, the first at the origin of ``map``.
+
+    ``stamps_ns`` (n,) int64; ``poses_xyyaw`` (n, 3) corrected, in ``map``; ``odometry_xyyaw`` (n, 3) as the local
+    odometry has it; ``online_xyyaw`` (n, 3) each corrected pose as it was when its frame was the newest; ``moved_m``
+    (n,) how far the last step moved each pose; ``odometry_std`` (n - 1, 3) of what leads from each frame to the next.
+    ``loops`` (e, 2) frame indices, earlier first, with ``loop_weights`` (e,) of zero to one, ``loop_relative_xyyaw``
+    (e, 3), the later frame as it was seen from the earlier one, and ``loop_std`` (e, 3) in which the weight is
+    accounted for. The arrays are read-only and stay as they are.
+    """
+
+    stamps_ns: np.ndarray
+    poses_xyyaw: np.ndarray
+    odometry_xyyaw: np.ndarray
+    online_xyyaw: np.ndarray
+    moved_m: np.ndarray
+    odometry_std: np.ndarray
+    loops: np.ndarray
+    loop_weights: np.ndarray
+    loop_relative_xyyaw: np.ndarray
+    loop_std: np.ndarray
+
+
+class PoseGraph(Protocol):
+    """The owner of all poses in ``map``, of the newest covariance, and of the loops."""
+
+    loop_weights: np.ndarray
+    took_s: float
+    optimized: bool
+    """Whether an optimisation ended since the newest frame came."""
+    fault: str
+    """What failed since the newest frame came, in words; empty where nothing did."""
+
+    @property
+    def running(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether there is anything left to optimise."""
+
+    @property
+    def window_fill(self) -> float:
+        """Share of the window that is in use."""
+
+    @property
+    def largest_move_m(self) -> float:
+        """How far the last optimisation moved a node at most."""
+
+    @property
+    def loop_frames(self) -> np.ndarray:
+        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
+
+    @property
+    def loop_relative(self) -> np.ndarray:
+        """Their measurements ``(loops, 3)``."""
+
+    @property
+    def loop_std(self) -> np.ndarray:
+        """Deviations ``(loops, 3)`` of these."""
+
+    def begin(self) -> None:
+        """Begin to optimise."""
+
+    def advance(self, iterations: int) -> bool:
+        """Run so many iterations; returns whether the optimisation is done."""
+
+    def finish(self) -> bool:
+        """Optimise what is left; returns whether there was anything."""
+
+    def abandon(self) -> None:
+        """Leave undone what has begun."""
+
+    def fail(self, error: Exception) -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
+
+    def frame_poses(self, before: bool = False) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
+
+
+class CorrectedTrajectory(ABC):
+    """Takes steps into a log and a graph, and tells what each changed.
+
+    An optimisation takes several iterations. ``iterations_per_step`` of them are run at the step that begins it and at
+    each one after it, so that no step takes much longer than the others.
+    """
+
+    _graph: PoseGraph
+
+    def __init__(self, iterations_per_step: int) -> None:
+        self._iterations_per_step = iterations_per_step
+        self._log = StepLog()
+        self.reset()
+
+    @abstractmethod
+    def _new_graph(self) -> PoseGraph:
+        """A graph without any frame."""
+
+    @abstractmethod
+    def _checked(self, step: RelativeStep) -> RelativeStep:
+        """The step as it is taken; raises ``RejectedStep`` for one that cannot be used."""
+
+    @abstractmethod
+    def _begin_at(self, step: RelativeStep) -> None:
+        """Give the graph what is known of the first frame."""
+
+    @abstractmethod
+    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
+        """Give the graph a step; returns whether it is time to optimise."""
+
+    def reset(self) -> None:
+        """Forget everything: the next step begins a new trajectory."""
+        self._log.reset()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._online = GrowingRows((3,), np.float64)
+        self._graph = self._new_graph()
+        self._optimized = False
+        self._odom = np.zeros(3)  # of the newest frame, on TF
+
+    @property
+    def fault(self) -> str:
+        """What failed in the last step, or in ``finish``, in words; empty where nothing did."""
+        return self._graph.fault
+
+    def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
+        """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
+
+        Without ``optimize`` the newest frame follows the one before it by odometry alone. The next optimisation takes
+        all of them in.
+
+        Raises:
+            RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
+                that is a little late. The trajectory is as it was before.
+        """
+        step = self._checked(step)
+        taken = self._log.take(step)
+        if taken.begins:
+            self._begin()
+            self._begin_at(step)
+            self._online.append(np.zeros(3))
+        due = self._append(step, taken)
+        self._odom = step.tf_odom_xyyaw
+        if not optimize:
+            self._graph.abandon()
+        self._optimized = self._optimise(due and optimize)
+        update = self._result(taken.restarted, taken.gap)
+        self._online.append(update.pose_xyyaw)
+        return update
+
+    def _optimise(self, due: bool) -> bool:
+        """Go on with an optimisation, or begin one; returns whether the newest frame ended one."""
+        try:
+            if due:
+                self._graph.begin()
+            if self._graph.running:
+                self._graph.advance(self._iterations_per_step)
+        except Exception as error:  # numerics of a library, or a fault of ours: it may cost an optimisation, no more
+            self._graph.fail(error)
+        return self._graph.optimized
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether there is anything left to optimise, which later steps, or ``finish``, are to do."""
+        return self._graph.unfinished
+
+    @property
+    def optimization_s(self) -> float:
+        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+        return self._graph.took_s
+
+    def finish(self) -> TrajectoryUpdate | None:
+        """Optimise what is left, when no more steps come; None where there is nothing, or where it failed."""
+        try:
+            done = self._log.steps > 0 and self._graph.finish()
+        except Exception as error:  # see _optimise
+            self._graph.fail(error)
+            done = False
+        if not done:
+            return None
+        self._optimized = True
+        return self._result(restarted=False, gap=False)
+
+    def trajectory(self) -> Trajectory | None:
+        """The whole trajectory as it is now, or None before the first step."""
+        if self._log.steps == 0:
+            return None
+        graph, log = self._graph, self._log
+        poses, moved = graph.frame_poses(), np.zeros(log.steps + 1)
+        if self._optimized:
+            before = graph.frame_poses(before=True)
+            moved[:-1] = np.linalg.norm((poses - before)[:-1, :2], axis=1)
+        arrays = (
+            log.stamps_ns.values, poses, log.odometry.values, self._online.values, moved, log.odometry_std.values,
+            graph.loop_frames, graph.loop_weights, graph.loop_relative, graph.loop_std,
+        )  # fmt: skip
+        return Trajectory(*map(_read_only, arrays))
+
+    def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
+        graph = self._graph
+        pose, covariance = graph.newest()
+        map_from_odom = se2.compose(torch.from_numpy(pose), se2.inverse(torch.from_numpy(self._odom))).numpy()
+        return TrajectoryUpdate(
+            stamp_ns=int(self._log.stamps_ns.values[-1]),
+            pose_xyyaw=_read_only(pose.copy()),
+            covariance=_read_only(0.5 * (covariance + covariance.T)),
+            map_from_odom_xyyaw=_read_only(map_from_odom),
+            frames=self._log.steps + 1,
+            optimized=self._optimized,
+            restarted=restarted,
+            gap=gap,
+            largest_move_m=graph.largest_move_m if self._optimized else 0.0,
+            closed_loops=int((graph.loop_weights > 0.5).sum()),
+            window_fill=graph.window_fill,
+            fault=graph.fault,
+        )
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,337 @@
+"""The graph of key scans behind the online trajectory of a lidar: nodes by motion, verified loops, warm starts.
+
+Node ``k`` is the pose of key scan ``k``; node 0, the first frame, is the origin of ``map``. A robot that stands adds no
+node. Frames between two nodes follow them by odometry.
+"""
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.geometry.planar_covariance import bounded, propagate
+from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.online.key_scan_store import KeyScanStore
+from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
+from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
+from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
+
+_MOST_ITERATIONS = 30
+"""Until nothing moves any more, at the end of a recording."""
+
+_KEYS_PER_OPTIMISED = 200
+"""For each so many nodes an optimisation waits for one more key scan."""
+
+
+@dataclass(frozen=True)
+class ScanGraphConfig:
+    """How key scans are optimised.
+
+    An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
+    at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
+    ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to
+    each step's covariance: registration in the same few key scans does not see them. About ``most_scans`` key scans are
+    kept; where there are more, places that many of them show lose some. Their poses stay.
+    """
+
+    loops: ScanLoopConfig = field(default_factory=ScanLoopConfig)
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    iterations: int = 5
+    keys_between: int = 8
+    surprise: float = 3.0
+    kernel: float = 3.0
+    step_m: float = 0.005
+    step_deg: float = 0.15
+    most_scans: int = 4000
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1 or self.keys_between < 1 or self.most_scans < 100:
+            raise ValueError(
+                f"iterations, keys_between, most_scans are {self.iterations}, {self.keys_between}, {self.most_scans}; "
+                "expected at least 1, 1 and 100"
+            )
+        positive = (self.surprise, self.kernel, self.step_m, self.step_deg)
+        if not all(0.0 < value < math.inf for value in positive):
+            raise ValueError(f"surprise, kernel, step_m, step_deg are {positive}; expected positive numbers")
+
+
+class ScanGraph:
+    """Takes frames, keeps key scans and their loops, and optimises all of them together."""
+
+    def __init__(self, config: ScanGraphConfig) -> None:
+        self.config = config
+        self.odometry = GrowingRows((3,), np.float64)
+        """Poses of all frames by the relative poses alone, the first at the origin."""
+        self.odometry.append(np.zeros(3))
+        self._frames = GrowingRows((), np.int64)  # of the nodes
+        self._nodes = GrowingRows((3,), np.float64)
+        self._steps = GrowingRows((3,), np.float64)
+        self._step_covariance = GrowingRows((3, 3), np.float64)  # for the optimisation
+        self._published_covariance = GrowingRows((3, 3), np.float64)
+        self._scans = KeyScanStore()
+        self._key_stamp_ns = 0
+        self._finder = ScanLoopFinder(config.loops)
+        self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
+        self._end = np.zeros((3, 3))  # covariance of the last node in the map
+        self._running: ScanPoseGraph | None = None
+        self._rows = np.zeros(0, np.int64)
+        self._left = 0
+        self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
+        self._before = np.zeros((1, 3))
+        self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
+        self.loop_weights = np.zeros(0)
+        """Of the loops in the last optimisation ``(loops,)``, zero to one."""
+        self.took_s = 0.0
+        """Computing time of the last optimisation."""
+        self.optimized = False
+        """Whether an optimisation ended since the newest frame came."""
+        self.fault = ""
+        """What failed since the newest frame came, in words. Everything is then as it was before, but for the loops."""
+
+    @property
+    def keys(self) -> int:
+        """Key scans so far."""
+        return len(self._nodes)
+
+    @property
+    def running(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+        return self._running is not None
+
+    @property
+    def largest_move_m(self) -> float:
+        """How far the last optimisation moved a node at most."""
+        moved = self._nodes.values[: len(self._before), :2] - self._before[:, :2]
+        return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
+
+    def begin_at(self, step: RelativeStep) -> None:
+        """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""
+        self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
+        self._frames.append(0)
+        self._nodes.append(np.zeros(3))
+        self._key_stamp_ns = step.from_stamp_ns
+
+    def append(self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None) -> bool:
+        """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise."""
+        self.optimized, self.fault = False, ""
+        last = torch.from_numpy(self.odometry.values[-1])
+        self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        since = self._since_key()
+        self._since = propagate(self._since, since, relative, covariance)
+        if key is None:
+            return False
+        if self._running is not None:
+            self.advance(self._left)  # what comes now adds a node to those that it is about
+        known = key.from_key_stamp_ns == self._key_stamp_ns
+        # Registration in the same key scans: errors of the steps between do not add up.
+        if known:
+            covariance = bounded(key.covariance)
+            self._complete(key, since, covariance, covariance * np.outer(key.factors, key.factors))
+        else:
+            covariance = bounded(self._since)
+            self._complete(key, since, covariance, covariance)
+        try:
+            return self._look_for_loops()
+        except Exception as error:  # numerics of a library, or a fault of ours: it may cost loops, and nothing else
+            self.fail(error, "the search for loops")
+            return False
+
+    def fail(self, error: Exception, work: str = "an optimisation") -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+        self.fault = f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self._running, self._waiting = None, 0
+
+    def _since_key(self) -> np.ndarray:
+        """Pose ``(3,)`` of the newest frame, seen from the last node."""
+        ends = torch.from_numpy(self.odometry.values[[int(self._frames.values[-1]), -1]])
+        since: np.ndarray = se2.between(ends[0], ends[1]).numpy()
+        return since
+
+    def _complete(self, key: KeyScanStep, since: np.ndarray, covariance: np.ndarray, published: np.ndarray) -> None:
+        config = self.config
+        floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
+        self._steps.append(since)
+        self._step_covariance.append(covariance + floor)
+        self._published_covariance.append(published + floor)
+        pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
+        self._end = propagate(self._end, pose, since, published + floor)
+        self._nodes.append(pose)
+        self._frames.append(len(self.odometry) - 1)
+        self._scans.append(key.scan)
+        self._key_stamp_ns = key.scan.stamp_ns
+        self._since = np.zeros((3, 3))
+
+    def _look_for_loops(self) -> bool:
+        """Ask for loops of the newest key; returns whether an optimisation is due."""
+        poses, config = self._nodes.values, self.config
+        accepted = self._finder.loops.pairs[self._finder.loops.accepted]
+        if (self.keys - 1) % config.loops.every:
+            found = 0.0
+        else:
+            windows = distance_windows(config.windows, graph_distances(poses, accepted, self.keys - 1))
+            loops = self._finder.find(self._scans, poses, windows)
+            self._save_memory()
+            off = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance).residuals(poses)
+            found = float(np.sqrt((off**2).sum(1)).max(initial=0.0))
+            self._waiting = max(self._waiting, int(len(loops) > 0))
+        self._waiting += self._waiting > 0
+        # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
+        return self._waiting > max(config.keys_between, self.keys // _KEYS_PER_OPTIMISED) or found > config.surprise
+
+    def _save_memory(self) -> None:
+        """Bound the memory of scans that the finder has seen."""
+        self._scans.compact()
+        most = self.config.most_scans
+        if self._scans.kept > most + most // 10:
+            newest = self.config.loops.submap_keys
+            self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.values, newest))
+
+    def measurements(self) -> tuple[RelativePoses, RelativePoses]:
+        """The steps from each node to the next, and the accepted loops."""
+        loops = self._finder.loops[np.flatnonzero(self._finder.loops.accepted)]
+        measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
+        return self._chain(self._step_covariance.values), measured
+
+    def begin(self) -> None:
+        """Begin to optimise all nodes; where that fails, ``fault`` says so."""
+        try:
+            self._begin()
+        except Exception as error:  # see append
+            self.fail(error)
+
+    def _begin(self) -> None:
+        began = time.perf_counter()
+        self._rows = np.flatnonzero(self._finder.loops.accepted)
+        steps, measured = self.measurements()
+        gates = np.ones(len(self._rows))
+        self._running = ScanPoseGraph(steps, measured, gates, self._nodes.values, self.config.kernel)
+        self._left = self.config.iterations
+        self._waiting = 0
+        self.took_s = time.perf_counter() - began
+
+    def _chain(self, covariance: np.ndarray) -> RelativePoses:
+        """The steps between the nodes, with covariances ``(keys - 1, 3, 3)``."""
+        chain = np.arange(self.keys - 1)
+        return RelativePoses.of_covariances(np.stack((chain, chain + 1), axis=1), self._steps.values, covariance)
+
+    def advance(self, iterations: int) -> bool:
+        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
+
+        Where it fails, it is over, every node is where it was, and ``fault`` says so.
+        """
+        if self._running is None:
+            raise RuntimeError("no optimisation has begun")
+        try:
+            return self._advance(self._running, iterations)
+        except Exception as error:  # see append
+            self.fail(error)
+            return False
+
+    def _advance(self, running: ScanPoseGraph, iterations: int) -> bool:
+        began = time.perf_counter()
+        for _ in range(min(iterations, self._left)):
+            running.iterate()
+            self._left = 0 if running.converged else self._left - 1
+        self.took_s += time.perf_counter() - began
+        if self._left:
+            return False
+        end = self._end
+        if self.keys > 1:
+            end = running.covariance(self._chain(self._published_covariance.values), self.keys - 1)
+        if not (np.isfinite(running.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            raise ArithmeticError("poses or their covariances came out as no numbers")
+        self._running = None
+        self._before = self._nodes.values.copy()
+        self._nodes.values[:] = running.poses
+        self._loop_rows, self.loop_weights = self._rows, running.weights
+        self._end, self.optimized = end, True
+        return True
+
+    def abandon(self) -> None:
+        """Leave undone what has begun."""
+        if self._running is not None:
+            self._running, self._waiting = None, self.config.keys_between
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether an optimisation has begun, or a loop waits for one."""
+        return self.running or self._waiting > 0
+
+    @property
+    def window_fill(self) -> float:
+        """All key scans are optimised: there is no window to fill."""
+        return 0.0
+
+    def finish(self) -> bool:
+        """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
+        self.fault = ""
+        if self._running is None:
+            if not self._finder.loops.accepted.any():
+                return False
+            self.begin()
+        self._left = _MOST_ITERATIONS
+        return self._running is not None and self.advance(self._left)
+
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
+        since = self._since_key()
+        pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
+        return pose, propagate(self._end, pose, since, self._since)
+
+    def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
+        """Poses of all frames ``(frames, 3)``, as they are or as they were before the last optimisation.
+
+        The difference between two nodes and their odometry is spread evenly over the frames between. With ``nodes``
+        ``(nodes, 3)`` these are the poses of the nodes.
+        """
+        nodes = (self._nodes.values if nodes is None else nodes).copy()
+        if before:  # nodes that came since follow the last of those
+            last = len(self._before) - 1
+            moved = torch.from_numpy(nodes[last:].copy())
+            nodes[: last + 1] = self._before
+            since = se2.between(moved[:1], moved)
+            nodes[last:] = se2.compose(torch.from_numpy(self._before[-1:]), since).numpy()
+        odometry, at = torch.from_numpy(self.odometry.values), self._frames.values
+        starts, ends = torch.from_numpy(nodes), odometry[torch.from_numpy(at)]
+        segment = torch.from_numpy(np.searchsorted(at, np.arange(len(odometry)), side="right") - 1)
+        within = se2.between(ends[segment], odometry)
+        bent = torch.zeros_like(starts)
+        bent[:-1] = se2.between(starts[:-1], starts[1:]) - se2.between(ends[:-1], ends[1:])
+        bent[:, 2] = se2.wrap(bent[:, 2])
+        first = torch.from_numpy(at)[segment]
+        length = torch.ones(len(nodes), dtype=torch.float64)
+        length[:-1] = torch.from_numpy(np.diff(at).astype(np.float64))
+        share = (torch.arange(len(odometry), dtype=torch.float64) - first) / length[segment]
+        poses: np.ndarray = se2.compose(starts[segment], within + share.unsqueeze(-1) * bent[segment]).numpy()
+        return poses
+
+    def walls(self, most: int) -> np.ndarray:
+        """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
+        every = max(1, -(-self._scans.points // most))
+        parts = [
+            transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.values, self._scans, strict=True)
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 2))
+
+    @property
+    def loop_frames(self) -> np.ndarray:
+        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
+        frames: np.ndarray = self._frames.values[self._finder.loops.pairs[self._loop_rows]]
+        return frames
+
+    @property
+    def loop_relative(self) -> np.ndarray:
+        """What these loops measured ``(loops, 3)``."""
+        return self._finder.loops.relative[self._loop_rows]
+
+    @property
+    def loop_std(self) -> np.ndarray:
+        """Deviations ``(loops, 3)`` of what they measured, in which their weights are accounted for."""
+        variance = np.diagonal(self._finder.loops.covariance, axis1=1, axis2=2)[self._loop_rows]
+        return np.sqrt(variance / np.maximum(self.loop_weights, 1e-12)[:, None])

@@ -1,0 +1,56 @@
+"""The online trajectory of a 2D lidar: relative poses and key scans in, the whole corrected trajectory out (no ROS)."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.data.relative_step import RelativeStep, check_step
+from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
+from ngo_estimator.online.step_log import TakenStep
+
+
+class ScanTrajectory(CorrectedTrajectory):
+    """Keeps the trajectory of a lidar and corrects it whenever loops call for it.
+
+    Between two key scans the newest frames follow the last one by odometry. A robot that stands adds frames, and no key
+    scans.
+    """
+
+    _graph: ScanGraph
+
+    def __init__(self, config: ScanGraphConfig | None = None, iterations_per_step: int = 0) -> None:
+        if iterations_per_step < 0:
+            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
+        self._config = config or ScanGraphConfig()
+        super().__init__(iterations_per_step or self._config.iterations)
+
+    @classmethod
+    def load(cls, weights: Path, world: str | None = None, iterations_per_step: int = 0) -> "ScanTrajectory":
+        """Begin with the settings in the folder ``weights``; raises ``LidarFileError``, of one clear line."""
+        return cls(read_lidar_file(weights, "graph", ScanGraphConfig, world), iterations_per_step)
+
+    @property
+    def graph(self) -> ScanGraph:
+        """The graph of key scans."""
+        return self._graph
+
+    def walls(self, most: int) -> np.ndarray:
+        """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
+        return self._graph.walls(most)
+
+    def _new_graph(self) -> ScanGraph:
+        return ScanGraph(self._config)
+
+    def _checked(self, step: RelativeStep) -> RelativeStep:
+        check_step(step, 0, None)
+        return replace(step, covariance=bounded(step.covariance))
+
+    def _begin_at(self, step: RelativeStep) -> None:
+        self._graph.begin_at(step)
+
+    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
+        return self._graph.append(taken.relative, bounded(taken.covariance), step.key)

@@ -1,0 +1,115 @@
+"""The steps of a trajectory in their order: stamps, odometry, gaps and new beginnings."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.relative_step import (
+    LARGEST_VALUE,
+    RESTART_AFTER_NS,
+    DuplicateStep,
+    LateStep,
+    RelativeStep,
+)
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.geometry import se2
+
+
+@dataclass(frozen=True)
+class TakenStep:
+    """Motion from the newest frame to the next one.
+
+    ``relative`` (3,) and its ``covariance`` (3, 3). ``begins``: it is the first of a trajectory; ``restarted``: there
+    was another before. ``gap``: steps were lost, and the motion is composed from the odometry.
+    """
+
+    relative: np.ndarray
+    covariance: np.ndarray
+    begins: bool
+    restarted: bool
+    gap: bool
+
+
+class StepLog:
+    """Takes steps, and keeps stamps and odometry of all frames."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next step begins a new trajectory."""
+        self.stamps_ns = GrowingRows((), np.int64)
+        self.odometry = GrowingRows((3,), np.float64)
+        """Poses of all frames in ``odom``."""
+        self.odometry_std = GrowingRows((3,), np.float32)
+        """Deviations of each step."""
+        self._origin_stamp_ns = 0
+
+    @property
+    def steps(self) -> int:
+        """Steps so far."""
+        return max(0, len(self.stamps_ns) - 1)
+
+    @property
+    def last_odom(self) -> np.ndarray:
+        """Pose ``(3,)`` of the newest frame in ``odom``."""
+        pose: np.ndarray = self.odometry.values[-1]
+        return pose
+
+    def is_restart(self, step: RelativeStep) -> bool:
+        """Whether a step comes from a source that started anew since the last one."""
+        if self.steps == 0:
+            return False
+        last = int(self.stamps_ns.values[-1])
+        return step.stamp_ns <= last - RESTART_AFTER_NS or step.origin_stamp_ns != self._origin_stamp_ns
+
+    def take(self, step: RelativeStep) -> TakenStep:
+        """Take the next step, which has been checked.
+
+        A step that begins after the last frame means lost steps: the motion between is composed from the poses in
+        ``odom``. A step of an odometry with another origin begins a new trajectory, for the motion between is unknown.
+        So does one that lies ``RESTART_AFTER_NS`` or more in the past, or ``LARGEST_VALUE`` away.
+
+        Raises:
+            DuplicateStep, LateStep: it is not newer than the last one. Nothing has changed.
+        """
+        restarted, gap = False, False
+        relative, covariance = step.relative_xyyaw, step.covariance
+        if self.steps:
+            last = int(self.stamps_ns.values[-1])
+            if self.is_restart(step):
+                restarted = True
+            elif step.stamp_ns <= last:
+                kind = DuplicateStep if step.stamp_ns == last else LateStep
+                raise kind(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
+            elif step.from_stamp_ns != last:
+                relative, covariance = self._over_gap(step, last)
+                gap = bool(np.abs(relative).max() <= LARGEST_VALUE)
+                if not gap:  # it would be so at every step to come
+                    restarted, relative, covariance = True, step.relative_xyyaw, step.covariance
+        if restarted:
+            self.reset()
+        begins = self.steps == 0
+        if begins:
+            self._begin(step)
+        self.stamps_ns.append(step.stamp_ns)
+        self.odometry.append(step.odom_xyyaw)
+        self.odometry_std.append(np.sqrt(np.diagonal(covariance)))
+        return TakenStep(relative, covariance, begins, restarted, gap)
+
+    def _over_gap(self, step: RelativeStep, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Relative pose and covariance from the last frame that is known to the one of ``step``.
+
+        The covariance of the step stands for all that were lost, in proportion to the time that they took.
+        """
+        odom = torch.from_numpy(np.stack((self.last_odom, step.odom_xyyaw)))
+        longer = (step.stamp_ns - last_ns) / (step.stamp_ns - step.from_stamp_ns)
+        return se2.between(odom[0], odom[1]).numpy(), step.covariance * max(longer, 1.0)
+
+    def _begin(self, step: RelativeStep) -> None:
+        self._origin_stamp_ns = step.origin_stamp_ns
+        odom = torch.from_numpy(step.odom_xyyaw)
+        before = se2.compose(odom, se2.inverse(torch.from_numpy(step.relative_xyyaw)))
+        self.stamps_ns.append(step.from_stamp_ns)
+        self.odometry.append(before.numpy())

@@ -1,0 +1,88 @@
+"""Walls that a scanner looked through: evidence that scans are not where they were put.
+
+Not in the paper.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
+
+_BINS = 360  # directions of a range profile
+_MARGIN_M, _MARGIN_SHARE = 0.3, 0.02  # a ray that goes on for that much behind a point went through it
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedScans:
+    """Scans placed in one frame.
+
+    ``points`` and ``normals`` ``(n, 2)`` of all scans, in that frame; ``sensors`` ``(scans, 3)`` the sensors' poses
+    in it; ``profiles`` ``(scans, 360)`` the range in each direction from a sensor (m, 0 where unknown), direction ``k``
+    from ``k`` degrees on.
+    """
+
+    points: Array
+    normals: Array
+    sensors: Array
+    profiles: Array
+
+
+def range_profile(scan: KeyScan) -> Array:
+    """Least range ``(360,)`` within a degree of each direction from the sensor (m, 0 where no ray came back)."""
+    nearest = np.full(_BINS, np.inf)
+    known = np.isfinite(scan.ranges)
+    bins = np.floor(scan.angles[known] * (_BINS / (2.0 * math.pi))).astype(np.int64)
+    for neighbour in (-1, 0, 1):
+        np.minimum.at(nearest, (bins + neighbour) % _BINS, scan.ranges[known])
+    return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+def placed(scans: Sequence[KeyScan], profiles: Sequence[Array], poses: Array) -> PlacedScans:
+    """Scans and their range profiles at poses ``(scans, 3)`` of their base in one frame."""
+    pairs = list(zip(scans, poses, strict=True))
+    return PlacedScans(
+        np.concatenate([transformed(pose, scan.points) for scan, pose in pairs]),
+        np.concatenate([rotated(pose[2], scan.normals) for scan, pose in pairs]),
+        np.stack([compose(pose, scan.sensor_xyyaw) for scan, pose in pairs]),
+        np.array(profiles, np.float64),
+    )
+
+
+def seen_through(target: PlacedScans, source: PlacedScans, pose: Array) -> float:
+    """Share of sightings that go through a wall: points of one side, from all sensors of the other.
+
+    A sighting is a point that a sensor should have seen: a ray in its direction ends there or goes on behind it. Points
+    behind the end of a ray are hidden, and say nothing. A wall that one side alone has is seen through by the other
+    alone, so that the larger of the two shares is returned; one where there is no sighting at all. ``pose`` ``(3,)`` is
+    that of ``source`` in ``target``.
+    """
+    sensors = np.stack([compose(pose, sensor) for sensor in source.sensors])
+    both = (
+        _sightings(target.sensors, target.profiles, transformed(pose, source.points)),
+        _sightings(sensors, source.profiles, target.points),
+    )
+    return max((through / (through + on) for through, on in both if through + on > 0), default=1.0)
+
+
+@njit(cache=True)
+def _sightings(sensors: Array, profiles: Array, points: Array) -> tuple[int, int]:
+    through, on = 0, 0
+    bins = profiles.shape[1]
+    for s in range(len(sensors)):
+        for k in range(len(points)):
+            x, y = points[k, 0] - sensors[s, 0], points[k, 1] - sensors[s, 1]
+            away = math.sqrt(x * x + y * y)
+            direction = math.floor((math.atan2(y, x) - sensors[s, 2]) * bins / (2.0 * math.pi)) % bins
+            ray = profiles[s, direction]
+            if ray > 0.0:
+                margin = _MARGIN_M + _MARGIN_SHARE * away
+                if away < ray - margin:
+                    through += 1
+                elif away < ray + margin:
+                    on += 1
+    return through, on

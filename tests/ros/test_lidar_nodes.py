@@ -1,0 +1,212 @@
+"""Both estimators as real processes on a lidar's scans: its mounting and the robot's own odometry come from topics."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
+from ngo_msgs.msg import RelativePose
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import LaserScan
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_estimator.nodes.messages import to_ns, to_time, transform_message
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_recordings.association import ros_pose
+from ngo_recordings.mounting import mounting_in
+from ngo_recordings.poses import TransformTree
+from ngo_recordings.scan_stream import scan_of
+from tests.unit.ngo_estimator.ray_casting import ROOM, cast
+
+from .processes import NodeProcess, Probe
+
+pytestmark = pytest.mark.processes
+
+FRAMES = 60
+STEP_NS = 100_000_000
+BEGIN_NS = 50_000_000_000
+ANGLES = np.radians(np.arange(-120.0, 120.5, 1.0))
+MOUNTING = np.array([0.12, -0.05, math.radians(30.0)])
+RELIABLE = {"world": "scan", "image_reliability": "reliable", "image_depth": 1000}
+
+
+def drive() -> list[np.ndarray]:
+    """True poses of a robot that goes round the room, some steps of it standing."""
+    poses = [np.array([1.0, 1.0, 0.0])]
+    for step in range(1, FRAMES):
+        speed = 0.0 if 20 <= step < 30 else 0.08
+        poses.append(compose(poses[-1], np.array([speed, 0.0, 0.03 if step > 30 else 0.0])))
+    return poses
+
+
+def wheel_pose(true: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Wheels that see everything 4 % too long, in a frame of their own."""
+    moved = between(first, true) * np.array([1.04, 1.04, 1.0])
+    return compose(np.array([5.0, -3.0, 1.0]), moved)
+
+
+def scan_message(true: np.ndarray, stamp_ns: int, upside_down: bool, noise: np.random.Generator) -> LaserScan:
+    sign = -1.0 if upside_down else 1.0
+    ranges = cast(ROOM, compose(true, MOUNTING), sign * ANGLES) + 0.005 * noise.standard_normal(len(ANGLES))
+    message = LaserScan(
+        angle_min=float(np.float32(ANGLES[0])),
+        angle_max=float(np.float32(ANGLES[-1])),
+        angle_increment=float(np.float32(np.radians(1.0))),
+        range_min=float(np.float32(0.05)),
+        range_max=30.0,
+        ranges=ranges.astype(np.float32),
+    )
+    message.header.stamp, message.header.frame_id = to_time(stamp_ns), "laser"
+    return message
+
+
+def mounting_message(upside_down: bool) -> TFMessage:
+    """Two static transforms from the robot to its scanner, the second with the roll of one that hangs."""
+    x, y, yaw = MOUNTING.tolist()
+    half = 0.5 * yaw
+    turned = Quaternion(z=math.sin(half), w=math.cos(half))
+    mast = TransformStamped(child_frame_id="mast")
+    mast.header.frame_id = "base_link"
+    mast.transform.translation, mast.transform.rotation = Vector3(x=x, y=y, z=0.2), turned
+    laser = TransformStamped(child_frame_id="laser")
+    laser.header.frame_id = "mast"
+    laser.transform.rotation = Quaternion(x=1.0, w=0.0) if upside_down else Quaternion(w=1.0)
+    return TFMessage(transforms=[mast, laser])
+
+
+def mounting_of(message: TFMessage) -> Mounting:
+    """The mounting to the last digit: registration amplifies the rounding of a quaternion."""
+    tree = TransformTree(0)
+    for each in message.transforms:
+        pose = ros_pose(each.transform.translation, each.transform.rotation)
+        assert pose is not None
+        tree.add(each.header.frame_id, each.child_frame_id, 0, pose, static=True)
+    found = mounting_in(tree, "base_link", "laser")
+    assert found is not None
+    return Mounting(found.base_from_scan_xyyaw, found.upside_down)
+
+
+@dataclass
+class Outputs:
+    relative_poses: list[RelativePose] = field(default_factory=list)
+    odometry: list[Odometry] = field(default_factory=list)
+    poses: list[PoseWithCovarianceStamped] = field(default_factory=list)
+    transforms: list[TFMessage] = field(default_factory=list)
+
+
+@pytest.fixture
+def probe() -> Iterator[Probe]:
+    with Probe() as probe:
+        yield probe
+
+
+def xyyaw(pose: Any) -> np.ndarray:
+    position = getattr(pose, "position", None) or pose.translation
+    rotation = getattr(pose, "orientation", None) or pose.rotation
+    return np.array([position.x, position.y, 2.0 * math.atan2(rotation.z, rotation.w)])
+
+
+def close(a: np.ndarray, b: np.ndarray, metres: float, degrees: float) -> bool:
+    off = between(a, b)
+    return bool(np.hypot(off[0], off[1]) < metres and abs(off[2]) < math.radians(degrees))
+
+
+@pytest.mark.parametrize(("robot_odometry", "upside_down"), [("none", False), ("topic", True), ("tf", False)])
+def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_down: bool) -> None:
+    out = Outputs(
+        probe.collect(RelativePose, "relative_pose"),
+        probe.collect(Odometry, "odom"),
+        probe.collect(PoseWithCovarianceStamped, "ngo/pose"),
+        probe.collect(TFMessage, "/tf"),
+    )
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    static = probe.node.create_publisher(TFMessage, "/tf_static", latched)
+    scans = probe.node.create_publisher(LaserScan, "scan", 1000)
+    wheels = probe.node.create_publisher(Odometry, "wheels", 1000)
+    tf = probe.node.create_publisher(TFMessage, "/tf", 1000)
+    settings = {**RELIABLE, "robot_odometry": robot_odometry, "robot_odometry_topic": "wheels"}
+    noise, poses = np.random.default_rng(0), drive()
+    core, online = LidarOdometry(), ScanTrajectory(iterations_per_step=1)
+    core.mounting = mounting_of(mounting_message(upside_down))
+    assert close(core.mounting.sensor_xyyaw, MOUNTING, 1e-6, 1e-4)
+    expected = []
+    with (
+        NodeProcess("ngo_estimator", "local_node", settings) as local,
+        NodeProcess("ngo_estimator", "ngo_node", {"world": "scan"}) as ngo,
+    ):
+        local.wait_for_log("ready: /local_node, scan, LaserScan on '/scan'")
+        ngo.wait_for_log("ready: /ngo_node, scan")
+        probe.spin_until(
+            lambda: (
+                scans.get_subscription_count() == 1
+                and static.get_subscription_count() == 1
+                and (robot_odometry != "topic" or wheels.get_subscription_count() == 1)
+                and probe.node.count_subscribers("relative_pose") == 2
+            ),
+            "the estimators",
+        )
+        for step, true in enumerate(poses):
+            stamp_ns = BEGIN_NS + step * STEP_NS
+            message, wheel = scan_message(true, stamp_ns, upside_down, noise), wheel_pose(true, poses[0])
+            if robot_odometry == "topic":
+                odometry = Odometry()
+                odometry.header.stamp = to_time(stamp_ns)
+                odometry.pose.pose.position.x, odometry.pose.pose.position.y = wheel[:2].tolist()
+                odometry.pose.pose.orientation.z = math.sin(0.5 * wheel[2])
+                odometry.pose.pose.orientation.w = math.cos(0.5 * wheel[2])
+                wheels.publish(odometry)
+            if robot_odometry == "tf":
+                tf.publish(transform_message(stamp_ns, "odom", "base_link", wheel))
+            if robot_odometry != "none":
+                core.add_wheels(stamp_ns, wheel)
+            scans.publish(message)
+            core.add_scan(scan_of(message, "scan"))
+            expected += list(core.ready())
+            if step == 5:  # the scans before it wait for the mounting
+                static.publish(mounting_message(upside_down))
+        probe.spin_until(lambda: len(out.poses) == FRAMES - 1, "a pose for every scan")
+        assert "dropped" not in local.log + ngo.log, local.log + ngo.log
+        if robot_odometry == "tf":
+            probe.spin_until(lambda: len(out.transforms) >= 2 * FRAMES - 1, "map -> odom")
+    assert len(expected) == len(out.relative_poses) == FRAMES - 1
+    for step, message in zip(expected, out.relative_poses, strict=True):
+        assert to_ns(message.header.stamp) == step.stamp_ns
+        received = [message.x, message.y, message.yaw]
+        if robot_odometry == "none":  # wheels and scans may arrive in another order
+            np.testing.assert_allclose(received, step.relative_xyyaw, rtol=0.0, atol=1e-6)
+        update = online.update(step)
+    last, moved = out.poses[-1], between(poses[0], poses[-1])
+    assert close(xyyaw(last.pose.pose), moved, 0.03, 0.6)
+    if robot_odometry == "none":
+        np.testing.assert_allclose(xyyaw(last.pose.pose), update.pose_xyyaw, rtol=0.0, atol=1e-5)
+    standing = [message for k, message in enumerate(out.relative_poses) if 21 <= k < 29]
+    assert not any(message.key_scan for message in standing), "a robot that stands adds no key scans"
+    if robot_odometry != "tf":
+        assert len(out.odometry) == FRAMES - 1
+        return
+    assert not out.odometry, "the robot's own odometry is the one of odom"
+    frames = {t.child_frame_id for message in out.transforms for t in message.transforms if t.header.frame_id == "map"}
+    assert frames == {"odom"}
+    corrections = [t for message in out.transforms for t in message.transforms if t.header.frame_id == "map"]
+    map_from_base = compose(xyyaw(corrections[-1].transform), wheel_pose(poses[-1], poses[0]))
+    assert close(map_from_base, xyyaw(last.pose.pose), 0.01, 0.2)
+
+
+def test_a_scanner_without_a_mounting_is_told(probe: Probe) -> None:
+    relative_poses = probe.collect(RelativePose, "relative_pose")
+    scans = probe.node.create_publisher(LaserScan, "scan", 1000)
+    noise = np.random.default_rng(0)
+    with NodeProcess("ngo_estimator", "local_node", RELIABLE) as local:
+        local.wait_for_log("ready: /local_node, scan")
+        probe.spin_until(lambda: scans.get_subscription_count() == 1, "the estimator")
+        for step in range(30):
+            scans.publish(scan_message(drive()[step], BEGIN_NS + step * STEP_NS, False, noise))
+        local.wait_for_log("/tf_static does not say where 'laser' sits on 'base_link'")
+        probe.spin_until(lambda: len(relative_poses) == 29, "a motion for every scan")

@@ -1,0 +1,72 @@
+"""Factors on a step's deviations: none before training, bounded after it, the same in numpy and in torch."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator.checkpoint import STEP_DEVIATION, CheckpointError, load_step_deviation, save_checkpoint
+from ngo_estimator.networks.step_deviation import STEP_EVIDENCE, UNSURE, StepDeviation, StepDeviationConfig
+from ngo_estimator.odometry.step_evidence import StepScaling
+
+
+def evidence(steps: int) -> np.ndarray:
+    """Evidence of steps that are all sure ``(steps, 12)``."""
+    values = np.random.default_rng(3).normal(size=(steps, len(STEP_EVIDENCE)))
+    values[:, UNSURE] = 0.0
+    return values
+
+
+def trained() -> StepDeviation:
+    """A network whose factors differ from step to step."""
+    torch.manual_seed(1)
+    network = StepDeviation(StepDeviationConfig())
+    torch.nn.init.normal_(network.head.weight)
+    return network.requires_grad_(False)
+
+
+def test_untrained_factors_are_one() -> None:
+    network = StepDeviation(StepDeviationConfig())
+    assert (network(torch.from_numpy(evidence(20)).float()) == 0.0).all()
+    assert (StepScaling(network).factors(evidence(1)[0]) == 1.0).all()
+
+
+def test_one_step_in_numpy_equals_many_in_torch() -> None:
+    network, steps = trained(), evidence(50)
+    expected = network.double()(torch.from_numpy(steps)).exp().numpy()[:, [0, 0, 1]]
+    scaling = StepScaling(network)
+    np.testing.assert_allclose(np.stack([scaling.factors(step) for step in steps]), expected, rtol=1e-6)
+    assert np.ptp(expected[:, 0]) > 0.5
+
+
+def test_factors_stay_within_their_limit() -> None:
+    network = trained()
+    network.head.bias += 100.0
+    factors = StepScaling(network).factors(evidence(1)[0])
+    np.testing.assert_allclose(factors, network.config.largest, rtol=1e-6)
+
+
+def test_an_unsure_step_keeps_its_deviations() -> None:
+    network, step = trained(), evidence(1)[0]
+    step[UNSURE] = 1.0
+    assert (StepScaling(network).factors(step) == 1.0).all()
+    assert (network(torch.from_numpy(step).float()) == 0.0).all()
+
+
+def test_weights_survive_the_disk_and_damage_is_noticed(tmp_path: Path) -> None:
+    network, path = trained(), tmp_path / f"{STEP_DEVIATION}.safetensors"
+    save_checkpoint(path, network, STEP_DEVIATION, "scan", {})
+    loaded = load_step_deviation(tmp_path, "scan")
+    assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in network.state_dict().items())
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(CheckpointError, match="sha256"):
+        load_step_deviation(tmp_path, "scan")
+
+
+@pytest.mark.parametrize("settings", [{"hidden": 0}, {"largest": 1.0}, {"largest": float("inf")}])
+def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="hidden, largest"):
+        StepDeviationConfig(**settings)  # type: ignore[arg-type]

@@ -1,0 +1,226 @@
+"""Scans and wheels in any order, late, silent or broken: the local estimator of a lidar."""
+
+import math
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ngo_estimator.data.relative_step import check_step
+from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarStep
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
+from ngo_recordings.scan_stream import LidarScan, WheelPose
+from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan
+
+BEGIN_NS = 10**12
+STEP_NS = 100_000_000
+ANGLES = fan(241, 240.0)
+
+
+def way(count: int, turn: float = 0.03) -> np.ndarray:
+    poses = [np.array((1.0, 1.0, 0.2))]
+    for _ in range(count - 1):
+        poses.append(compose(poses[-1], np.array((0.05, 0.0, turn))))
+    return np.array(poses)
+
+
+def scan_of(ranges: np.ndarray, k: int, angles: np.ndarray = ANGLES, **more: Any) -> LidarScan:
+    values = {"range_min": 0.05, "range_max": 30.0, "time_increment": 0.0, "frame_id": "laser"} | more
+    increment = float(angles[1] - angles[0]) if len(angles) > 1 else 0.01
+    return LidarScan(BEGIN_NS + k * STEP_NS, float(angles[0]), increment, np.asarray(ranges, np.float32), **values)
+
+
+def scans(poses: np.ndarray) -> list[LidarScan]:
+    noise = np.random.default_rng(0)
+    return [scan_of(cast(ROOM, pose, ANGLES) + noise.normal(0.0, 0.005, 241), k) for k, pose in enumerate(poses)]
+
+
+def wheels(poses: np.ndarray, late_ns: int = 0) -> list[WheelPose]:
+    """Wheels in a frame of their own, 3 % too long."""
+    first = np.array((5.0, -2.0, 1.0))
+    scaled = [between(poses[0], pose) * (1.03, 1.03, 1.0) for pose in poses]
+    return [WheelPose(BEGIN_NS + k * STEP_NS + late_ns, compose(first, each)) for k, each in enumerate(scaled)]
+
+
+def fed(odometry: LidarOdometry, records: Iterable[LidarScan | WheelPose], at_end: bool = True) -> list[LidarStep]:
+    steps = []
+    for record in records:
+        if isinstance(record, WheelPose):
+            odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+        else:
+            odometry.add_scan(record)
+        steps += list(odometry.ready())
+    return steps + (list(odometry.ready(at_end=True)) if at_end else [])
+
+
+def merged(poses: np.ndarray, held: int) -> list[LidarScan | WheelPose]:
+    """Wheels that come ``held`` scans after their own, or before it where that is negative."""
+    ours, theirs = scans(poses), wheels(poses)
+    keyed = [(k, 1, each) for k, each in enumerate(ours)] + [(k + held, 0, each) for k, each in enumerate(theirs)]
+    return [each for _, _, each in sorted(keyed, key=lambda entry: entry[:2])]
+
+
+def off(steps: list[LidarStep], poses: np.ndarray) -> float:
+    last = between(between(poses[0], poses[-1]), steps[-1].odom_xyyaw)
+    return math.hypot(last[0], last[1]) + abs(last[2])
+
+
+@pytest.mark.parametrize("held", [-5, 1, 2])
+def test_wheels_may_come_before_or_after_their_scans(held: int) -> None:
+    """Scans wait for their wheels: the result does not depend on who came first."""
+    poses = way(60)
+    together = fed(LidarOdometry(), merged(poses, 0))
+    apart = fed(LidarOdometry(), merged(poses, held))
+    assert len(together) == len(apart) == 59 and off(together, poses) < 0.05
+    for a, b in zip(together, apart, strict=True):
+        np.testing.assert_allclose(a.odom_xyyaw, b.odom_xyyaw, atol=0.01)  # the first scan waits for nobody
+        assert b.robot_odom_xyyaw is not None or b is apart[0]
+
+
+def test_silent_wheels_hold_up_nothing_for_long() -> None:
+    poses = way(80)
+    theirs = {each.stamp_ns: each for each in wheels(poses)[:30]}
+    odometry, steps, most = LidarOdometry(), [], 0
+    for scan in scans(poses):
+        if scan.stamp_ns in theirs:
+            odometry.add_wheels(scan.stamp_ns, theirs[scan.stamp_ns].pose_xyyaw)
+        odometry.add_scan(scan)
+        steps += list(odometry.ready())
+        most = max(most, odometry.waiting)
+    assert most <= 4 and odometry.waiting == 0 and len(steps) == 79
+    assert off(steps, poses) < 0.05
+    robot = np.array([step.robot_odom_xyyaw for step in steps], np.float64)
+    assert np.abs(np.diff(robot, axis=0)[:, :2]).max() < 0.1  # goes on by our own steps
+
+
+def test_wheels_that_restart_begin_a_new_frame() -> None:
+    poses = way(60)
+    records: list[LidarScan | WheelPose] = []
+    for k, (scan, wheel) in enumerate(zip(scans(poses), wheels(poses), strict=True)):
+        back = 0 if k < 30 else 5 * 10**9  # the wheels' clock jumps back, and they begin at zero
+        pose = wheel.pose_xyyaw if k < 30 else between(wheels(poses)[30].pose_xyyaw, wheel.pose_xyyaw)
+        records += [WheelPose(wheel.stamp_ns - back, pose), scan]
+    steps = fed(LidarOdometry(), records)
+    assert len(steps) == 59 and off(steps, poses) < 0.05
+
+
+def test_stamps_that_came_already_and_restarts() -> None:
+    poses = way(30)
+    ours, odometry = scans(poses), LidarOdometry()
+    fed(odometry, ours[:20], at_end=False)
+    with pytest.raises(DuplicateFrame):
+        odometry.add_scan(ours[19])
+    with pytest.raises(LateFrame):
+        odometry.add_scan(ours[15])
+    assert odometry.restarts == 0
+    again = fed(odometry, [scan_of(ours[0].ranges, -50), *(scan_of(scan.ranges, k - 50) for k, scan in
+                enumerate(ours[1:], 1))])  # fmt: skip
+    assert odometry.restarts == 1 and len(again) == 29
+    assert again[0].origin_scan is not None and again[0].origin_stamp_ns == BEGIN_NS - 50 * STEP_NS
+    np.testing.assert_array_equal(again[-1].odom_xyyaw, fed(LidarOdometry(), ours)[-1].odom_xyyaw)
+
+
+@pytest.mark.parametrize("with_wheels", [True, False])
+def test_deskew_helps_a_robot_that_turns(with_wheels: bool) -> None:
+    """A scanner that sweeps for 0.09 s on a robot that turns to and fro, after it stood."""
+    sweep_s, rays = 0.09, len(ANGLES)
+    turns = [0.0] * 5 + [math.radians(8.0 if k // 8 % 2 else -8.0) for k in range(56)]
+    steps_xyyaw = [np.array((0.05 if turn else 0.0, 0.0, turn)) for turn in turns]
+    poses = [np.array((1.5, 1.2, 0.6))]
+    for step in steps_xyyaw:
+        poses.append(compose(poses[-1], step))
+    offsets = np.arange(rays) * sweep_s / rays
+    noise, plain, swept = np.random.default_rng(0), [], []
+    for k, (pose, step) in enumerate(zip(poses, steps_xyyaw, strict=False)):
+        moved = [compose(pose, step * t / 0.1) for t in offsets]
+        ranges = np.array([cast(ROOM, at, angle[None])[0] for at, angle in zip(moved, ANGLES, strict=True)])
+        ranges += noise.normal(0.0, 0.005, rays)
+        plain.append(scan_of(ranges, k))
+        swept.append(scan_of(ranges, k, time_increment=sweep_s / rays))
+    found = []
+    for each in (plain, swept):
+        records: list[Any] = list(each)
+        if with_wheels:
+            records = [record for pair in zip(wheels(np.array(poses)), each, strict=False) for record in pair]
+        steps = fed(LidarOdometry(), records)
+        errors = [between(between(poses[0], p), step.odom_xyyaw) for p, step in zip(poses[1:], steps, strict=False)]
+        found.append(float(np.sqrt(np.mean(np.square(errors)[:, :2].sum(1)))))
+    assert found[1] < 0.7 * found[0]
+
+
+def hostile_scans() -> dict[str, LidarScan]:
+    count = 20_000
+    good = cast(ROOM, way(40)[20], ANGLES)
+    return {
+        "tiny increment": scan_of(good, 0, np.array((0.0, 1e-9))),
+        "all nan": scan_of(np.full(241, np.nan), 0),
+        "all inf": scan_of(np.full(241, np.inf), 0),
+        "all zero": scan_of(np.zeros(241), 0),
+        "all negative": scan_of(np.full(241, -3.0), 0),
+        "one ray": scan_of(np.ones(1), 0, np.zeros(1)),
+        "no ray": scan_of(np.zeros(0), 0, np.zeros(1)),
+        "20,000 rays": scan_of(np.full(count, 3.0), 0, np.linspace(-3.0, 3.0, count)),
+        "20,000 wild rays": scan_of(np.random.default_rng(0).uniform(0.0, 900.0, count), 0, np.linspace(-3, 3, count)),
+        "too many rays": scan_of(np.ones(count + 1), 0, np.linspace(-3.0, 3.0, count + 1)),
+        "clockwise": scan_of(good[::-1], 0, ANGLES[::-1]),
+        "no range_max": scan_of(good, 0, range_max=0.0),
+        "infinite range_max": scan_of(good, 0, range_max=math.inf),
+        "range_max of nan": scan_of(good, 0, range_max=math.nan),
+        "limits in the wrong order": scan_of(good, 0, range_min=50.0, range_max=1.0),
+        "everything far away": scan_of(np.full(241, 3e38), 0, range_max=math.inf),
+        "all in one place": scan_of(np.full(241, 0.0500001), 0),
+        "a sweep of hours": scan_of(good, 0, time_increment=100.0),
+        "a sweep of nan": scan_of(good, 0, time_increment=math.nan),
+    }
+
+
+@pytest.mark.parametrize("name", hostile_scans())
+def test_a_hostile_scan_costs_itself_alone(name: str) -> None:
+    """In the middle of a drive, and as its first scan; no message takes long."""
+    poses = way(40)
+    bad = hostile_scans()[name]
+    for at in (0, 20):
+        odometry, steps, refused = LidarOdometry(), [], 0
+        for k, scan in enumerate(scans(poses)):
+            one = LidarScan(scan.stamp_ns, *list(vars(bad).values())[1:]) if k == at else scan
+            began = time.process_time()
+            try:
+                odometry.add_scan(one)
+                steps += list(odometry.ready())
+            except UnusableImage:
+                refused += 1
+            assert time.process_time() - began < 2.0 or k < 2  # the first ones compile
+        assert refused <= 1 and len(steps) >= 38
+        for step in steps:
+            check_step(step, 0, None)
+            assert step.odom_xyyaw.dtype == np.float64
+        assert at == 0 or off(steps, poses) < 0.1
+
+
+values = st.sampled_from([0.0, 1e9, 1e-3, 1.0, -1.0, 1e6, 1e150, 1e300, -1e300, math.nan, math.inf])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(-40, 40), st.tuples(values, values, values)), max_size=8))
+def test_any_wheels_leave_finite_steps(hostile: list[tuple[int, int, tuple[float, ...]]]) -> None:
+    poses = way(31)
+    odometry, steps = LidarOdometry(), []
+    for k, (scan, wheel) in enumerate(zip(scans(poses), wheels(poses), strict=True)):
+        odometry.add_wheels(wheel.stamp_ns, wheel.pose_xyyaw)
+        for at, late, pose in hostile:
+            if at == k:
+                try:
+                    odometry.add_wheels(wheel.stamp_ns + late * 50_000_000, np.array(pose))
+                except ValueError:
+                    assert not (np.abs(pose) <= 1e9).all()
+        odometry.add_scan(scan)
+        steps += list(odometry.ready())
+    steps += list(odometry.ready(at_end=True))
+    assert len(steps) == 30
+    for step in steps:
+        check_step(step, 0, None)

@@ -1,0 +1,51 @@
+"""The published covariance follows the factors on the steps' deviations, and the poses do not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
+
+STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))
+
+
+def driven(factors: np.ndarray, keys: int = 6, config: ScanGraphConfig | None = None) -> ScanGraph:
+    """A graph after steps that each end at a key scan without points."""
+    graph = ScanGraph(config or ScanGraphConfig(step_m=1e-6, step_deg=1e-6))
+    nothing = np.zeros(0, np.float32)
+    for k in range(keys):
+        key = KeyScanStep(no_scan(k + 1), k, STEP, COVARIANCE, factors)
+        if k == 0:
+            graph.begin_at(RelativeStep(1, 0, STEP, COVARIANCE, 0, STEP, nothing, nothing, key=key))
+        graph.append(STEP, COVARIANCE, key)
+    return graph
+
+
+@pytest.mark.parametrize("optimised", [False, True])
+def test_the_published_covariance_follows_the_factors_and_the_poses_do_not(optimised: bool) -> None:
+    plain, scaled = driven(np.ones(3)), driven(np.full(3, 3.0))
+    if optimised:
+        for graph in (plain, scaled):
+            graph.begin()
+            while not graph.advance(1):
+                pass
+    (pose, covariance), (same_pose, larger) = plain.newest(), scaled.newest()
+    np.testing.assert_array_equal(same_pose, pose)
+    np.testing.assert_allclose(larger, 9.0 * covariance, rtol=1e-6)
+
+
+def test_optimising_a_chain_without_loops_keeps_its_covariance() -> None:
+    graph = driven(np.array((2.0, 2.0, 0.5)))
+    before = graph.newest()[1]
+    graph.begin()
+    graph.advance(5)
+    np.testing.assert_allclose(graph.newest()[1], before, rtol=1e-6)
+
+
+def test_a_key_scan_has_no_factors_by_default() -> None:
+    key = KeyScanStep(no_scan(1), 0, STEP, COVARIANCE)
+    np.testing.assert_array_equal(key.factors, 1.0)
+    assert dataclasses.replace(key, factors=np.full(3, 2.0)).factors[0] == 2.0
