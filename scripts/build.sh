@@ -21,6 +21,10 @@ if [ -f install/local_setup.bash ] && [ "$(cat install/ngo_key 2>/dev/null)" = "
 fi
 
 rm -f install/ngo_key
+# Links of an earlier build to sources that are gone would end this one.
+for folder in build install; do
+    [ ! -d "$folder" ] || find "$folder" -xtype l -delete
+done
 # A build must see the underlay alone: what this shell has opened besides would end up in the setup files.
 unset AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PYTHONPATH
 export NGO_ENV_UNDERLAY_ONLY=1

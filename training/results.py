@@ -2,6 +2,7 @@
 
     python -m training.results --world maze2d
     python -m training.results --world maze3d
+    python -m training.results --world scan      # of the lidar: training.results_scan
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
 measured in mazes that nothing was trained or chosen on. The command writes ``training/results/WORLD.json``,
@@ -9,6 +10,7 @@ measured in mazes that nothing was trained or chosen on. The command writes ``tr
 """
 
 import json
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from tqdm import tqdm
 
+from training import results_scan
 from training.common import runs
 from training.common.command_line import run_command
 from training.common.curves import write_at_once
@@ -189,4 +192,7 @@ def summary(
 
 
 if __name__ == "__main__":
-    run_command(main, Arguments, __doc__)
+    if "--world scan" in " ".join(sys.argv).replace("--world=", "--world "):
+        run_command(results_scan.main, results_scan.Arguments, results_scan.__doc__)
+    else:
+        run_command(main, Arguments, __doc__)

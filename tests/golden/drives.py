@@ -14,7 +14,7 @@ from ngo_estimator.online.online_trajectory import OnlineTrajectory
 
 FOLDER = Path(__file__).parent
 WEIGHTS = FOLDER.parents[1] / "ros_ws/src/ngo_estimator/weights"
-WORLDS = ("maze2d", "maze3d", "scan")
+WORLDS = ("maze2d", "maze3d")
 FIRST_STAMP_NS = 1_000_000_000
 
 
@@ -22,9 +22,9 @@ FIRST_STAMP_NS = 1_000_000_000
 class GoldenDrive:
     """A drive of ``n`` frames through a maze, and the expected result.
 
-    ``frames`` ``(n, height, width, channels)`` of the world's type, ``actions`` ``(n - 1,)`` between them (unused by
-    weights for scans), ``period_ns`` () between two stamps, ``truth`` ``(n, 3)`` the true poses seen from the first
-    frame (m, m, rad). ``poses`` ``(n, 3)`` and ``covariance`` ``(3, 3)`` are the expected corrected poses and the
+    ``frames`` ``(n, height, width, channels)`` of the world's type, ``actions`` ``(n - 1,)`` between them,
+    ``period_ns`` () between two stamps, ``truth`` ``(n, 3)`` the true poses seen from the first frame (m, m, rad).
+    ``poses`` ``(n, 3)`` and ``covariance`` ``(3, 3)`` are the expected corrected poses and the
     covariance of the last one, in ``map``.
     """
 
@@ -69,3 +69,10 @@ def corrected(steps: list[RelativeStep], online: OnlineTrajectory) -> tuple[Traj
 def position_rmse(poses: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square error (m) of positions."""
     return float(np.sqrt(np.square(poses[:, :2] - truth[:, :2]).sum(axis=1).mean()))
+
+
+def largest_difference(poses: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """Largest distance (m) and angle (rad) between two trajectories."""
+    difference = poses - expected
+    angle = np.remainder(difference[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    return float(np.hypot(difference[:, 0], difference[:, 1]).max()), float(np.abs(angle).max())

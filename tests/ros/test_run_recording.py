@@ -30,6 +30,7 @@ from ngo_recordings.writer import RecordingWriter
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.maze3d import Maze3D
+from tests.unit.ngo_estimator.samples import SCAN
 from tests.unit.ngo_recordings import messages as make
 
 from .processes import NodeProcess, Probe
@@ -124,7 +125,7 @@ class LiveNodes:
             self._probe.collect(PoseWithCovarianceStamped, "ngo/pose"),
             self._probe.collect(Trajectory, "ngo/trajectory"),
         )
-        self._topics = {"/scan"} if world == "scan" else {"/image", "/action"}
+        self._topics = {"/scan"} if world == "our_robot" else {"/image", "/action"}
         self._publishers = {name: self._probe.node.create_publisher(TOPICS[name], name, 1000) for name in self._topics}
 
     def close(self) -> None:
@@ -209,9 +210,9 @@ def numbers(message: Any) -> tuple[float, ...]:
 def test_equals_the_live_nodes(world: str, tmp_path: Path) -> None:
     name = "maze2d" if world == "faulty" else world
     weights = None
-    if world == "scan":
-        weights = tmp_path / "weights"
-        write_untrained(weights, "scan")
+    if world == "scan":  # networks of one's own
+        name, weights = "our_robot", tmp_path / "weights"
+        write_untrained(weights, name, SCAN)
     if world == "faulty":
         entries = faulty_entries()
     else:

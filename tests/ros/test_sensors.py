@@ -19,6 +19,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.odometry.local_odometry import LocalOdometry
+from tests.unit.ngo_estimator.samples import SCAN
 
 from .processes import NodeProcess, Probe
 
@@ -47,15 +48,15 @@ def assert_same_motion(core: LocalOdometry, message: RelativePose, image: np.nda
 
 
 def test_the_simulators_laser_becomes_odometry(probe: Probe, tmp_path: Path) -> None:
-    write_untrained(tmp_path, "scan")
-    core = LocalOdometry.load(tmp_path, "scan")
+    write_untrained(tmp_path, "our_robot", SCAN)
+    core = LocalOdometry.load(tmp_path, "our_robot")
     scans, odometry = probe.collect(LaserScan, "scan"), probe.collect(Odometry, "odom")
     relative_poses = probe.collect(RelativePose, "relative_pose")
     probe.collect(Image, "image")  # last: the simulator waits for this one
-    settings = {"world": "scan", "weights": str(tmp_path), **RELIABLE}
+    settings = {"world": "our_robot", "weights": str(tmp_path), **RELIABLE}
     maze = {"frames": FRAMES, "rate": 0.0, "flow_control_topics": ["odom"], **WAITING}
     with NodeProcess("ngo_estimator", "local_node", settings) as local:
-        local.wait_for_log("ready: /local_node, scan, LaserScan on '/scan'")
+        local.wait_for_log("ready: /local_node, our_robot, LaserScan on '/scan'")
         probe.spin_until(lambda: probe.node.count_publishers("odom"), "the estimator")
         with NodeProcess("ngo_sim", "maze2d", maze) as simulator:
             probe.spin_until(lambda: len(odometry) == len(relative_poses) == FRAMES - 1, "odometry of every scan")
@@ -123,7 +124,7 @@ def test_compressed_pictures_for_weights_that_take_depth_end_the_start(probe: Pr
         assert len(local.lines) == 1, local.log
 
 
-def test_the_shipped_scan_model_follows_the_simulator(probe: Probe) -> None:
+def test_the_shipped_lidar_follows_the_simulator(probe: Probe) -> None:
     """Both estimators as a user starts them, on a maze of the validation split."""
     frames = 160
     truth, odometry = probe.collect(Odometry, "ground_truth"), probe.collect(Odometry, "odom")

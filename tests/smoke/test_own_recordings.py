@@ -18,6 +18,9 @@ from training.recordings.recording_source import NO_LOOPS
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(400)]
 
+SMALL_MAZE = {"seed": 1007, "frames": 2000, "rows": 3, "cols": 3}
+LIDAR = {"image": "/scan", "action": "none"}
+
 
 def record(world: str, path: Path, **parameters: Any) -> None:
     with NodeProcess("ngo_sim", world, {"rate": 0, "record": str(path), **parameters}) as node:
@@ -25,16 +28,24 @@ def record(world: str, path: Path, **parameters: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("world", "drives", "settings"),
+    ("world", "drives", "settings", "shape"),
     [
         # One drive, whose end is held out.
-        ("maze2d", [{"seed": 1007, "frames": 2000, "rows": 3, "cols": 3}], {"rate": 6e-3, "epochs": 6}),
+        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 6}, (1, 241, 4)),
+        # The same as a lidar sees it, without actions.
+        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 6, "topics": LIDAR}, (1, 241, 1)),
         # Several, of which the last is.
-        ("maze3d", [{"seed": seed, "frames": 1000} for seed in (1001, 1002, 1003)], {"rate": 4e-3, "epochs": 4}),
+        (
+            "maze3d",
+            [{"seed": seed, "frames": 1000} for seed in (1001, 1002, 1003)],
+            {"rate": 4e-3, "epochs": 4},
+            (60, 80, 3),
+        ),
     ],
+    ids=["maze2d", "scan", "maze3d"],
 )
 def test_a_minute_of_training_from_files_alone_beats_the_untrained_estimator(
-    world: str, drives: list[dict[str, int]], settings: dict[str, float], tmp_path: Path
+    world: str, drives: list[dict[str, int]], settings: dict[str, Any], shape: tuple[int, ...], tmp_path: Path
 ) -> None:
     files = [tmp_path / f"drive_{drive['seed']}.mcap" for drive in drives]
     for path, drive in zip(files, drives, strict=True):
@@ -66,7 +77,8 @@ def test_a_minute_of_training_from_files_alone_beats_the_untrained_estimator(
     assert len(description["data"]["split"]) == 4
     assert str(tmp_path) not in json.dumps(description)
     # What was measured in the recordings is what runs later.
-    assert network.config.image.shape == ((1, 241, 4) if world == "maze2d" else (60, 80, 3))
+    assert network.config.image.shape == shape
+    assert network.config.image.is_scan == ("topics" in settings)
     assert network.config.period_s == pytest.approx(0.1 if world == "maze2d" else 2 / 35, rel=1e-6)
     optimizer = load_description(folder / "neural_graph_optimizer.safetensors", "neural_graph_optimizer")
     assert (NO_LOOPS in optimizer) == (NO_LOOPS in table)

@@ -53,7 +53,7 @@ class Killed(RuntimeError):
 
 @pytest.mark.parametrize(
     ("world", "frames", "place_frames"),
-    [("maze2d", 161, 400), ("scan", 161, 700), pytest.param("maze3d", 161, 700, marks=pytest.mark.slow)],
+    [("maze2d", 161, 400), pytest.param("maze3d", 161, 700, marks=pytest.mark.slow)],
 )
 def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     world: str,
@@ -119,9 +119,9 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     # A calibrated network has no constant error on what it was calibrated with: the normalisation was changed for it.
     config = load_local(weights, world)[0].config
     assert config.relative_bias[2] != 0.0
-    assert config.action_history == {"maze2d": 3, "scan": 1, "maze3d": 12}[world]
+    assert config.action_history == {"maze2d": 3, "maze3d": 12}[world]
     # Steps alone of what is seen and in validation; the world's windows where earlier actions correct it.
-    assert set(windows) == {"maze2d": {(1,)}, "scan": {(1,)}, "maze3d": {(1,), (1, 4, 16)}}[world]
+    assert set(windows) == {"maze2d": {(1,)}, "maze3d": {(1,), (1, 4, 16)}}[world]
 
 
 def test_the_papers_form_trains_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Train on recordings where no simulator can be imported: ``python -m tests.smoke.without_simulators SETTINGS``.
 
-SETTINGS is a JSON object: ``folder``, ``data``, ``width``, ``rate``, ``epochs``. The last line printed is another one:
-the table of the evaluation, and the same errors of the odometry before any training (``untrained``).
+SETTINGS is a JSON object: ``folder``, ``data``, ``width``, ``rate``, ``epochs`` and, where they are not chosen,
+``topics``. The last line printed is another one: the table of the evaluation, and the same errors of the odometry
+before any training (``untrained``).
 """
 
 import importlib.abc
@@ -30,6 +31,7 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
     import torch
 
     from ngo_estimator.geometry import se2
+    from ngo_recordings.topics import TopicArguments
     from training import evaluate, featurise, train_local, train_optimizer, train_place, train_smoother
     from training.recordings.recording_source import RecordedArguments, open_recorded
     from training.recordings.recording_streams import RecordedSteps, track_pairs
@@ -38,7 +40,9 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
     from training.train_local import estimated, initial_network
 
     folder = Path(settings["folder"])
-    recordings = RecordedArguments(data=tuple(map(Path, settings["data"])), name="robot")
+    recordings = RecordedArguments(
+        data=tuple(map(Path, settings["data"])), name="robot", topics=TopicArguments(**settings.get("topics", {}))
+    )
     places: dict[str, Any] = {"runs": folder / "runs"}
     common: dict[str, Any] = {"recordings": recordings, "precision": "32-true", **places}
     width, epochs = settings["width"], settings["epochs"]

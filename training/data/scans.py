@@ -1,5 +1,7 @@
 """Simulated 2D lidars: mazes of random width and pace, seen by lidars of random geometry and quality.
 
+Estimators are measured on these mazes, and nothing is trained on them.
+
 Everything random follows from the maze's seed, so an episode is the same wherever it is simulated.
 """
 
@@ -21,6 +23,22 @@ from ngo_sim.mazes import Maze
 _CAST_RAYS = 721  # of the simulated scanner before its own rays are chosen: half a degree from one to the next
 _DRAWN, _NOISE = 7, 8  # numbers of the random generators of an episode, none of them the driver's
 
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "as drawn in training": {},
+    "noise 0 cm": {"noise_m": 0.0},
+    "noise 1 cm": {"noise_m": 0.01},
+    "noise 3 cm": {"noise_m": 0.03},
+    "noise 5 cm": {"noise_m": 0.05},
+    "dropouts 0 %": {"dropout": 0.0},
+    "dropouts 5 %": {"dropout": 0.05},
+    "dropouts 20 %": {"dropout": 0.2},
+    "noise 5 cm, dropouts 20 %": {"noise_m": 0.05, "dropout": 0.2},
+    "field of view 180 deg": {"field_of_view_deg": 180.0},
+    "field of view 360 deg": {"field_of_view_deg": 360.0},
+    "range 4 m": {"range_max_m": 4.0},
+}
+"""Conditions of the tables by name: what they change of the scanner that is drawn."""
+
 
 @dataclass(frozen=True)
 class Scanner:
@@ -40,7 +58,7 @@ class Scanner:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Scanner:
-        """A scanner like those that the networks learn from."""
+        """A scanner of the tables: what it sees varies from maze to maze."""
         every = int(rng.integers(1, 5))
         return cls(
             every=every,
@@ -50,6 +68,15 @@ class Scanner:
             dropout=float(rng.uniform(0.0, 0.05)),
             range_max_m=float(np.exp(rng.uniform(math.log(4.0), math.log(30.0)))),
         )
+
+
+SCAN_IMAGE = ImageFormat(
+    height=1, width=289, channels=1, dtype="float32", field_of_view_deg=360.0, depth_gain_m=1.5, depth_softening_m=0.75
+)
+"""A format of scans that covers all directions, as networks for scanners of any geometry take it."""
+
+ROWS = (4, 7)
+"""Range of the rows of a table's mazes, both ends included."""
 
 
 def drawn_config(rng: np.random.Generator, size: Mapping[str, int]) -> Maze2DConfig:
@@ -105,7 +132,8 @@ class ScannedMaze(gymnasium.Env[Any, Any]):
         observation, *rest, info = self._world.step(action)
         return self._scan(observation), *rest, info  # type: ignore[return-value]
 
-    def _scan(self, observation: np.ndarray) -> np.ndarray:
+    def rays(self, observation: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """What the scanner measures: its ranges ``(rays,)``, the angle of the first and the step to the next."""
         scanner, angles = self.scanner, self._world.ray_angles_rad
         half = math.radians(scanner.field_of_view_deg) / 2.0 + 1e-9
         # A ray straight back is cast twice, as the first and the last.
@@ -115,5 +143,8 @@ class ScannedMaze(gymnasium.Env[Any, Any]):
         ranges = depth + scanner.noise_m * self._noise.standard_normal(len(depth))
         lost = (depth > scanner.range_max_m) | (self._noise.random(len(depth)) < scanner.dropout)
         step = float(angles[1] - angles[0]) * scanner.every
-        ranges = np.where(lost, np.inf, ranges)
-        return scan_image(self._image, ranges, float(angles[chosen[0]]), step, 0.0, math.inf).reshape(-1)
+        return np.where(lost, np.inf, ranges), float(angles[chosen[0]]), step
+
+    def _scan(self, observation: np.ndarray) -> np.ndarray:
+        ranges, first, step = self.rays(observation)
+        return scan_image(self._image, ranges, first, step, 0.0, math.inf).reshape(-1)

@@ -24,7 +24,6 @@ from training.data.batches import (
     action_histories,
     mirrored,
     relative_poses,
-    reversed_in_time,
 )
 from training.data.episodes import episodes_in, images_of, wall_ranges
 from training.data.worlds import DRAWN, World
@@ -81,8 +80,7 @@ class PairStream(_Stream):
     What is shuffled are stretches of steps that follow each other, as many as the longest of the world's
     ``error_windows`` has (mostly one). A batch holds ``earlier``, ``later`` ``(batch, height, width, channels)``,
     ``relative`` ``(batch, 3)`` and, in a world with actions, ``action`` ``(batch, ACTION_HISTORY)``: a few of them as
-    after a restart, when the earlier ones are not known. Where a world ``reverses``, time runs backwards in every
-    fourth batch.
+    after a restart, when the earlier ones are not known.
     """
 
     FRAMES = 401
@@ -129,8 +127,6 @@ class PairStream(_Stream):
             }
             if self.world.actions:
                 batch["action"] = actions[chosen]
-            if self.world.reverses and count % 8 in (2, 5):
-                batch = reversed_in_time(batch)
             yield mirrored(batch) if count % 2 else batch
 
 

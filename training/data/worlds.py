@@ -17,7 +17,7 @@ from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
 if TYPE_CHECKING:
     import gymnasium
 
-WorldName = Literal["maze2d", "maze3d", "scan"]
+WorldName = Literal["maze2d", "maze3d"]
 
 # A maze is a function of its seed and size: these ranges never meet (tests/unit/training/data/test_worlds.py).
 TEST_SEEDS = range(0, 1_000)
@@ -66,7 +66,7 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class World(Domain):
-    """A simulated world. No driver here drives backwards, whether the world ``reverses`` or not."""
+    """A simulated world. No driver here drives backwards."""
 
     driver: str
     """Name of the driver wherever no other is named; smoother and optimizer learn from its trajectories."""
@@ -123,10 +123,6 @@ class World(Domain):
             from ngo_sim.maze2d import Maze2D, Maze2DConfig
 
             return Maze2D(Maze2DConfig(**changes))
-        if self.name == "scan":
-            from training.data.scans import ScannedMaze
-
-            return ScannedMaze(self.image, changes)
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
         return Maze3D(Maze3DConfig(**changes))
@@ -225,24 +221,6 @@ WORLDS = {
             "seen_policy": Table(stretch=1, seen=True, driver="learned"),
             "unseen_policy": Table(driver="learned"),
         },
-    ),
-    # The 2D world as any 2D lidar sees it; corridors and paces are drawn, so lengths here are those of the middle.
-    "scan": World(
-        name="scan",
-        image=WORLD_IMAGES["scan"],
-        driver="corners",
-        block_m=1.4,
-        period_s=0.1,
-        episode_frames=2000,
-        rows=(4, 7),
-        extra_openings=(0, 8),
-        place_radius_m=0.7,
-        heading_limit_rad=np.pi,
-        loop_views=5,
-        tables={"unseen": Table()},
-        reverses=True,
-        actions=0,
-        mirrored_actions=(),
     ),
 }
 

@@ -21,6 +21,7 @@ setup(
         "matplotlib",
         "ngo_common",
         "ngo_recordings",
+        "numba",
         "numpy",
         "rich",
         "rosbags",

@@ -26,6 +26,7 @@ setup(
         "numpy",
         "pymunk",
         "safetensors",
+        "scipy",
         "vizdoom",
     ],
     zip_safe=False,

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
+from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig
 from ngo_estimator.networks.odometry_smoothing import SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig
@@ -13,6 +14,9 @@ from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 
 WORLDS = ["maze2d", "maze3d"]
+
+SCAN = ImageFormat(1, 289, 1, "float32", field_of_view_deg=360.0, depth_gain_m=1.5, depth_softening_m=0.75)
+"""Scans of a robot of one's own."""
 
 
 def observations(world: str, count: int, seed: int = 0) -> Tensor:

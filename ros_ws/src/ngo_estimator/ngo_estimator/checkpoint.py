@@ -34,15 +34,6 @@ RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
-    "scan": ImageFormat(
-        height=1,
-        width=289,
-        channels=1,
-        dtype="float32",
-        field_of_view_deg=360.0,
-        depth_gain_m=1.5,
-        depth_softening_m=0.75,
-    ),
 }
 ACTION_WORLDS = ("maze2d", "maze3d")
 

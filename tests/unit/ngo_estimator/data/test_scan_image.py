@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.data.images import ImageFormat, scan_image, to_network
+from tests.unit.ngo_estimator.samples import SCAN
 
-SCAN = WORLD_IMAGES["scan"]
 EIGHT = ImageFormat(1, 9, 1, "float32", field_of_view_deg=360.0)  # a ray every 45 degrees, from back over left
 
 

@@ -11,15 +11,14 @@ from PIL import Image as Picture
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image, LaserScan
 
-from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.data.images import ImageFormat, scan_image
 from ngo_estimator.nodes.sensors import sensor_array, sensor_topic
+from tests.unit.ngo_estimator.samples import SCAN
 
 ROW = ImageFormat(1, 9, 4, "float32")
 COLOUR = ImageFormat(3, 8, 3, "uint8")
 GREY = ImageFormat(3, 8, 1, "uint8")
 DEPTH = ImageFormat(3, 8, 1, "float32")
-SCAN = WORLD_IMAGES["scan"]
 
 
 def over_the_wire(message: Any) -> Any:

@@ -3,23 +3,19 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_sim.episodes import Episode, record_episode
-from training.data.batches import relative_poses, reversed_in_time
-from training.data.scans import ScannedMaze, Scanner
-from training.data.streams import PairStream
-from training.data.worlds import TRAIN_SEEDS, WORLDS
+from training.data.scans import SCAN_IMAGE, ScannedMaze, Scanner
 
-IMAGE, SIZE = WORLD_IMAGES["scan"], {"rows": 3, "cols": 3}
+SIZE = {"rows": 3, "cols": 3}
 PERFECT = {"every": 1, "first": 0, "field_of_view_deg": 360.0, "noise_m": 0.0, "dropout": 0.0, "range_max_m": 100.0}
 
 
 def episode(seed: int = 5, frames: int = 20, **changes: object) -> Episode:
-    return record_episode(ScannedMaze(IMAGE, SIZE, changes), "corners", frames, seed)
+    return record_episode(ScannedMaze(SCAN_IMAGE, SIZE, changes), "corners", frames, seed)
 
 
 def test_an_episode_is_a_function_of_its_seed_alone() -> None:
-    env = ScannedMaze(IMAGE, SIZE)
+    env = ScannedMaze(SCAN_IMAGE, SIZE)
     record_episode(env, "corners", 30, 4)
     again = record_episode(env, "corners", 20, 5)
     np.testing.assert_array_equal(again.observations, episode().observations)
@@ -37,7 +33,7 @@ def test_noise_and_dropouts_are_those_asked_for() -> None:
     perfect = episode(**PERFECT).observations
     assert np.isfinite(perfect).all()
     # The rays of the scanner that are those of the format, so that nothing is interpolated.
-    same = np.abs(np.degrees(IMAGE.ray_angles_rad) % 0.5) < 1e-6
+    same = np.abs(np.degrees(SCAN_IMAGE.ray_angles_rad) % 0.5) < 1e-6
     noisy = episode(**{**PERFECT, "noise_m": 0.02}).observations - perfect
     assert noisy[:, same].std() == pytest.approx(0.02, rel=0.1) and abs(noisy[:, same].mean()) < 0.002
     coarse, fine = (np.isinf(episode(**{**PERFECT, "every": n, "dropout": 0.2}).observations).mean() for n in (4, 1))
@@ -51,7 +47,7 @@ def test_limits_of_range_and_view_leave_no_return() -> None:
     np.testing.assert_array_equal(np.isinf(near)[perfect > 1.6], True)
     np.testing.assert_array_equal(near[perfect < 1.4], perfect[perfect < 1.4])
     ahead = episode(**{**PERFECT, "field_of_view_deg": 200.0}).observations
-    degrees = np.abs(np.degrees(IMAGE.ray_angles_rad))
+    degrees = np.abs(np.degrees(SCAN_IMAGE.ray_angles_rad))
     assert np.isinf(ahead[:, degrees > 101.0]).all() and np.isfinite(ahead[:, degrees < 99.0]).all()
 
 
@@ -67,21 +63,3 @@ def test_what_is_drawn_is_in_its_ranges_and_varies() -> None:
     assert {s.every for s in scanners} == {1, 2, 3, 4} and all(s.first < s.every for s in scanners)
     widths = [episode(seed, 1).maze.block_m for seed in range(20)]
     assert 0.8 <= min(widths) < 1.1 and 1.9 < max(widths) <= 2.5
-
-
-def test_training_pairs_have_no_action_and_some_run_backwards() -> None:
-    world = WORLDS["scan"]
-    batches = list(PairStream(world, TRAIN_SEEDS, 0, 3200, 256))
-    assert all(batch.keys() == {"earlier", "later", "relative"} for batch in batches)
-    forward = [float(batch["relative"][:, 0].mean()) for batch in batches]
-    assert [count for count, mean in enumerate(forward) if mean < 0.0] == [2, 5, 10]
-
-
-def test_backwards_undoes_forwards() -> None:
-    poses = np.array([[0.0, 0.0, 0.3], [0.2, 0.1, 0.5], [0.3, 0.1, 0.2]])
-    world = WORLDS["scan"]
-    batch = next(iter(PairStream(world, TRAIN_SEEDS, 0, 3200, 256)))
-    batch = {name: value[:2] for name, value in batch.items()} | {"relative": relative_poses(poses)}
-    back = reversed_in_time(batch)
-    assert back["earlier"] is batch["later"] and back["later"] is batch["earlier"]
-    np.testing.assert_allclose(back["relative"].flip(0), relative_poses(poses[::-1].copy()), atol=1e-6)

@@ -53,6 +53,21 @@ def test_pairs_are_consecutive_frames_and_their_motion_every_second_batch_in_a_m
     assert seen <= consecutive and len(seen) > 0.9 * len(consecutive)
 
 
+def test_time_runs_backwards_in_a_quarter_of_the_batches_where_the_robot_does(data: RecordedData) -> None:
+    domain = dataclasses.replace(data.domain, reverses=True)
+    tracks = data.tracks("train")
+    later, earlier = (torch.from_numpy(drives.poses(2, 0))[k] for k in (1, 0))
+    back = se2.between(later, earlier).float()
+    batches, forward = (list(RecordedPairs(d, tracks, 0, 512, 32)) for d in (domain, data.domain))
+    reversed_ones = [k for k in range(len(batches)) if float(batches[k]["relative"][:, 0].mean()) < 0.0]
+    assert reversed_ones == [k for k in range(len(batches)) if k % 8 in (2, 5)]
+    for k in reversed_ones:
+        true = mirrored(batches[k]) if k % 2 else batches[k]
+        torch.testing.assert_close(true["relative"], back.expand(len(true["relative"]), 3), atol=1e-6, rtol=0.0)
+        assert torch.equal(batches[k]["earlier"], forward[k]["later"])
+        assert torch.equal(batches[k]["later"], forward[k]["earlier"])
+
+
 def test_an_epoch_follows_from_its_number_and_processes_share_it(data: RecordedData) -> None:
     def epoch(number: int, share: Share = Share()) -> list[bytes]:  # noqa: B008
         return [

@@ -73,9 +73,8 @@ def test_whole_turns_are_no_error() -> None:
     assert scores(estimate, truth, world_named("maze2d"))["heading_rmse_deg"] == pytest.approx(np.zeros(4), abs=1e-9)
 
 
-def test_every_world_of_the_paper_has_metrics() -> None:
-    """The scan model is measured over scanners instead (training/evaluate_scan.py)."""
-    assert set(METRICS) == set(WORLDS) - {"scan"}
+def test_every_world_has_metrics() -> None:
+    assert set(METRICS) == set(WORLDS)
 
 
 def test_trajectories_of_different_lengths_are_refused() -> None:

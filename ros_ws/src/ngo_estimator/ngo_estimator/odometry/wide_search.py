@@ -17,9 +17,9 @@ from ngo_estimator.geometry.planar_motion import Array, wrap
 class WideSearchConfig:
     """How far wide searches go.
 
-    A search goes ``least_m`` from the prediction, or ``deviations`` of it where that is farther, at most ``most_m``,
-    and turns by each of ``turns_deg`` until a pose has a response of ``enough``. A metre from the prediction costs
-    ``metre_cost`` of the response, a radian ``radian_cost``: the place that was found near it is left for one that is
+    A search goes ``least_m`` from the prediction, or ``deviations`` of it where that is farther, at most ``most_m``. It
+    turns by each of ``turns_deg`` until a pose has a response of ``enough``. A metre from the prediction costs
+    ``metre_cost`` of the response, a radian ``radian_cost``. The place that was found near it is left for one that is
     better by ``better`` after that. A second place whose response is at least ``alike`` of the best makes it doubtful.
     ``most_points`` of the scan are looked up.
     """

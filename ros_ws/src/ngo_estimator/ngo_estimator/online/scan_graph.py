@@ -192,6 +192,12 @@ class ScanGraph:
             newest = self.config.loops.submap_keys
             self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.values, newest))
 
+    def measurements(self) -> tuple[RelativePoses, RelativePoses]:
+        """The steps from each node to the next, and the accepted loops."""
+        loops = self._finder.loops[np.flatnonzero(self._finder.loops.accepted)]
+        measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
+        return self._chain(self._step_covariance.values), measured
+
     def begin(self) -> None:
         """Begin to optimise all nodes; where that fails, ``fault`` says so."""
         try:
@@ -202,10 +208,8 @@ class ScanGraph:
     def _begin(self) -> None:
         began = time.perf_counter()
         self._rows = np.flatnonzero(self._finder.loops.accepted)
-        loops = self._finder.loops[self._rows]
-        steps = self._chain(self._step_covariance.values)
-        measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
-        gates = np.ones(len(loops))
+        steps, measured = self.measurements()
+        gates = np.ones(len(self._rows))
         self._running = ScanPoseGraph(steps, measured, gates, self._nodes.values, self.config.kernel)
         self._left = self.config.iterations
         self._waiting = 0
@@ -280,12 +284,13 @@ class ScanGraph:
         pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
         return pose, propagate(self._end, pose, since, self._since)
 
-    def frame_poses(self, before: bool = False) -> np.ndarray:
+    def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
         """Poses of all frames ``(frames, 3)``, as they are or as they were before the last optimisation.
 
-        The difference between two nodes and their odometry is spread evenly over the frames between.
+        The difference between two nodes and their odometry is spread evenly over the frames between. With ``nodes``
+        ``(nodes, 3)`` these are the poses of the nodes.
         """
-        nodes = self._nodes.values.copy()
+        nodes = (self._nodes.values if nodes is None else nodes).copy()
         if before:  # nodes that came since follow the last of those
             last = len(self._before) - 1
             moved = torch.from_numpy(nodes[last:].copy())

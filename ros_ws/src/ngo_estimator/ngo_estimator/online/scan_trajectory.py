@@ -33,6 +33,11 @@ class ScanTrajectory(CorrectedTrajectory):
         """Begin with the settings in the folder ``weights``; raises ``LidarFileError``, of one clear line."""
         return cls(read_lidar_file(weights, "graph", ScanGraphConfig, world), iterations_per_step)
 
+    @property
+    def graph(self) -> ScanGraph:
+        """The graph of key scans."""
+        return self._graph
+
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
         return self._graph.walls(most)

@@ -1,0 +1,67 @@
+"""The lidar's results at toy size: every row, the files, and a second run that computes nothing."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from training import results_scan
+from training.scoring import lidar_rows
+from training.scoring.lidar_rows import ROWS
+
+
+@pytest.mark.timeout(600)
+def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = results_scan.Arguments(
+        buildings=2,
+        length_m=4.0,
+        mazes=2,
+        frames=40,
+        out=tmp_path / "out",
+        docs=tmp_path / "docs",
+        runs=tmp_path / "runs",
+    )
+    result = results_scan.main(arguments)
+    text = (tmp_path / "out" / "scan.json").read_text()
+    assert json.loads(text) == result
+    assert str(tmp_path) not in text
+
+    there = {name for name, row in ROWS.items() if not row.missing()}
+    assert set(result["tables"]) == {"buildings", "aliased", "maze2d"}
+    assert set(result["tables"]["buildings"]) == there
+    assert set(result["tables"]["maze2d"]) == {name for name in there if not ROWS[name].needs_wheels}
+    ate = result["tables"]["buildings"]["ours"]["ate_m"]
+    assert 0.0 < ate["mean"] < 0.3
+    assert ate["ci95"][0] <= ate["mean"] <= ate["ci95"][1]
+    assert result["paired"]["buildings"]["wheels"]["ate_m"]["relative_percent"]["mean"] > 0.0
+    assert result["logs"] == {}
+    assert result["failed"] == []
+    assert [line for line in result["skipped"] if line.startswith("logs: no folder")]
+
+    page = (tmp_path / "docs" / "results_scan.md").read_text()
+    assert "Simulated buildings" in page
+    for image in ("results_scan_buildings.png", "results_scan_aliased.png"):
+        assert image in page
+        assert (tmp_path / "docs" / "images" / image).stat().st_size > 10_000
+
+    def no_run(*_: object) -> None:
+        raise AssertionError("a row was estimated again")
+
+    monkeypatch.setattr(lidar_rows.DriveRuns, "__init__", no_run)
+    again = results_scan.main(arguments)
+    assert again["tables"] == result["tables"]
+
+
+def test_a_row_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(ValueError, match="gtsam_lm"):
+        results_scan.Arguments(rows=("gtsam",))
+
+
+@pytest.mark.parametrize("world", [("--world", "scan"), ("--world=scan",)])
+def test_the_command_of_results_takes_the_lidar(world: tuple[str, ...]) -> None:
+    command = [sys.executable, "-m", "training.results", *world, "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    assert "--logs" in shown
+    assert "--prefixes" not in shown

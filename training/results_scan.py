@@ -1,0 +1,266 @@
+"""The tables and figures of the lidar, by one command.
+
+    python -m training.results --world scan --logs FOLDER
+
+Every row is measured on the logs in a folder, where one is given, on simulated buildings and mazes that nothing was
+trained or chosen on, and beside other programs. The command writes ``training/results/scan.json``,
+``docs/results_scan.md`` and ``docs/images/results_scan_*.png``. Pictures of logs go to a folder of their own, if one is
+given. Run it again to continue after a stop.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+from tqdm import tqdm
+
+import ngo_recordings
+import ngo_sim
+from training.common import runs
+from training.common.command_line import run_command
+from training.common.curves import write_at_once
+from training.data import scans, simulated_drives
+from training.data.scans import CONDITIONS
+from training.data.simulated_drives import BUILDING_TEST_SEEDS, building_drive, maze_drive, scanned_maze_drive
+from training.data.worlds import WORLDS
+from training.recordings import lidar_logs
+from training.recordings.lidar_logs import log_drive, log_identity, logs_below
+from training.report import lidar_figures, lidar_page
+from training.scoring.lidar_bars import PUBLISHED, Bar, Table, bars
+from training.scoring.lidar_rows import ROWS, Row
+from training.scoring.lidar_scores import DriveSource, Scored, score_drive
+from training.scoring.statistics import compare, mean_interval
+
+Numbers = dict[str, dict[str, Any]]
+"""``{mean, ci95}`` by the metric's key."""
+
+_ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
+_SIMULATED = (ngo_sim, scans, simulated_drives)
+_READ = (ngo_recordings, lidar_logs)
+_MOST_SCANS = 20_000  # of a building: some robots stand for hours
+_PAIRED = "ate_m"
+_SCANNER_ROWS = ("ours_without_wheels",)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the lidar's results."""
+
+    world: Literal["scan"] = "scan"
+    """World to measure in."""
+    logs: Path | None = None
+    """Folder of real logs (.bag, .log, .clf, gzipped or not), with relations as NAME.relations; none: left out."""
+    buildings: int = 20
+    """Simulated buildings of each of the two tables."""
+    length_m: float = 500.0
+    """Way that the robot drives in a building."""
+    mazes: int = 8
+    """Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0."""
+    frames: int = 2000
+    """Scans in a maze."""
+    rows: tuple[str, ...] = ()
+    """Rows to measure, by name; none: all."""
+    weights: Path = runs.WEIGHTS / "scan"
+    """Folder with lidar.json, the settings of our estimators."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets scan.json."""
+    docs: Path = runs.ROOT / "docs"
+    """Folder that gets results_scan.md and images/."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of what was measured."""
+    pictures: Path | None = None
+    """Folder that gets pictures of the logs; none: they are not drawn."""
+
+    def __post_init__(self) -> None:
+        if unknown := [row for row in self.rows if row not in ROWS]:
+            raise ValueError(f"rows has {', '.join(unknown)}; expected among {', '.join(ROWS)}")
+        if self.buildings < 2 or self.mazes < 2 or self.frames < 2 or not self.length_m > 0.0:
+            raise ValueError(
+                f"buildings, mazes, frames, length_m are {self.buildings}, {self.mazes}, {self.frames}, "
+                f"{self.length_m}; expected at least 2 of each, and a positive way"
+            )
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Measure, write everything, and return the JSON's content."""
+    record = runs.record("results", arguments)
+    rows, skipped = _rows(arguments.rows)
+    tables = {name: _measured(arguments, name, sources, rows) for name, sources in _sources(arguments, skipped).items()}
+    scanner_rows = {name: row for name, row in rows.items() if name in _SCANNER_ROWS}
+    scanners = {
+        condition: _measured(arguments, condition, _scanner_sources(arguments, condition), scanner_rows)
+        for condition in CONDITIONS
+    }
+    found = bars(tables, scanners)
+    logs = tables.pop("logs", {})
+    result = {
+        "command": _command(record["command"], bool(logs)),
+        "revision": record["revision"],
+        "settings": {name: getattr(arguments, name) for name in ("buildings", "length_m", "mazes", "frames")},
+        "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
+        "tables": {name: _table_numbers(table) for name, table in tables.items()},
+        "scanners": {name: _table_numbers(table) for name, table in scanners.items()},
+        "paired": {name: _paired(table) for name, table in {"logs": logs, **tables}.items()},
+        "bars": [bar.as_json() for bar in found],
+        "skipped": skipped,
+        "failed": _failures({"logs": logs, **tables, **scanners}),
+    }
+    write_at_once(arguments.out / "scan.json", json.dumps(result, indent=2) + "\n")
+    images = lidar_figures.draw_buildings(arguments.docs / "images", tables)
+    if arguments.pictures is not None:
+        lidar_figures.draw_logs(arguments.pictures, logs)
+    write_at_once(arguments.docs / "results_scan.md", lidar_page.page(result, images))
+    _print(found, skipped)
+    return result
+
+
+def _command(recorded: str, with_logs: bool) -> str:
+    flags = recorded.partition("training.results")[2].split() + (["--logs", "FOLDER"] if with_logs else [])
+    return " ".join(("make results WORLD=scan", *([f'ARGS="{" ".join(flags)}"'] if flags else [])))
+
+
+def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
+    """The rows to measure, and in words those that this machine lacks something for."""
+    asked = {name: row for name, row in ROWS.items() if not names or name in names}
+    lacking = {name: row.missing() for name, row in asked.items()}
+    return (
+        {name: row for name, row in asked.items() if not lacking[name]},
+        [f"{name}: {why}" for name, why in lacking.items() if why],
+    )
+
+
+def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSource]]:
+    """The drives of each table; what is not there is added to what is skipped."""
+    seeds = {
+        "buildings": BUILDING_TEST_SEEDS[: arguments.buildings],
+        "aliased": BUILDING_TEST_SEEDS[_ALIASED_FIRST : _ALIASED_FIRST + arguments.buildings],
+    }
+    sources = {
+        table: [
+            DriveSource(
+                f"{table}_{seed}",
+                f"building {seed} {table} {arguments.length_m:g} m, {_MOST_SCANS} scans",
+                partial(building_drive, seed, arguments.length_m, table == "aliased", _MOST_SCANS),
+                _SIMULATED,
+            )
+            for seed in chosen
+        ]
+        for table, chosen in seeds.items()
+    }
+    mazes = list(WORLDS["scan"].table_seeds("unseen", "validation")[: arguments.mazes])
+    sources["maze2d"] = [
+        DriveSource(
+            f"maze2d_{seed}",
+            f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
+            partial(maze_drive, seed, arguments.frames, mazes[0]),
+            _SIMULATED,
+            has_wheels=False,
+        )
+        for seed in mazes
+    ]
+    if arguments.logs is None:
+        skipped.append("logs: no folder is given (--logs)")
+        return sources
+    logs = logs_below(arguments.logs)
+    if not logs:
+        skipped.append("logs: the folder has none")
+        return sources
+    of_logs = [DriveSource(name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()]
+    return {"logs": of_logs, **sources}
+
+
+def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
+    changes = CONDITIONS[condition]
+    return [
+        DriveSource(
+            f"maze_{seed}",
+            f"scanned maze {seed}, {condition}, {json.dumps(changes)}, {arguments.frames} frames",
+            partial(scanned_maze_drive, seed, arguments.frames, changes),
+            _SIMULATED,
+            has_wheels=False,
+        )
+        for seed in WORLDS["scan"].table_seeds("unseen", "validation")[: arguments.mazes]
+    ]
+
+
+def _measured(arguments: Arguments, table: str, sources: Sequence[DriveSource], rows: Mapping[str, Row]) -> Table:
+    cache = arguments.runs / "scan" / "results" / table.replace(" ", "_").replace("%", "percent").replace(",", "")
+    measured: dict[str, dict[str, Scored]] = {}
+    with tqdm(sources, desc=table, unit="drive") as bar:
+        for source in bar:
+            bar.set_postfix_str(source.name)
+            measured[source.name] = dict(score_drive(source, dict(rows), arguments.weights, cache))
+    return measured
+
+
+def _log_numbers(scored: Mapping[str, Scored]) -> dict[str, Numbers]:
+    """Of one log: means over its relations, the interval by resampling them; one number of a whole log has none."""
+    return {
+        row: {key: _interval(values) for key, values in one.errors.items()}
+        for row, one in scored.items()
+        if not one.failed
+    }
+
+
+def _interval(values: np.ndarray) -> dict[str, Any]:
+    if len(values) == 0:
+        return {"mean": None, "ci95": None}
+    return mean_interval(values).as_json() if len(values) > 1 else {"mean": float(values[0]), "ci95": None}
+
+
+def _published(log: str) -> dict[str, Numbers]:
+    return {
+        row: {key: {"mean": value, "ci95": None} for key, value in numbers.items()}
+        for row, numbers in PUBLISHED.get(log, {}).items()
+    }
+
+
+def _table_numbers(table: Table) -> dict[str, Numbers]:
+    """Of several drives: means over them, the interval by resampling them."""
+    by_row: dict[str, dict[str, list[float]]] = {}
+    for rows in table.values():
+        for row, scored in rows.items():
+            for key, values in scored.errors.items():
+                by_row.setdefault(row, {}).setdefault(key, []).append(float(values.mean()))
+    return {row: {key: _interval(np.array(values)) for key, values in errors.items()} for row, errors in by_row.items()}
+
+
+def _paired(table: Table) -> dict[str, Any]:
+    """By row: how much larger its ATE is than ours on the same drives, in a table of two drives or more."""
+    by_row: dict[str, list[tuple[float, float]]] = {}
+    for rows in table.values():
+        ours = rows["ours"].errors if "ours" in rows else {}
+        for row, scored in rows.items():
+            if row != "ours" and _PAIRED in ours and _PAIRED in scored.errors:
+                by_row.setdefault(row, []).append((float(scored.errors[_PAIRED][0]), float(ours[_PAIRED][0])))
+    return {
+        row: {_PAIRED: compare(*np.array(pairs).T).as_json()} for row, pairs in by_row.items() if len(pairs) > 1
+    }  # fmt: skip
+
+
+def _failures(tables: Mapping[str, Table]) -> list[str]:
+    return [
+        f"{table}, {drive}, {row}: {scored.failed}"
+        for table, drives in tables.items()
+        for drive, rows in drives.items()
+        for row, scored in rows.items()
+        if scored.failed
+    ]
+
+
+def _print(found: Sequence[Bar], skipped: Sequence[str]) -> None:
+    console = Console(highlight=False)
+    for bar in found:
+        limit = f"at most {bar.most:.4g}" if bar.least is None else f"at least {bar.least:.4g}"
+        console.print(f"{'met   ' if bar.met else 'MISSED'}  {bar.name}: {bar.value:.4g}, {limit}", soft_wrap=True)
+    for text in skipped:
+        console.print(f"skipped  {text}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)

@@ -1,0 +1,76 @@
+"""How far an estimate is from what is known of a lidar's drive."""
+
+import numpy as np
+
+from training.data.batches import seen_from_first
+from training.data.lidar_drives import Reference, ReferencePoses, Relations, TruePoses
+from training.scoring.metrics import trajectory_error
+from training.scoring.relations import interpolated, relation_errors
+
+Errors = dict[str, np.ndarray]
+"""Errors by the metric's key, each ``(samples,)``: one a relation, or a single one of a whole trajectory."""
+
+WITHIN_DEVIATIONS = 3.0
+
+
+def lidar_errors(reference: Reference | None, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Errors:
+    """Errors of an estimate ``(n, 3)`` at increasing stamps ``(n,)``.
+
+    - Relations: ``translation_m``, ``rotation_deg`` of each, and ``far_m``, ``far_deg`` of those that span over 30 s.
+    - A mapper's poses: ``ate_m``, the root mean square distance of positions after the best rigid alignment (Sturm et
+      al. 2012).
+    - The truth: ``ate_m``, and aligned at the first pose alone ``position_rmse_m``, ``heading_rmse_deg``.
+
+    Raises:
+        ValueError: nothing is known of the drive, or the estimate says nothing about what is.
+    """
+    if reference is None:
+        raise ValueError("nothing is known of where the robot was; expected a reference")
+    # From an epoch's start a float loses microseconds: relations are given in such floats, all else from the first.
+    if isinstance(reference, Relations):
+        found = relation_errors(reference, stamps_ns * 1e-9, poses_xyyaw)
+        return {
+            "translation_m": found.translation_m,
+            "rotation_deg": found.rotation_deg,
+            "far_m": found.translation_m[found.far],
+            "far_deg": found.rotation_deg[found.far],
+        }
+    estimate = _at(reference.stamps_ns, stamps_ns, poses_xyyaw)
+    errors = {"ate_m": np.array([absolute_error_m(estimate, reference.poses_xyyaw)])}
+    if isinstance(reference, ReferencePoses):
+        return errors
+    first = trajectory_error(estimate, reference.poses_xyyaw)
+    return {
+        **errors,
+        "position_rmse_m": np.array([first.position_rmse_m]),
+        "heading_rmse_deg": np.array([first.heading_rmse_deg]),
+    }
+
+
+def absolute_error_m(estimate_xyyaw: np.ndarray, reference_xyyaw: np.ndarray) -> float:
+    """Root mean square distance of positions, both ``(n, 3)``, after the planar rigid motion that makes it least."""
+    estimate, reference = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (estimate_xyyaw, reference_xyyaw))
+    x, y = estimate.T
+    dot, cross = (estimate * reference).sum(), (x * reference[:, 1] - y * reference[:, 0]).sum()
+    cosine, sine = np.cos(np.arctan2(cross, dot)), np.sin(np.arctan2(cross, dot))
+    turned = np.stack((cosine * x - sine * y, sine * x + cosine * y), axis=-1)
+    return float(np.sqrt(((turned - reference) ** 2).sum(axis=1).mean()))
+
+
+def within_deviations(truth: TruePoses, stamps_ns: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> float:
+    """Share of the published poses ``(n, 3)`` whose covariance ``(n, 3, 3)`` holds the truth.
+
+    x, y and heading of a pose, as published at its stamp, must each be within three of their own deviations of the
+    truth, both seen from the first scan.
+    """
+    start, true = truth.stamps_ns[0], seen_from_first(truth.poses_xyyaw)
+    at = interpolated((truth.stamps_ns - start) * 1e-9, true, (stamps_ns - start) * 1e-9)
+    off = np.abs(poses - at)
+    off[:, 2] = np.abs(np.remainder(poses[:, 2] - at[:, 2] + np.pi, 2.0 * np.pi) - np.pi)
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return float((off <= WITHIN_DEVIATIONS * deviations).all(axis=1).mean())
+
+
+def _at(wanted_ns: np.ndarray, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> np.ndarray:
+    start = wanted_ns[0]
+    return interpolated((stamps_ns - start) * 1e-9, poses_xyyaw, (wanted_ns - start) * 1e-9)

@@ -1,0 +1,278 @@
+"""The rows of the lidar's tables: who estimates, with which settings. One line makes a row."""
+
+import contextlib
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+
+import ngo_estimator
+from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
+from ngo_estimator.online.corrected_trajectory import Trajectory
+from ngo_estimator.online.scan_graph import ScanGraphConfig
+from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.optimizer.scan_pose_graph import RelativePoses
+from ngo_recordings.scan_stream import WheelPose
+from training.baselines import lidar_peers, mrpt_slam
+from training.baselines.lidar_peers import GraphPeerConfig, KissConfig
+from training.data.lidar_drives import LidarDrive
+
+_MOST_WALL_POINTS = 60_000  # of a picture
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where a row says that the robot was.
+
+    ``poses`` ``(n, 3)`` at ``stamps_ns`` ``(n,)`` with all the row knows at the end. Where the row has them: ``online``
+    ``(n, 3)`` as published at each stamp with ``covariances`` ``(n, 3, 3)``, ``odometry`` ``(n, 3)`` that was given to
+    the correction, and ``walls`` ``(m, 2)`` at the corrected poses. ``scans_per_s`` by computing time of one thread;
+    ``facts`` are numbers about the run.
+    """
+
+    stamps_ns: np.ndarray
+    poses: np.ndarray
+    scans_per_s: float | None = None
+    online: np.ndarray | None = None
+    covariances: np.ndarray | None = None
+    odometry: np.ndarray | None = None
+    walls: np.ndarray | None = None
+    facts: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Our estimators with the shipped settings, and what a row changes of them.
+
+    ``wheels`` are listened to where the robot has any.
+    ``odometry`` and ``graph`` are changes of the front end and of the back end, by the setting's name with dots:
+    ``{"loops.least_agreeing": 0}``.
+    """
+
+    wheels: bool = True
+    odometry: Mapping[str, Any] = field(default_factory=dict)
+    graph: Mapping[str, Any] = field(default_factory=dict)
+
+
+Config = TypeVar("Config")
+
+
+def changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """A dataclass with other values; raises ``TypeError`` for a name that it does not have."""
+    for name, value in changes.items():
+        first, _, rest = name.partition(".")
+        inner = changed(getattr(config, first), {rest: value}) if rest else value
+        config = dataclasses.replace(config, **{first: inner})  # type: ignore[type-var]
+    return config
+
+
+@dataclass(frozen=True, eq=False)
+class _Front:
+    steps: list[LidarStep]
+    lag_s: float
+    unsure: int
+    took_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    online: ScanTrajectory
+    trajectory: Trajectory
+    covariances: np.ndarray
+    front: _Front
+    back_s: float
+
+
+class DriveRuns:
+    """Our estimators over one drive: rows that share a front end, or all of it, share its run."""
+
+    def __init__(self, drive: LidarDrive, weights: Path) -> None:
+        self.drive = drive
+        self._weights = weights
+        self._fronts: dict[str, _Front] = {}
+        self._runs: dict[str, _Run] = {}
+
+    def run(self, pipeline: Pipeline) -> _Run:
+        """Both estimators over the drive; raises ``ValueError`` where it gives no trajectory."""
+        pipeline = dataclasses.replace(pipeline, wheels=pipeline.wheels and bool(self.drive.wheels))
+        key = identity_of(pipeline)
+        if key not in self._runs:
+            self._runs[key] = self._optimized(self._front(pipeline), pipeline.graph)
+        return self._runs[key]
+
+    def _front(self, pipeline: Pipeline) -> _Front:
+        key = identity_of(dataclasses.replace(pipeline, graph={}))
+        if key not in self._fronts:
+            settings = read_lidar_file(self._weights, "odometry", LidarOdometryConfig)
+            odometry = LidarOdometry(changed(settings, pipeline.odometry), self.drive.mounting)
+            steps: list[LidarStep] = []
+            began = time.process_time()
+            for record in self.drive.records(pipeline.wheels):
+                if isinstance(record, WheelPose):
+                    odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+                else:
+                    with contextlib.suppress(ValueError):  # a scan that is of no use is left out, as by the node
+                        odometry.add_scan(record)
+                _take(odometry, steps, at_end=False)
+            _take(odometry, steps, at_end=True)
+            took_s = time.process_time() - began
+            self._fronts[key] = _Front(steps, odometry.lag_s, sum(step.unsure for step in steps), took_s)
+        return self._fronts[key]
+
+    def _optimized(self, front: _Front, changes: Mapping[str, Any]) -> _Run:
+        settings = changed(read_lidar_file(self._weights, "graph", ScanGraphConfig), changes)
+        online = ScanTrajectory(settings)
+        covariances = [np.zeros((3, 3))]
+        began = time.process_time()
+        for step in front.steps:
+            covariances.append(online.update(step).covariance)
+        online.finish()
+        back_s = time.process_time() - began
+        trajectory = online.trajectory()
+        if trajectory is None or len(trajectory.stamps_ns) != len(covariances):
+            raise ValueError(f"{self.drive.name}: {len(front.steps)} steps give no trajectory; expected a single one")
+        return _Run(online, trajectory, np.stack(covariances), front, back_s)
+
+
+def _take(odometry: LidarOdometry, steps: list[LidarStep], at_end: bool) -> None:
+    while True:
+        try:
+            steps.extend(odometry.ready(at_end))
+            return
+        except ValueError:
+            continue
+
+
+def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
+    """The whole pipeline."""
+    run = runs.run(pipeline)
+    trajectory, seconds = run.trajectory, run.front.took_s + run.back_s
+    return Estimate(
+        trajectory.stamps_ns,
+        trajectory.poses_xyyaw,
+        len(trajectory.stamps_ns) / seconds,
+        trajectory.online_xyyaw,
+        run.covariances,
+        trajectory.odometry_xyyaw,
+        run.online.walls(_MOST_WALL_POINTS),
+        {
+            "keys": run.online.graph.keys,
+            "loops": len(run.online.graph.loop_weights),
+            "lag_s": run.front.lag_s,
+            "unsure": run.front.unsure,
+        },
+    )
+
+
+Solver = Callable[[RelativePoses, RelativePoses, np.ndarray, GraphPeerConfig], np.ndarray]
+
+
+def graph_peer(runs: DriveRuns, solve: Solver, config: GraphPeerConfig) -> Estimate:
+    """Another solver on the steps and the loops of our own run, from its odometry."""
+    run = runs.run(Pipeline())
+    graph = run.online.graph
+    steps, loops = graph.measurements()
+    began = time.process_time()
+    nodes = solve(steps, loops, _chained(steps.relative), config)
+    seconds = time.process_time() - began
+    poses = graph.frame_poses(nodes=nodes)
+    facts = {"solver_s": seconds, "loops": len(loops.nodes)}
+    return Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw, facts=facts)
+
+
+def _chained(relative: np.ndarray) -> np.ndarray:
+    """Poses ``(n + 1, 3)`` along relative ones ``(n, 3)``, from the origin."""
+    yaw = np.concatenate(([0.0], np.cumsum(relative[:, 2])))
+    cosine, sine = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    x = cosine * relative[:, 0] - sine * relative[:, 1]
+    y = sine * relative[:, 0] + cosine * relative[:, 1]
+    return np.stack((*(np.concatenate(([0.0], np.cumsum(part))) for part in (x, y)), yaw), axis=-1)
+
+
+def wheels_alone(runs: DriveRuns) -> Estimate:
+    """The wheel odometry as it was published."""
+    wheels = runs.drive.wheels
+    stamps_ns = np.array([pose.stamp_ns for pose in wheels], dtype=np.int64)
+    kept = np.concatenate(([True], np.diff(np.maximum.accumulate(stamps_ns)) > 0))
+    return Estimate(stamps_ns[kept], np.stack([pose.pose_xyyaw for pose in wheels])[kept])
+
+
+def kiss(runs: DriveRuns, config: KissConfig) -> Estimate:
+    """KISS-ICP."""
+    drive = runs.drive
+    began = time.process_time()
+    poses = lidar_peers.kiss_icp(drive.scans, drive.mounting, config)
+    return Estimate(drive.scan_stamps_ns, poses, len(poses) / (time.process_time() - began), online=poses)
+
+
+def mrpt(runs: DriveRuns, program: mrpt_slam.Program) -> Estimate:
+    """A program of MRPT."""
+    drive = runs.drive
+    found = mrpt_slam.run(program, drive, mrpt_slam.MrptConfig())
+    return Estimate(found.stamps_ns, found.poses_xyyaw, len(drive.scans) / found.took_s)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row: how it estimates, by which settings, and what it needs.
+
+    ``code`` are the packages that its numbers follow from. ``missing`` says in a few words what it lacks on this
+    machine, or nothing.
+    """
+
+    estimate: Callable[[DriveRuns], Estimate]
+    settings: Any
+    needs_wheels: bool = False
+    code: tuple[ModuleType, ...] = (ngo_estimator,)
+    missing: Callable[[], str] = lambda: ""
+
+
+def _ours(**changes: Any) -> Row:
+    pipeline = Pipeline(**changes)
+    return Row(partial(ours, pipeline=pipeline), pipeline)
+
+
+def _gtsam(solve: Solver) -> Row:
+    config = GraphPeerConfig()
+    return Row(partial(graph_peer, solve=solve, config=config), config, code=(ngo_estimator, lidar_peers))
+
+
+def _mrpt(program: mrpt_slam.Program) -> Row:
+    config = mrpt_slam.MrptConfig()
+    return Row(
+        partial(mrpt, program=program), config, True, (mrpt_slam,), partial(mrpt_slam.missing, program)
+    )  # fmt: skip
+
+
+def _kiss_missing() -> str:
+    return "" if find_spec("kiss_icp") else "KISS-ICP is not installed (requirements/test.txt)"
+
+
+ROWS: dict[str, Row] = {
+    "wheels": Row(wheels_alone, None, needs_wheels=True, code=()),
+    "ours": _ours(),
+    "ours_without_wheels": _ours(wheels=False),
+    "gtsam_lm": _gtsam(lidar_peers.solve_lm),
+    "gtsam_gnc": _gtsam(lidar_peers.solve_gnc),
+    "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
+    "icp_slam": _mrpt("icp-slam"),
+    "rbpf_slam": _mrpt("rbpf-slam"),
+    # The ablation.
+    "without_agreement": _ours(graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
+    "without_kernel": _ours(graph={"kernel": 1e6}),
+}
+
+
+def identity_of(settings: Any) -> str:
+    """Settings in words; two of one identity are the same."""
+    values = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else settings  # type: ignore[arg-type]
+    return json.dumps(values, sort_keys=True)

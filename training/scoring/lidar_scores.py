@@ -1,0 +1,151 @@
+"""The errors of a lidar's rows on drives, kept on disk so that nothing is computed twice."""
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from training.baselines.mrpt_slam import MrptError
+from training.data import lidar_drives
+from training.data.lidar_drives import LidarDrive, TruePoses
+from training.scoring import lidar_errors as errors_module
+from training.scoring import metrics, relations
+from training.scoring.lidar_errors import Errors, lidar_errors, within_deviations
+from training.scoring.lidar_rows import DriveRuns, Estimate, Row, identity_of
+
+_ALWAYS = (lidar_drives, errors_module, metrics, relations)
+_MOST_DRAWN = 4000  # poses of a path in a picture
+
+
+@dataclass(frozen=True)
+class DriveSource:
+    """A drive that is made when it is needed.
+
+    ``identity`` says in words all that it follows from beside ``code``, the modules and packages that make it.
+    """
+
+    name: str
+    identity: str
+    make: Callable[[], LidarDrive]
+    code: tuple[ModuleType, ...]
+    has_wheels: bool = True
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What a row makes of a drive.
+
+    ``errors`` by the metric's key, each ``(samples,)``: of the whole trajectory, with ``online_`` as published at each
+    scan, with ``odometry_`` of what the correction was given. ``path`` ``(n, 3)`` and ``walls`` ``(m, 2)`` are thinned
+    for pictures, ``truth`` ``(k, 3)`` is empty where it is unknown. ``failed`` says why there is nothing.
+    """
+
+    errors: Errors = field(default_factory=dict)
+    path: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    walls: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    truth: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    failed: str = ""
+
+
+def score_drive(source: DriveSource, rows: dict[str, Row], weights: Path, cache: Path) -> Iterator[tuple[str, Scored]]:
+    """What each row makes of a drive, from ``cache/DRIVE.ROW.npz`` where settings, drive and code are those of today.
+
+    A row that the drive has no wheels for is left out; the drive is made only if a row is not known yet.
+    """
+    runs: DriveRuns | None = None
+    for name, row in rows.items():
+        if row.needs_wheels and not source.has_wheels:
+            continue
+        path = cache / f"{source.name}.{name}.npz"
+        code = _code((*_ALWAYS, *source.code, *row.code))
+        identity = json.dumps([name, identity_of(row.settings), source.identity, code, _weights(row, weights)])
+        known = _read(path, identity)
+        if known is None:
+            runs = runs or DriveRuns(source.make(), weights)
+            known = _scored(runs, row)
+            _write(path, identity, known)
+        yield name, known
+
+
+def _scored(runs: DriveRuns, row: Row) -> Scored:
+    drive = runs.drive
+    if row.needs_wheels and not drive.wheels:
+        return Scored(failed=f"{drive.name} has no wheel odometry")
+    try:
+        estimate = row.estimate(runs)
+        errors = _errors(drive, estimate)
+    except (ValueError, MrptError) as error:
+        return Scored(failed=str(error))
+    truth = drive.reference.poses_xyyaw if isinstance(drive.reference, TruePoses) else np.zeros((0, 3))
+    walls = np.zeros((0, 2)) if estimate.walls is None else estimate.walls
+    return Scored(errors, _thinned(estimate.poses), walls, _thinned(truth))
+
+
+def _errors(drive: LidarDrive, estimate: Estimate) -> Errors:
+    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses)
+    for name, poses in (("online", estimate.online), ("odometry", estimate.odometry)):
+        if poses is not None:
+            found = lidar_errors(drive.reference, estimate.stamps_ns, poses)
+            errors.update({f"{name}_{key}": values for key, values in found.items()})
+    if isinstance(drive.reference, TruePoses) and estimate.online is not None and estimate.covariances is not None:
+        share = within_deviations(drive.reference, estimate.stamps_ns, estimate.online, estimate.covariances)
+        errors["within_three_deviations"] = np.array([share])
+    if estimate.scans_per_s is not None:
+        errors["scans_per_s"] = np.array([estimate.scans_per_s])
+    errors.update({name: np.array([float(value)]) for name, value in estimate.facts.items()})
+    return errors
+
+
+def _thinned(poses: np.ndarray) -> np.ndarray:
+    return poses[:: max(1, -(-len(poses) // _MOST_DRAWN))]
+
+
+def _weights(row: Row, weights: Path) -> str:
+    """A hash of the shipped settings, for a row of our own estimators."""
+    ours = [module.__name__ for module in row.code if module.__name__ == "ngo_estimator"]
+    return _digest(sorted(weights.iterdir())) if ours else ""
+
+
+def _code(modules: Sequence[ModuleType]) -> str:
+    """A hash of the files of modules and of whole packages that numbers follow from."""
+    files: list[Path] = []
+    for module in modules:
+        folders = list(getattr(module, "__path__", ()))
+        if folders:
+            files += [path for folder in folders for path in sorted(Path(folder).rglob("*.py"))]
+        else:
+            files.append(Path(str(module.__file__)))
+    return _digest(files)
+
+
+def _digest(files: Sequence[Path]) -> str:
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files if path.is_file())).hexdigest()
+
+
+def _read(cache: Path, identity: str) -> Scored | None:
+    if not cache.exists():
+        return None
+    with np.load(cache) as stored:
+        if str(stored["identity"]) != identity:
+            return None
+        errors = {name[6:]: stored[name] for name in stored.files if name.startswith("error:")}
+        return Scored(errors, stored["path"], stored["walls"], stored["truth"], str(stored["failed"]))
+
+
+def _write(cache: Path, identity: str, scored: Scored) -> None:
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
+    errors = {f"error:{name}": values for name, values in scored.errors.items()}
+    drawn = {name: getattr(scored, name).astype(np.float32) for name in ("path", "walls", "truth")}
+    try:
+        np.savez(partial, identity=np.array(identity), failed=np.array(scored.failed), **drawn, **errors)  # type: ignore[arg-type]
+        os.replace(partial, cache)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            partial.unlink()
