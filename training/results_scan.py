@@ -152,7 +152,7 @@ def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSo
         ]
         for table, chosen in seeds.items()
     }
-    mazes = list(WORLDS["scan"].table_seeds("unseen", "validation")[: arguments.mazes])
+    mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
     sources["maze2d"] = [
         DriveSource(
             f"maze2d_{seed}",
@@ -184,7 +184,7 @@ def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
             _SIMULATED,
             has_wheels=False,
         )
-        for seed in WORLDS["scan"].table_seeds("unseen", "validation")[: arguments.mazes]
+        for seed in WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes]
     ]
 
 

@@ -6,6 +6,7 @@
 
 import functools
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,8 @@ def test_shipped_settings_correct_a_stored_drive_as_before() -> None:
 def test_a_stored_drive_tells_other_settings(changes: dict[str, Any], tmp_path: Path) -> None:
     """Settings that are a tenth larger or smaller than the shipped ones."""
     shipped = json.loads((SHIPPED / LIDAR_FILE).read_text())
-    (tmp_path / LIDAR_FILE).write_text(json.dumps({**shipped, **changes}))
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    (tmp_path / LIDAR_FILE).write_text(json.dumps({**shipped, **{k: {**shipped[k], **v} for k, v in changes.items()}}))
     trajectory, _ = corrected_scans(golden(), tmp_path)
     distance_m, angle_rad = largest_difference(trajectory.poses_xyyaw, golden().poses)
     assert distance_m > 2.0 * TOLERANCE_M or angle_rad > 2.0 * TOLERANCE_RAD

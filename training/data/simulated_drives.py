@@ -15,7 +15,7 @@ from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.maze2d import Maze2DConfig
 from training.data.lidar_drives import LidarDrive, TruePoses
-from training.data.scans import ScannedMaze
+from training.data.scans import ROWS, SCAN_IMAGE, ScannedMaze
 from training.data.worlds import WORLDS
 
 BUILDING_TEST_SEEDS = range(20_000, 30_000)
@@ -75,12 +75,11 @@ def maze_drive(seed: int, frames: int, size_seed: int | None = None) -> LidarDri
 
 def scanned_maze_drive(seed: int, frames: int, changes: Mapping[str, Any]) -> LidarDrive:
     """A drive through a maze of drawn width, seen by a drawn scanner with ``changes`` to its properties; no wheels."""
-    world = WORLDS["scan"]
     rng = np.random.default_rng(seed)
-    rows = int(rng.integers(world.rows[0], world.rows[1] + 1))
+    rows = int(rng.integers(ROWS[0], ROWS[1] + 1))
     size = {"rows": rows, "cols": rows, "extra_openings": int(rng.integers(0, 9))}
-    maze = _RawScans(world.image, size, changes)
-    episode = record_episode(maze, world.driver, frames, seed)
+    maze = _RawScans(SCAN_IMAGE, size, changes)
+    episode = record_episode(maze, WORLDS["maze2d"].driver, frames, seed)
     named = ", ".join(f"{name} {value:g}" for name, value in changes.items()) or "as drawn"
     return _of_maze(
         f"scanned_maze_{seed}",

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import ngo_estimator
+from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
 from ngo_estimator.online.corrected_trajectory import Trajectory
@@ -112,8 +113,9 @@ class DriveRuns:
     def _front(self, pipeline: Pipeline) -> _Front:
         key = identity_of(dataclasses.replace(pipeline, graph={}))
         if key not in self._fronts:
-            settings = read_lidar_file(self._weights, "odometry", LidarOdometryConfig)
-            odometry = LidarOdometry(changed(settings, pipeline.odometry), self.drive.mounting)
+            settings = changed(read_lidar_file(self._weights, "odometry", LidarOdometryConfig), pipeline.odometry)
+            deviation = load_step_deviation(self._weights) if settings.learned_deviation else None
+            odometry = LidarOdometry(settings, self.drive.mounting, deviation)
             steps: list[LidarStep] = []
             began = time.process_time()
             for record in self.drive.records(pipeline.wheels):
@@ -269,6 +271,7 @@ ROWS: dict[str, Row] = {
     # The ablation.
     "without_agreement": _ours(graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
     "without_kernel": _ours(graph={"kernel": 1e6}),
+    "constant_deviations": _ours(odometry={"learned_deviation": False}),
 }
 
 

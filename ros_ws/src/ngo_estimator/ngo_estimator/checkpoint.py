@@ -35,7 +35,6 @@ WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
 }
-ACTION_WORLDS = ("maze2d", "maze3d")
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -206,7 +205,7 @@ def write_untrained(weights: Path, world: str, image: ImageFormat | None = None)
         LocalPoseConfig(
             image=image,
             width=0.125,
-            actions=3 if world in ACTION_WORLDS else 0,
+            actions=3 if world in WORLD_IMAGES else 0,
             period_s=2 / 35 if world == "maze3d" else 0.1,
             relative_std=std,
         )

@@ -3,7 +3,7 @@ import numpy as np
 from ngo_estimator.data.images import scan_image
 from ngo_sim.episodes import record_episode
 from training.data.lidar_drives import TruePoses
-from training.data.scans import ScannedMaze
+from training.data.scans import ROWS, SCAN_IMAGE, ScannedMaze
 from training.data.simulated_drives import building_drive, maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
 
@@ -20,14 +20,14 @@ def test_a_building_is_the_same_each_time_and_another_where_rooms_repeat() -> No
 
 
 def test_a_scanned_maze_has_the_scans_that_the_networks_saw() -> None:
-    world, frames = WORLDS["scan"], 5
+    frames = 5
     drive = scanned_maze_drive(1_500, frames, {})
     rng = np.random.default_rng(1_500)
-    rows = int(rng.integers(world.rows[0], world.rows[1] + 1))
+    rows = int(rng.integers(ROWS[0], ROWS[1] + 1))
     size = {"rows": rows, "cols": rows, "extra_openings": int(rng.integers(0, 9))}
-    episode = record_episode(ScannedMaze(world.image, size, {}), world.driver, frames, 1_500)
+    episode = record_episode(ScannedMaze(SCAN_IMAGE, size, {}), WORLDS["maze2d"].driver, frames, 1_500)
     images = [
-        scan_image(world.image, scan.ranges, scan.angle_min, scan.angle_increment, 0.0, np.inf).reshape(-1)
+        scan_image(SCAN_IMAGE, scan.ranges, scan.angle_min, scan.angle_increment, 0.0, np.inf).reshape(-1)
         for scan in drive.scans
     ]
     np.testing.assert_allclose(images, episode.observations, atol=1e-6)
