@@ -85,4 +85,4 @@ def test_it_publishes_what_the_core_gives(probe: Probe) -> None:
 def test_a_bad_parameter_is_one_line_and_exit_code_2() -> None:
     with NodeProcess("ngo_sim", "building2d", {"layout": "square"}) as node:
         assert node.wait() == 2
-        assert [line for line in node.lines if "layout is 'square'" in line]
+        assert [line for line in node.lines if "parameter 'layout' is 'square'; allowed: one of any, ring" in line]
