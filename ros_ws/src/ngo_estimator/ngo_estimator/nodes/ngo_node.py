@@ -117,6 +117,7 @@ class NgoNode(LifecycleNode):
     def _configure(self) -> None:
         settings, built = self._settings, self._built
         # Imported here because torch takes seconds: a bad parameter is said at once.
+        from ngo_estimator.offline.warm_up import warm_up
         from ngo_estimator.online.map_origin import MapOrigin
         from ngo_estimator.online.online_trajectory import OnlineTrajectory
         from ngo_estimator.online.scan_trajectory import ScanTrajectory
@@ -124,6 +125,7 @@ class NgoNode(LifecycleNode):
 
         def load(folder: Path, world: str) -> OnlineTrajectory | ScanTrajectory:
             if is_lidar(folder):
+                warm_up()
                 return ScanTrajectory.load(folder, world, settings.iterations_per_step)
             return OnlineTrajectory.load(
                 folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
