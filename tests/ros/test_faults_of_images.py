@@ -23,6 +23,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.nodes.image_input import ImageInput
 from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
 
@@ -213,14 +214,16 @@ def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
     rclpy.init(args=["--ros-args", "-r", "__ns:=/broken", *given, *reliable])
     node, executor = LocalNode(), SingleThreadedExecutor()
     executor.add_node(node)
-    update, broken_ns = node._core.update, RUN_NS + 2 * STEP_NS
+    assert isinstance(node._input, ImageInput)
+    core = node._input._core
+    update, broken_ns = core.update, RUN_NS + 2 * STEP_NS
 
     def update_or_fail(stamp_ns: int, *inputs: Any) -> Any:
         if stamp_ns == broken_ns:
             raise RuntimeError("of two\nlines")
         return update(stamp_ns, *inputs)
 
-    monkeypatch.setattr(node._core, "update", update_or_fail)
+    monkeypatch.setattr(core, "update", update_or_fail)
     try:
         with Probe("broken") as probe:
             images = probe.node.create_publisher(Image, "/broken/image", 100)

@@ -38,7 +38,7 @@ class Listening:
             except Exception as error:
                 # A fault of ours, not of the message: a robot is better off with a gap than without the node.
                 reason = f"internal error, {type(error).__name__}: {' '.join(str(error).split())}"
-                self._status.dropped(f"message on {topic}", reason)
+                self._status.dropped(f"message on '{topic}'", reason)
                 self._node.get_logger().debug(traceback.format_exc())
 
         return take

@@ -183,8 +183,9 @@ class CorrectedTrajectory(ABC):
         """
         step = self._checked(step)
         taken = self._log.take(step)
-        if taken.begins:
+        if taken.restarted:
             self._begin()
+        if taken.begins:
             self._begin_at(step)
             self._online.append(np.zeros(3))
         due = self._append(step, taken)
