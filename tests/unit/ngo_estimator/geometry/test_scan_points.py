@@ -31,7 +31,8 @@ def test_points_lie_on_walls_and_normals_are_theirs(rays: int, mounting: Mountin
     points = transformed(BASE, scan.points)
     assert 40 <= len(points) <= 400
     # Means of rays on both sides of a corner are a little off it.
-    assert np.quantile(off_walls(points), 0.95) < 1e-9 and off_walls(points).max() < 0.03
+    # Key scans hold what messages carry, float32.
+    assert np.quantile(off_walls(points), 0.95) < 1e-6 and off_walls(points).max() < 0.03
     known = np.abs(scan.normals).sum(axis=1) > 0.0
     assert known.mean() > 0.8
     normals = transformed(np.array((0.0, 0.0, BASE[2])), scan.normals[known])

@@ -53,8 +53,7 @@ def test_a_loop_shares_its_error_by_the_variances() -> None:
     np.testing.assert_allclose(graph.poses[:, 0], [0.0, 0.9, 1.8, 2.7, 3.6], atol=1e-6)
     np.testing.assert_allclose(graph.poses[:, 1:], 0.0, atol=1e-9)
     # Two ways to the last node, of variances 4 v and v.
-    assert graph.equations is not None
-    assert graph.equations.covariance([4])[0, 0] == pytest.approx(0.01 * 4.0 / 5.0, rel=1e-6)
+    assert graph.covariance(steps_of(steps), 4)[0, 0] == pytest.approx(0.01 * 4.0 / 5.0, rel=1e-6)
 
 
 def test_a_fix_across_a_corridor_moves_nothing_along_it() -> None:
@@ -64,10 +63,10 @@ def test_a_fix_across_a_corridor_moves_nothing_along_it() -> None:
     # Seen from node 1, ahead is the map's y. It is 0.3 m to the left of where the chain has it, and 2 m short.
     along, across = 1e3, 1e-3
     loop = measured([(1, 4)], [(1.0, 0.3, 0.0)], (along, across, 1e3))
-    graph = solved(ScanPoseGraph(steps_of(steps, (0.1, 0.1, 1e-4)), loop, np.ones(1), poses, WIDE))
+    between = steps_of(steps, (0.1, 0.1, 1e-4))
+    graph = solved(ScanPoseGraph(between, loop, np.ones(1), poses, WIDE))
     np.testing.assert_allclose(graph.poses[4], [-0.3, 3.0, math.pi / 2.0], atol=2e-3)
-    assert graph.equations is not None
-    covariance = graph.equations.covariance([4])
+    covariance = graph.covariance(between, 4)
     assert covariance[1, 1] > 0.02 and covariance[0, 0] < 2e-2  # the map's y is the corridor's length
 
 
