@@ -49,7 +49,7 @@ class Arguments:
     """The recordings, the weights, and the folder of the results."""
 
     recordings: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """.mcap files or rosbag2 folders, several as one recording in order of time."""
+    """.mcap files, rosbag2 folders, ROS 1 bags or CARMEN logs, several as one recording in order of time."""
     out: Path
     """Folder for the results, new or empty."""
     world: str | None = None
