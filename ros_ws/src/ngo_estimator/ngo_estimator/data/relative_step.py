@@ -54,8 +54,8 @@ class RelativeStep:
     ``relative_xyyaw`` (3,) is the newer frame in the older one, ``covariance`` (3, 3) its covariance (x, y, yaw),
     ``odom_xyyaw`` (3,) the newer frame in ``odom``, whose origin is the frame at ``origin_stamp_ns`` (m, rad).
     ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
-    older one, which only the first step after a start has: of all others it came already. ``key`` is there where the
-    step ends at a key scan of a lidar, ``origin_scan``, the lidar's first scan, in the first step after a start.
+    older one. Only the first step after a start has it: later ones would repeat it. ``key`` is there if the step ends
+    at a key scan of a lidar. ``origin_scan``, the lidar's first scan, is in the first step after a start.
     ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one.
     """
 
@@ -82,7 +82,7 @@ def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | 
     """Raise ``RejectedStep`` if a step cannot be used, whatever came before it.
 
     Args:
-        motion_feature_size, code_length: lengths that are expected; None for place codes that are of no account.
+        motion_feature_size, code_length: lengths that are expected; None if place codes are not used.
     """
     vectors = {
         "relative_xyyaw": (step.relative_xyyaw, (3,)),

@@ -90,7 +90,7 @@ class LocalOdometry:
         Args:
             stamp_ns: time of the frame.
             image: ``image_shape`` of ``image_dtype``.
-            action: the action between the last frame and this one; of no account for the first frame.
+            action: the action between the last frame and this one; ignored for the first frame.
             twist: ``(3,)`` mean velocity (m/s, m/s, rad/s) between the two, where the networks take it; likewise.
 
         Returns:
