@@ -126,8 +126,11 @@ class ScanGraph:
         self._since = propagate(self._since, since, relative, covariance)
         if key is None:
             return False
-        if self._running is not None:
-            self.advance(self._left)  # what comes now adds a node to those that it is about
+        if self._running is not None:  # what comes now adds a node to those that it is about
+            try:
+                self.advance(self._left)
+            except Exception as error:  # it may cost an optimisation, and nothing else
+                self.fail(error)
         known = key.from_key_stamp_ns == self._key_stamp_ns
         # Registration in the same key scans: errors of the steps between do not add up.
         if known:
@@ -199,13 +202,7 @@ class ScanGraph:
         return self._chain(self._step_covariance.values), measured
 
     def begin(self) -> None:
-        """Begin to optimise all nodes; where that fails, ``fault`` says so."""
-        try:
-            self._begin()
-        except Exception as error:  # see append
-            self.fail(error)
-
-    def _begin(self) -> None:
+        """Begin to optimise all nodes."""
         began = time.perf_counter()
         self._rows = np.flatnonzero(self._finder.loops.accepted)
         steps, measured = self.measurements()
@@ -223,17 +220,11 @@ class ScanGraph:
     def advance(self, iterations: int) -> bool:
         """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
 
-        Where it fails, it is over, every node is where it was, and ``fault`` says so.
+        An error leaves every node where it was.
         """
-        if self._running is None:
+        running = self._running
+        if running is None:
             raise RuntimeError("no optimisation has begun")
-        try:
-            return self._advance(self._running, iterations)
-        except Exception as error:  # see append
-            self.fail(error)
-            return False
-
-    def _advance(self, running: ScanPoseGraph, iterations: int) -> bool:
         began = time.perf_counter()
         for _ in range(min(iterations, self._left)):
             running.iterate()
