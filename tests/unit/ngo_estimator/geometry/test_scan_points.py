@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry.planar_motion import Array, between, compose, transformed
-from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan
+from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan, range_noise
 from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan, scan_at
 
 AHEAD = Mounting(np.zeros(3))
@@ -71,6 +71,29 @@ def test_points_of_a_surface_are_spaced() -> None:
     scan = scan_at(ROOM, BASE, angles=fan(3000, 180.0))
     gaps = np.hypot(*np.diff(scan.points, axis=0).T)
     assert np.quantile(gaps, 0.05) > 0.03
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.03, 0.05])
+@pytest.mark.parametrize("rays", [181, 720])
+def test_noise_is_estimated_and_does_not_cost_the_normals(rays: int, noise_m: float) -> None:
+    """Objects in front of a third of the walls do not count as noise."""
+    rng, angles = np.random.default_rng(0), fan(rays, 240.0)
+    estimates, errors_deg, shares = [], [], []
+    for _ in range(20):
+        ranges = cast(ROOM, BASE, angles) + rng.normal(0.0, noise_m, rays)
+        scan = key_scan(0, angles, ranges, LIMITS, AHEAD)
+        known = np.abs(scan.normals).sum(axis=1) > 0.0
+        shares.append(known.mean())
+        turned = np.degrees(np.arctan2(scan.normals[known, 1], scan.normals[known, 0]) + BASE[2])
+        errors_deg.append(np.abs((turned + 45.0) % 90.0 - 45.0).mean())  # the room has right angles
+        estimates.append(range_noise(angles, np.where(np.arange(rays) % 30 < 10, 0.7 * ranges, ranges)))
+    assert np.mean(estimates) == pytest.approx(noise_m, rel=0.35, abs=1e-3)
+    assert np.mean(shares) > 0.85 and np.mean(errors_deg) < 15.0
+
+
+def test_noise_of_scans_that_do_not_tell_it() -> None:
+    assert range_noise(fan(15, 90.0), np.ones(15)) == 0.0
+    assert range_noise(np.linspace(-3.0, 3.0, 40), np.ones(40)) == 0.0  # neighbours see different walls
 
 
 def test_no_line_joins_two_surfaces() -> None:

@@ -9,6 +9,18 @@ from numba import njit
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, transformed
 
+_LEAST_TRIPLES = 20
+"""Triples of neighbouring rays without which a scan's noise is not estimated."""
+
+_WIDEST_TRIPLE_RAD = 0.2
+"""Between the outer rays of such a triple."""
+
+_QUARTER = 0.3186
+"""Deviations within which a quarter of a normal distribution lies."""
+
+_LARGEST_NOISE_M = 0.06
+"""Larger estimates come from clutter."""
+
 
 @dataclass(frozen=True)
 class ScanPointsConfig:
@@ -17,7 +29,9 @@ class ScanPointsConfig:
     ``spacing_m`` is the least length of surface that gets a point of its own; rays closer together are averaged.
     ``most_points`` widens the spacing of scans that would have more points. ``neighbours`` points to each side make a
     normal. ``thickness_m`` is the largest deviation of these points from their line, beside ``thickness_share`` of the
-    range. A line that passes the sensor closer than ``edge_on`` times its range joins two surfaces, and is none.
+    range. Noisy scans get a spacing of at least ``spacing_noise`` and a thickness of at least ``thickness_noise``
+    standard deviations of a range. A line that passes the sensor closer than ``edge_on`` times its range joins two
+    surfaces, and is none.
     """
 
     spacing_m: float = 0.04
@@ -25,6 +39,8 @@ class ScanPointsConfig:
     neighbours: int = 4
     thickness_m: float = 0.03
     thickness_share: float = 0.002
+    spacing_noise: float = 2.0
+    thickness_noise: float = 1.0
     edge_on: float = 0.08
 
     def __post_init__(self) -> None:
@@ -32,6 +48,11 @@ class ScanPointsConfig:
             raise ValueError(
                 f"spacing_m, most_points, neighbours are {self.spacing_m}, {self.most_points}, {self.neighbours}; "
                 "expected a positive length, at least 10 and at least 1"
+            )
+        if not all(0.0 <= noise < math.inf for noise in (self.spacing_noise, self.thickness_noise)):
+            raise ValueError(
+                f"spacing_noise, thickness_noise are {self.spacing_noise}, {self.thickness_noise}; expected numbers of "
+                "at least 0"
             )
         if not (0.0 < self.thickness_m < math.inf and 0.0 <= self.thickness_share < 1.0 and 0.0 <= self.edge_on < 1.0):
             raise ValueError(
@@ -101,13 +122,38 @@ def key_scan(
     seen = np.isfinite(ranges)
     polar, distance = angles[seen], ranges[seen]
     ends = np.stack((distance * np.cos(polar), distance * np.sin(polar)), axis=-1)
-    thin = _thinned(ends, config.spacing_m, config.most_points)
-    normals = _normals(thin, config.neighbours, config.thickness_m, config.thickness_share, config.edge_on)
+    noise_m = range_noise(polar, distance)
+    thin = _thinned(ends, max(config.spacing_m, config.spacing_noise * noise_m), config.most_points)
+    thickness_m = max(config.thickness_m, config.thickness_noise * noise_m)
+    normals = _normals(thin, config.neighbours, thickness_m, config.thickness_share, config.edge_on)
     turn = np.array((0.0, 0.0, mounting.sensor_xyyaw[2]))
     parts = transformed(mounting.sensor_xyyaw, thin), transformed(turn, normals), angles, ranges
     # What messages carry: a live node sees the same as a run over a recording.
     points, normals, angles, ranges = (part.astype(np.float32).astype(np.float64) for part in parts)
     return KeyScan(stamp_ns, points, normals, mounting.sensor_xyyaw, angles, ranges, float(np.float32(largest)))
+
+
+def range_noise(angles: Array, ranges: Array) -> float:
+    """Standard deviation of a range (m), from rays at rising ``angles`` ``(m,)`` (rad) with finite ``ranges`` ``(m,)``.
+
+    Three neighbouring rays on a straight wall determine the middle one: 1 / range is a sinusoid of the angle. The
+    smallest quarter of the differences counts, since clutter adds to the others. Scans of few rays give 0.
+    """
+    if len(ranges) < _LEAST_TRIPLES + 2:
+        return 0.0
+    left, right = angles[1:-1] - angles[:-2], angles[2:] - angles[1:-1]
+    near = (left > 0.0) & (right > 0.0) & (left + right < _WIDEST_TRIPLE_RAD)
+    if np.count_nonzero(near) < _LEAST_TRIPLES:
+        return 0.0
+    left, right = left[near], right[near]
+    before, middle, after = ranges[:-2][near], ranges[1:-1][near], ranges[2:][near]
+    both = np.sin(left + right)
+    share_before, share_after = np.sin(right) / both, np.sin(left) / both
+    expected = 1.0 / (share_before / before + share_after / after)
+    # Sensitivities of the expected range to both neighbours.
+    of_before, of_after = share_before * (expected / before) ** 2, share_after * (expected / after) ** 2
+    off = np.abs(middle - expected) / np.sqrt(1.0 + of_before**2 + of_after**2)
+    return min(float(np.quantile(off, 0.25)) / _QUARTER, _LARGEST_NOISE_M)
 
 
 def _checked(angles: Array, ranges: Array, range_limits: tuple[float, float]) -> tuple[Array, Array]:

@@ -30,6 +30,9 @@ _SWEEP_STEPS = 2
 Of one step alone the error comes back with the other sign, and swings.
 """
 
+_LONGEST_SWEEP_S = 1.0
+"""A scan that claims to have taken longer is wrong about it."""
+
 _LEAST_POINTS = 3
 """Points without which a scan says nothing."""
 
@@ -195,7 +198,7 @@ class LidarOdometry:
     def _has_wheels(self, stamp_ns: int) -> bool:
         if self._wheels is None or self._newest_wheels_ns is None:
             return True
-        until = stamp_ns - int(self.lag_s * 1e9)
+        until = stamp_ns + int((_duration_s(self._waiting[0]) - self.lag_s) * 1e9)
         newest_scan_ns = self._waiting[-1].stamp_ns
         return (
             self._newest_wheels_ns >= until
@@ -272,14 +275,20 @@ class LidarOdometry:
         """How the robot moves during the scan, where the scan says how long it takes and the motion is known."""
         if self._last is None or not self._last_steps or scan.time_increment == 0.0:
             return None
-        between_s = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
+        between_s, sweep_s = (scan.stamp_ns - self._last.stamp_ns) * 1e-9, _duration_s(scan)
         # A sweep that lasts longer than from scan to scan is none.
-        if not 0.0 < abs(scan.time_increment) * len(scan.ranges) <= 1.2 * between_s:
+        if not 0.0 < sweep_s <= 1.2 * between_s:
             return None
         duration_s = sum(duration for duration, _ in self._last_steps)
         twist = np.sum([step for _, step in self._last_steps], axis=0) / duration_s
         if self._wheels is not None:
-            ends = self._wheels.pose_at(self._last.stamp_ns), self._wheels.pose_at(scan.stamp_ns)
+            ends = self._wheels.pose_at(scan.stamp_ns), self._wheels.pose_at(scan.stamp_ns + int(sweep_s * 1e9))
             if ends[0] is not None and ends[1] is not None:
-                twist = between(ends[0], ends[1]) / between_s
+                twist = between(ends[0], ends[1]) / sweep_s
         return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)
+
+
+def _duration_s(scan: LidarScan) -> float:
+    """How long the sweep lasts (s); 0 where the scan does not say it, or says what cannot be."""
+    duration_s = abs(scan.time_increment) * len(scan.ranges)
+    return duration_s if duration_s <= _LONGEST_SWEEP_S else 0.0
