@@ -98,6 +98,22 @@ def test_silent_wheels_hold_up_nothing_for_long() -> None:
     assert np.abs(np.diff(robot, axis=0)[:, :2]).max() < 0.1  # goes on by our own steps
 
 
+def test_after_a_pause_of_both_a_scan_waits_for_its_wheels() -> None:
+    """The robot turned by 80 degrees while neither scans nor wheels came."""
+    poses = way(40)
+    poses[20:] = [compose(compose(poses[19], np.array((0.3, -0.2, -1.4))), between(poses[20], p)) for p in poses[20:]]
+    pause_ns = 3 * 10**9
+    records: list[LidarScan | WheelPose] = []
+    for k, (scan, wheel) in enumerate(zip(scans(poses), wheels(poses), strict=True)):
+        late = pause_ns if k >= 20 else 0
+        records.append(LidarScan(scan.stamp_ns + late, *list(vars(scan).values())[1:]))
+        records.append(WheelPose(wheel.stamp_ns + late, wheel.pose_xyyaw))  # behind its scan
+    steps = fed(LidarOdometry(), records)
+    assert steps[19].robot_odom_xyyaw == pytest.approx(wheels(poses)[20].pose_xyyaw)
+    np.testing.assert_allclose(steps[19].relative_xyyaw, between(poses[19], poses[20]), atol=0.1)
+    assert off(steps, poses) < 0.1
+
+
 def test_wheels_that_restart_begin_a_new_frame() -> None:
     poses = way(60)
     records: list[LidarScan | WheelPose] = []

@@ -200,9 +200,11 @@ class LidarOdometry:
             return True
         until = stamp_ns + int((_duration_s(self._waiting[0]) - self.lag_s) * 1e9)
         newest_scan_ns = self._waiting[-1].stamp_ns
+        # Where the scans paused, the wheels may have paused with them.
+        heard_until = until if self._last is None else min(until, self._last.stamp_ns)
         return (
             self._newest_wheels_ns >= until
-            or self._newest_wheels_ns < until - int(self.config.wheel_silence_s * 1e9)
+            or self._newest_wheels_ns < heard_until - int(self.config.wheel_silence_s * 1e9)
             or newest_scan_ns >= stamp_ns + int(self.config.wheel_wait_s * 1e9)
         )
 

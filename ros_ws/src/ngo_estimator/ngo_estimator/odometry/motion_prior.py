@@ -64,6 +64,7 @@ class MotionPrior:
         self.config = config
         self._stamp_ns = 0
         self._velocity = np.zeros(3)
+        self._velocity_covariance = np.zeros((3, 3))
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None
         self._last_wheels: Array | None = None
@@ -121,14 +122,27 @@ class MotionPrior:
         information = np.linalg.inv(total).astype(np.float64)
         return Prediction(mean, total, information, (mean,))
 
-    def accept(self, stamp_ns: int, pose: Array, step: Array, is_key: bool, unsure: bool) -> None:
+    def accept(self, stamp_ns: int, pose: Array, step: Array, covariance: Array, is_key: bool, unsure: bool) -> None:
         """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before.
 
-        A step that is ``unsure`` is no measured velocity: without wheels the last one is believed less and less.
+        ``covariance`` ``(3, 3)`` is that of the step: a direction that the walls leave open tells no velocity. A step
+        that is ``unsure`` is no measured velocity: without wheels the last one is believed less and less.
         """
-        measured = not unsure or self._now_wheels is not None
-        self._velocity = step / ((stamp_ns - self._stamp_ns) * 1e-9) if measured else 0.5 * self._velocity
+        elapsed = (stamp_ns - self._stamp_ns) * 1e-9
+        if not unsure or self._now_wheels is not None:
+            self._measure_velocity(step / elapsed, covariance / elapsed**2, elapsed)
+        else:
+            self._velocity = 0.5 * self._velocity
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
         if is_key:
             self._anchor, self._anchor_wheels = pose, self._now_wheels
             self._doubt = self._doubt_rad = 0.0
+
+    def _measure_velocity(self, measured: Array, covariance: Array, elapsed: float) -> None:
+        """A step of a Kalman filter with accelerations as its noise."""
+        config = self.config
+        changes = np.array((config.acceleration_m_s2, config.acceleration_m_s2, config.acceleration_rad_s2)) * elapsed
+        before = self._velocity_covariance + np.diag(changes**2)
+        gain = np.linalg.solve((before + covariance).T, before.T).T
+        self._velocity = self._velocity + gain @ (measured - self._velocity)
+        self._velocity_covariance = (np.eye(3) - gain) @ before

@@ -251,7 +251,7 @@ class ScanOdometry:
             evidence,
             factors,
         )
-        self._prior.accept(scan.stamp_ns, pose, step, is_key, unsure)
+        self._prior.accept(scan.stamp_ns, pose, step, turned_covariance(-self._pose[2], both), is_key, unsure)
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
