@@ -89,6 +89,21 @@ def test_no_lag_is_claimed_without_turns_or_without_a_lag() -> None:
     assert abs(right.lag_s) < 0.01
 
 
+def test_noisy_wheels_that_are_as_slow_as_the_scans_show_no_lag() -> None:
+    """Interpolation averages the noise of two poses: that is no reason for half a period of lag."""
+    generator = np.random.default_rng(3)
+    for _ in range(4):
+        wheels, noise = WheelOdometry(), 0.0
+        for i in range(1500):
+            time = 0.17 * i
+            noise += 0.03 * generator.standard_normal()
+            wheels.add(round(time * 1e9), np.array((0.0, 0.0, heading(time) + noise)))
+            if i:
+                turn = heading(time) - heading(time - 0.17) + 0.003 * generator.standard_normal()
+                wheels.observe_turn(round((time - 0.17) * 1e9), round(time * 1e9), turn)
+        assert abs(wheels.lag_s) < 0.02
+
+
 def test_a_pose_reads_the_wheels_at_the_lag() -> None:
     wheels = WheelOdometry()
     for i in range(50):

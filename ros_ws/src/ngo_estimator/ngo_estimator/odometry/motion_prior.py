@@ -1,8 +1,8 @@
 """Where the next scan is expected: by the wheels, and by the velocity that the scans measured last.
 
 The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
-Wheels that stand still while the scans moved (frozen), or that run away from them (a jump), are doubted: the prior
-widens by the disagreement until the next key scan, and both predictions are tried.
+Wheels that stopped at once while the scans moved (frozen), or that run away from them (a jump), are doubted: for that
+scan the prior widens by the disagreement, and both predictions are tried. The next prior counts from that scan.
 """
 
 import math
@@ -20,8 +20,9 @@ class MotionPriorConfig:
 
     Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
     ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
-    zero. Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``
-    allow, or where they stand exactly still while constant velocity moves by ``frozen_m``.
+    zero. Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or
+    ``doubt_deg`` and ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most
+    ``longest_freeze_s``, while constant velocity moves by ``frozen_m``.
     """
 
     still_m: float = 0.03
@@ -33,7 +34,9 @@ class MotionPriorConfig:
     longest_s: float = 1.5
     doubt_m: float = 0.1
     doubt_m_s2: float = 4.0
+    doubt_deg: float = 10.0
     frozen_m: float = 0.01
+    longest_freeze_s: float = 2.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -69,12 +72,13 @@ class MotionPrior:
         self._anchor_wheels: Array | None = None
         self._last_wheels: Array | None = None
         self._now_wheels: Array | None = None
-        self._doubt = 0.0  # m since the last key scan
-        self._doubt_rad = 0.0
+        self._anchor_covariance = np.zeros((3, 3))
+        self._doubted = False
+        self._moved_ns = 0  # when the wheels moved last
 
     def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
         """The first scan is a key scan at this pose."""
-        self._stamp_ns, self._anchor = stamp_ns, pose
+        self._stamp_ns, self._anchor, self._moved_ns = stamp_ns, pose, stamp_ns
         self._last_wheels = self._anchor_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
 
     def predict(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry | None) -> Prediction:
@@ -91,26 +95,39 @@ class MotionPrior:
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
         starts = [compose(last, step)]
         off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
-        way = math.hypot(constant[0], constant[1])
-        frozen = not step.any() and (way > self.config.frozen_m or off_rad > math.radians(self.config.still_deg))
-        jumped = off > self.config.doubt_m + self.config.doubt_m_s2 * elapsed**2
-        if frozen or jumped:
-            self._doubt += off
-            self._doubt_rad += off_rad
+        turn_doubt = math.radians(self.config.doubt_deg) + self.config.acceleration_rad_s2 * elapsed**2
+        jumped = off > self.config.doubt_m + self.config.doubt_m_s2 * elapsed**2 or off_rad > turn_doubt
+        doubted = jumped or self._is_frozen(stamp_ns, step, constant)
+        if doubted:
             starts.append(compose(last, constant))
-        if self._anchor_wheels is None:
-            self._anchor, self._anchor_wheels = last, self._last_wheels
+        if doubted or self._doubted or self._anchor_wheels is None:
+            # The wheels' way since the key scan is wrong by what was doubted: count from the last scan.
+            self._anchor, self._anchor_wheels, self._anchor_covariance = last, self._last_wheels, covariance
+        self._doubted = doubted
         moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
-        deviations = deviations + np.array((self._doubt, self._doubt, self._doubt_rad))
-        mean = compose(self._anchor, moved)
-        if frozen or jumped or self._doubt:
-            # The wheels' way since the key scan is wrong by what was doubted: go on from the last scan.
-            mean = starts[0]
-        doubted = self._doubt > 0.0
-        moves = not doubted and bool(step.any())
-        total = np.diag(deviations**2)
-        step_covariance = np.diag(step_deviations**2) if moves else None
-        return Prediction(mean, total, np.diag(deviations**-2), tuple(starts), True, not doubted, step_covariance)
+        if doubted:
+            deviations = deviations + np.array((off, off, off_rad))
+        total = np.diag(deviations**2) + self._anchor_covariance
+        return Prediction(
+            compose(self._anchor, moved),
+            total,
+            np.linalg.inv(total).astype(np.float64),
+            tuple(starts),
+            by_wheels=True,
+            measured=not doubted,
+            step_covariance=np.diag(step_deviations**2) if not doubted and step.any() else None,
+        )
+
+    def _is_frozen(self, stamp_ns: int, step: Array, constant: Array) -> bool:
+        """Whether wheels that stand exactly still may have stopped counting."""
+        config = self.config
+        if step.any():
+            self._moved_ns = stamp_ns
+        still_s = (stamp_ns - self._moved_ns) * 1e-9
+        moves = math.hypot(constant[0], constant[1]) > config.frozen_m or abs(constant[2]) > math.radians(
+            config.still_deg
+        )
+        return not step.any() and moves and still_s <= config.longest_freeze_s
 
     def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
         config = self.config
@@ -135,8 +152,8 @@ class MotionPrior:
             self._velocity = 0.5 * self._velocity
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
         if is_key:
-            self._anchor, self._anchor_wheels = pose, self._now_wheels
-            self._doubt = self._doubt_rad = 0.0
+            self._anchor, self._anchor_wheels, self._anchor_covariance = pose, self._now_wheels, np.zeros((3, 3))
+            self._doubted = False
 
     def _measure_velocity(self, measured: Array, covariance: Array, elapsed: float) -> None:
         """A step of a Kalman filter with accelerations as its noise."""

@@ -3,6 +3,9 @@
 A scan whose stamp is right sees the turn that the wheels report between the same stamps. For every lag of a grid the
 estimator sums the squared differences between both turns; the lag with the least sum explains the stamps. One sum a
 lag is kept.
+
+Interpolation between two poses of the wheels averages their noise, most of it halfway, so that lags halfway between
+stamps would win. Yaws are averaged over two periods of the wheels instead: then all lags average alike.
 """
 
 import math
@@ -12,6 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array
+
+_WITHIN = (np.arange(8) + 0.5) / 4.0 - 1.0
+"""Where the yaw is averaged, in periods of the wheels."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class WheelLag:
             start_s, end_s, turn = self._waiting.popleft()
             if start_s - self.config.largest_s < stamps_s[0]:
                 continue
-            turns = np.interp(end_s - self._lags, stamps_s, yaws) - np.interp(start_s - self._lags, stamps_s, yaws)
+            turns = self._averaged(end_s, stamps_s, yaws) - self._averaged(start_s, stamps_s, yaws)
             if max(abs(turn), float(np.abs(turns).max())) < self.config.least_turn_rad:
                 continue
             fade = 0.5 ** (1.0 / self.config.half_life)
@@ -81,6 +87,18 @@ class WheelLag:
             self._weight = fade * self._weight + 1.0
             taken = True
         return taken and self._decide()
+
+    def _averaged(self, at_s: float, stamps_s: Array, yaws: Array) -> Array:
+        """The wheels' yaw around a time, for each lag."""
+        first, last = np.searchsorted(
+            stamps_s, (at_s - 2.0 * self.config.largest_s, at_s + 2.0 * self.config.largest_s)
+        )
+        first, last = max(int(first) - 1, 0), int(last) + 1
+        stamps_s, yaws = stamps_s[first:last], yaws[first:last]
+        period_s = min(float(np.median(np.diff(stamps_s))), self.config.largest_s) if len(stamps_s) > 1 else 0.0
+        times_s = (at_s - self._lags)[:, None] + period_s * _WITHIN
+        averaged: Array = np.interp(times_s, stamps_s, yaws).mean(axis=1)
+        return averaged
 
     def _decide(self) -> bool:
         best = int(np.argmin(self._sums))
