@@ -60,6 +60,16 @@ class OccupancyMap:
         sure = np.select([values < 0, values <= 100.0 * free, values >= 100.0 * occupied], [UNKNOWN, 0, 100], UNKNOWN)
         return OccupancyMap(sure.astype(np.int8), self.resolution_m, self.origin_xy)
 
+    def cropped(self) -> "OccupancyMap":
+        """The part that anything is known of."""
+        known = self.values != UNKNOWN
+        rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return OccupancyMap(np.zeros((0, 0), np.int8), self.resolution_m, self.origin_xy)
+        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        corner = self.origin_xy + self.resolution_m * np.array((columns[0], rows[0]))
+        return OccupancyMap(self.values[part], self.resolution_m, corner)
+
 
 class MapTooLarge(ValueError):
     """Scans lie so far apart that no map of them fits into memory; the map is as it was before."""
@@ -93,14 +103,9 @@ class OccupancyGrid:
         self._render(scans, poses, -1)
 
     def cells(self, config: OccupancyConfig) -> OccupancyMap:
-        """The probabilities of all cells that anything is known of, and of those between them."""
-        rows, columns = (np.flatnonzero(_known(self._hits, self._passes, axis)) for axis in (0, 1))
-        if not len(rows):
-            return OccupancyMap(np.zeros((0, 0), np.int8), self.resolution_m, np.zeros(2))
-        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        values = _percent(self._hits[part], self._passes[part], config.hit, config.passed)
-        corner = self._low + np.array((columns[0], rows[0]))
-        return OccupancyMap(values, self.resolution_m, corner * self.resolution_m)
+        """The probabilities of all cells; the extent grows in large steps, so that it seldom changes."""
+        values = _percent(self._hits, self._passes, config.hit, config.passed)
+        return OccupancyMap(values, self.resolution_m, self._low.astype(np.float64) * self.resolution_m)
 
     def _render(self, scans: Sequence[RangeScan], poses: Array, sign: int) -> None:
         if not len(scans):
@@ -129,7 +134,9 @@ class OccupancyGrid:
         width, height = high - low
         if not width * height <= _MOST_CELLS:
             size = f"{width * self.resolution_m:.0f} m x {height * self.resolution_m:.0f} m"
-            raise MapTooLarge(f"the map would be {size}; expected at most {_MOST_CELLS} cells: use a coarser resolution")
+            raise MapTooLarge(
+                f"the map would be {size}; expected at most {_MOST_CELLS} cells: use a coarser resolution"
+            )
         if self._hits.shape == (height, width):
             return
         corner = low.astype(np.int64)
@@ -192,17 +199,6 @@ def _count(
                     column, columns, next_x = column + step_x, columns - 1, next_x + per_x
                 else:
                     row, rows, next_y = row + step_y, rows - 1, next_y + per_y
-
-
-@njit(cache=True)
-def _known(hits: Counts, passes: Counts, axis: int) -> NDArray[np.bool_]:
-    """Whether each row (axis 0) or column (axis 1) has a cell that anything is known of."""
-    known = np.zeros(hits.shape[axis], np.bool_)
-    for row in range(hits.shape[0]):
-        for column in range(hits.shape[1]):
-            if hits[row, column] | passes[row, column]:
-                known[column if axis else row] = True
-    return known
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, OccupancyGrid, OccupancyMap
-from ngo_estimator.mapping.range_scan import Array, RangeScan
+from ngo_estimator.mapping.range_scan import Array, RangeScan, range_scan
 
 _RAYS_AT_ONCE, _SCANS_AT_ONCE = 10_000, 256  # between two looks at the clock
 
@@ -171,7 +171,9 @@ class ScanMap:
         if restarted or self._span is None:
             self._forget()
             self._waiting = {
-                stamp: (run, scan) for stamp, (run, scan) in self._waiting.items() if run == self._run and stamp >= first
+                stamp: (run, scan)
+                for stamp, (run, scan) in self._waiting.items()
+                if run == self._run and stamp >= first
             }
         self._span = first, last
         return restarted
@@ -213,3 +215,11 @@ class ScanMap:
         self._grid.add(scans, poses)
         self._grid.remove(scans, self._poses[slots])
         self._poses[slots] = poses
+
+
+def warm_up() -> None:
+    """Compile all that a map needs: the first time it takes seconds."""
+    grid = OccupancyGrid(1.0)
+    scan = range_scan(np.zeros(1), np.ones(1), np.zeros(3), 2.0)
+    grid.add([scan], np.zeros((1, 3)))
+    grid.cells(OccupancyConfig())
