@@ -160,12 +160,12 @@ def test_a_subscriber_that_comes_later_gets_the_map(mapper: Mapper) -> None:
 
 
 def test_small_changes_are_sent_as_updates_where_everybody_takes_them(mapper: Mapper) -> None:
-    """A last pose that moves a little changes a part; the whole goes out again for one who takes no updates."""
+    """A few poses that move change a part; the whole goes out again for one who takes no updates."""
     updates: list[OccupancyGridUpdate] = []
     taking = mapper.probe.node.create_subscription(OccupancyGridUpdate, "map_updates", updates.append, 10)
     mapper.probe.spin_until(lambda: mapper.probe.node.count_publishers("/map_updates") == 1, "the topic of updates")
     moved = poses(30)
-    moved[-1, :2] += 0.3
+    moved[-3:, :2] += 0.3
     mapper.maps.clear()
     mapper.trajectories.publish(trajectory(moved))
     mapper.probe.spin_until(lambda: updates or mapper.maps, "a change of the map")
