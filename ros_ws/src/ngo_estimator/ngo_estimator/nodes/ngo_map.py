@@ -90,6 +90,7 @@ class NgoMap(Node):
             self._missed = f"the map lacks what was seen before {seconds(step.stamp_ns)} s: this node started later"
             self.get_logger().warning(self._missed)
         self._begun = True
+        self._due = self._trajectory is not None  # the trajectory may have come before this step
 
     def _on_trajectory(self, message: Trajectory) -> None:
         expected = self._settings.framed(self._settings.map_frame)
