@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from ngo_common.settings import BadParameter, described, make_settings
-from ngo_estimator.nodes.settings import LocalNodeSettings, NgoNodeSettings
+from ngo_estimator.nodes.settings import LocalNodeSettings, MapNodeSettings, NgoNodeSettings
 
 SRC = Path(__file__).parents[4] / "ros_ws/src"
 CONFIG = SRC / "ngo_estimator/config"
-KINDS = {"local_node": LocalNodeSettings, "ngo_node": NgoNodeSettings}
+KINDS = {"local_node": LocalNodeSettings, "ngo_node": NgoNodeSettings, "ngo_map": MapNodeSettings}
 
 
 @pytest.mark.parametrize("name", KINDS)
