@@ -13,7 +13,7 @@ def fake_result(seed: int) -> dict[str, Any]:
     return {"world": "maze2d", "seed": seed, "frames": 30, "path_m": 9.0, "odometry": errors[0], "corrected": errors[1]}
 
 
-def fake_run_one(arguments: Any, seed: int, out: Path, console: Any) -> dict[str, Any]:
+def fake_run_one(arguments: Any, seed: int, out: Path, console: Any, view: Any = None) -> dict[str, Any]:
     return fake_result(seed)
 
 
