@@ -45,7 +45,7 @@ def imports_below(folder: Path) -> set[str]:
 def ros_packages_in_launch_files(folder: Path) -> set[str]:
     """Packages that launch files name: those whose nodes they start, and whose folders they look into."""
     named: set[str] = set()
-    for path in folder.glob("launch/*.py"):
+    for path in [*folder.glob("launch/*.py"), *folder.glob("ngo_bringup/*.py")]:
         named |= {
             node.value
             for node in ast.walk(ast.parse(path.read_text()))
