@@ -17,6 +17,7 @@ ALL_TOPICS = {
     "ngo/path": "nav_msgs/msg/Path",
     "ngo/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "ngo/trajectory": "ngo_msgs/msg/Trajectory",
+    "map": "nav_msgs/msg/OccupancyGrid",
     "ngo/loops": "visualization_msgs/msg/MarkerArray",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",

@@ -43,7 +43,7 @@ class SessionConfig:
     views: int = 0
 
     def estimators(self) -> list[NodeSpec]:
-        """The two estimator nodes; the image comes reliably, because a demo must not depend on luck."""
+        """The two estimator nodes and the map; the image comes reliably, because a demo must not depend on luck."""
         weights = {} if self.weights is None else {"weights": str(self.weights.resolve())}
         window = {"window_frames": max(2000, self.frames), "relative_pose_depth": max(2000, self.frames)}
         local = {
@@ -55,6 +55,7 @@ class SessionConfig:
             # A path after every frame, for the latency.
             NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
             NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
+            NodeSpec("ngo_estimator", "ngo_map", {"world": self.world, **weights}),
         ]
 
     def simulator(self) -> NodeSpec:
@@ -105,7 +106,8 @@ class Session:
                 lambda: (
                     recorder.has_publisher("ngo/path")
                     and recorder.has_publisher("odom")
-                    and recorder.has_subscriber("relative_pose")
+                    and recorder.has_publisher("map")
+                    and recorder.has_subscriber("relative_pose", 2)
                     and recorder.has_subscriber("image", 1 + config.views)
                 ),
                 "the estimators to come up",

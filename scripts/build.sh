@@ -31,9 +31,16 @@ export NGO_ENV_UNDERLAY_ONLY=1
 . "$ROOT/env.sh"
 
 paths=(src) cmake_args=(-DBUILD_TESTING=OFF)
+# Stand-ins for packages that this ROS 2 lacks.
+for package in wheels/*/package.xml; do
+    package="$(dirname "$package")"
+    for prefix in ${AMENT_PREFIX_PATH//:/ }; do
+        [ ! -d "$prefix/share/${package#wheels/}" ] || continue 2
+    done
+    paths+=("$package")
+done
 if [ "$(cat "$VENV/ngo_underlay")" = wheels ]; then
-    # tf2_msgs, which the wheels lack, and a workaround for their CMake files.
-    paths+=(wheels)
+    # A workaround for the wheels' CMake files.
     cmake_args+=("-DCMAKE_PROJECT_INCLUDE=$ROOT/ros_ws/wheels/drop_missing_python_includes.cmake")
 fi
 step "build the workspace" colcon build --symlink-install --base-paths "${paths[@]}" --cmake-args "${cmake_args[@]}"

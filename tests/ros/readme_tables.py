@@ -1,4 +1,4 @@
-"""Parameters, topics and services of the five nodes, as they declare them and as docs/reference lists them.
+"""Parameters, topics and services of all nodes, as they declare them and as docs/reference lists them.
 
 python -m tests.ros.readme_tables      # writes the nodes' parameters into docs/reference/parameters.md
 """
@@ -30,6 +30,7 @@ NODES = {
     "building2d": "ngo_sim",
     "local_node": "ngo_estimator",
     "ngo_node": "ngo_estimator",
+    "ngo_map": "ngo_estimator",
 }
 BEGIN = "<!-- Written by `python -m tests.ros.readme_tables`; a test compares it with the nodes. -->\n"
 END = "<!-- End of the parameters. -->\n"
@@ -98,7 +99,7 @@ class NodeFacts:
 
 @contextmanager
 def running_nodes() -> Iterator[dict[str, NodeFacts]]:
-    """All five nodes, in one graph."""
+    """All nodes, in one graph."""
     probe = Probe()
     facts: dict[str, NodeFacts] = {}
     processes: list[NodeProcess] = []

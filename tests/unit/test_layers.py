@@ -55,7 +55,7 @@ LAYERS = {
         {"networks"},
         {"optimizer"},
         {"checkpoint"},
-        {"odometry", "online", "trajectory"},
+        {"odometry", "online", "trajectory", "mapping"},
         {"offline", "view"},
         {"nodes"},
     ],

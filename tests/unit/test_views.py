@@ -27,7 +27,7 @@ TYPES = {
 def types() -> dict[str, str]:
     """Types of messages by topic."""
     rows = table_rows(TOPICS_AND_SERVICES.read_text(), "## Topics")
-    return {"map": "nav_msgs/OccupancyGrid"} | {row[0].strip("`"): row[1].strip("`") for row in rows}
+    return {row[0].strip("`"): row[1].strip("`") for row in rows}
 
 
 @pytest.fixture

@@ -23,6 +23,8 @@ setup(
         "ngo_recordings",
         "numba",
         "numpy",
+        "pillow",
+        "pyyaml",
         "rich",
         "rosbags",
         "safetensors",
@@ -39,6 +41,7 @@ setup(
     entry_points={
         "console_scripts": [
             "local_node = ngo_estimator.nodes.local_node:main",
+            "ngo_map = ngo_estimator.nodes.ngo_map:main",
             "ngo_node = ngo_estimator.nodes.ngo_node:main",
             "run_recording = ngo_estimator.nodes.run_recording:main",
             "view_node = ngo_estimator.nodes.view_node:main",

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from ngo_common.settings import BadParameter, Settings, described, make_settings
-from ngo_estimator.nodes.settings import LocalNodeSettings, NgoNodeSettings
+from ngo_estimator.nodes.settings import LocalNodeSettings, MapNodeSettings, NgoNodeSettings
 from ngo_estimator.nodes.view_settings import ViewNodeSettings
 
 SRC = Path(__file__).parents[4] / "ros_ws/src"
@@ -15,6 +15,7 @@ CONFIG = SRC / "ngo_estimator/config"
 KINDS: dict[str, type[Settings]] = {
     "local_node": LocalNodeSettings,
     "ngo_node": NgoNodeSettings,
+    "ngo_map": MapNodeSettings,
     "view_node": ViewNodeSettings,
 }
 

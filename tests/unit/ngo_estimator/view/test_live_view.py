@@ -74,6 +74,17 @@ def test_the_view_moves_when_the_path_leaves_it_and_not_before(notes: Notes) -> 
     assert window.holds(np.zeros(2), np.array([38.0, 0.0]))
 
 
+def test_the_whole_map_is_looked_at(notes: Notes) -> None:
+    view = LiveView(notes)
+    drive(view, 5)
+    view.show_map(np.zeros((400, 400), np.int8), 0.1, np.array([-30.0, -5.0, 0.0]))
+    window = notes.last["look_at"][0]
+    assert window.holds(np.array([-30.0, -5.0]), np.array([10.0, 35.0]))
+    looks = notes.counts["look_at"]
+    drive(view, 8)
+    assert notes.counts["look_at"] == looks, "the path lies within the map"
+
+
 def test_time_goes_on_when_the_source_restarts(notes: Notes) -> None:
     view, times = LiveView(notes), []
     for stamp_s in (100, 101, 101, 103, 1, 2):

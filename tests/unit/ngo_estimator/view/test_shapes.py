@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.view.shapes import ellipse, scan_points, shown_picture, window_around
+from ngo_estimator.view.shapes import ellipse, known_corners, scan_points, shown_picture, window_around
 from ngo_recordings.mounting import Mounting
 from ngo_recordings.scan_stream import LidarScan
 
@@ -37,6 +37,16 @@ def test_every_kind_of_observation_becomes_a_picture() -> None:
     assert strip[3, 2].tolist() == [0, 128, 255]
     depth = np.array([[[0.0], [1.0]], [[2.0], [np.inf]]], np.float32)
     assert shown_picture(depth)[..., 0].tolist() == [[255, 128], [0, 0]]
+
+
+def test_the_known_part_of_a_grid() -> None:
+    cells = np.full((20, 30), -1, np.int8)
+    assert known_corners(cells, 0.1, np.zeros(3)).shape == (0, 2)
+    cells[5, 10], cells[7, 3] = 0, 100
+    corners = known_corners(cells, 0.1, np.array([1.0, 2.0, 0.0]))
+    np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], [[1.3, 2.5], [2.1, 2.8]])
+    turned = known_corners(cells, 0.1, np.array([0.0, 0.0, np.pi / 2]))
+    np.testing.assert_allclose([turned.min(axis=0), turned.max(axis=0)], [[-0.8, 0.3], [-0.5, 1.1]])
 
 
 def test_a_window_has_room_for_the_path_to_grow() -> None:

@@ -15,8 +15,8 @@ _TWISTS = ("TwistStamped", "Twist", "Odometry")
 
 
 @dataclass(frozen=True)
-class EstimatorSettings(FramedSettings):
-    """Parameters of every estimator node."""
+class StepSettings(FramedSettings):
+    """Parameters of every node that publishes or takes relative poses."""
 
     world: str = setting(
         "maze3d",
@@ -25,9 +25,6 @@ class EstimatorSettings(FramedSettings):
         check=lambda value: re.fullmatch(r"[\w-]+", value) is not None,
     )
     weights: str = setting("", "Folder of weights for that world; empty: the ones that ship with the package.")
-    threads: int = setting(1, "Threads that the networks compute with.", minimum=1, maximum=64)
-    odom_frame: str = frame("odom", "Frame in which the odometry is smooth and drifts.")
-    publish_tf: bool = setting(True, "Whether to publish the transform on tf_topic.")
     relative_pose_topic: str = topic("relative_pose", "Steps of the odometry, from local_node to ngo_node.")
     relative_pose_depth: int = setting(
         2000, "Queue of relative_pose_topic, at least ngo_node's window_frames.", minimum=1, maximum=100_000
@@ -39,7 +36,6 @@ class EstimatorSettings(FramedSettings):
         maximum=3600.0,
         live=True,
     )
-    tf_topic: str = topic("/tf", "Transforms.")
     diagnostics_topic: str = topic("/diagnostics", "Rates, drops and durations of the node.")
     diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0, live=True)
 
@@ -47,6 +43,16 @@ class EstimatorSettings(FramedSettings):
         super().__post_init__()
         if not self.weights and self.world not in SHIPPED_WORLDS:
             raise BadParameter(f"parameter 'world' is {self.world!r}; allowed: {_WORLD_NAMES}")
+
+
+@dataclass(frozen=True)
+class EstimatorSettings(StepSettings):
+    """Parameters of both estimator nodes."""
+
+    threads: int = setting(1, "Threads that the networks compute with.", minimum=1, maximum=64)
+    odom_frame: str = frame("odom", "Frame in which the odometry is smooth and drifts.")
+    publish_tf: bool = setting(True, "Whether to publish the transform on tf_topic.")
+    tf_topic: str = topic("/tf", "Transforms.")
 
 
 @dataclass(frozen=True)
@@ -193,3 +199,22 @@ class NgoNodeSettings(EstimatorSettings):
                 f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; "
                 f"allowed: at least window_frames, which is {self.window_frames}"
             )
+
+
+@dataclass(frozen=True)
+class MapNodeSettings(StepSettings):
+    """Parameters of ``ngo_map``."""
+
+    resolution: float = setting(0.05, "Side of the map's cells, m.", minimum=0.005, maximum=10.0)
+    max_range: float = setting(
+        0.0,
+        "Longest range that enters the map, m; longer rays are free up to it. 0: as far as the sensor is accurate.",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    map_update_interval: float = setting(
+        0.5, "Least time between two maps, s.", minimum=0.05, maximum=3600.0, live=True
+    )
+    map_frame: str = frame("map", "Frame of the map, that of trajectory_topic.")
+    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory, from ngo_node.")
+    map_topic: str = topic("map", "Map; changes of a part of it go to a topic of this name with _updates behind it.")

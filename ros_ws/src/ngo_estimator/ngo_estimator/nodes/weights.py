@@ -8,12 +8,12 @@ from ament_index_python.packages import get_package_share_directory
 
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.lidar_file import is_lidar
-from ngo_estimator.nodes.settings import EstimatorSettings
+from ngo_estimator.nodes.settings import EstimatorSettings, StepSettings
 
 Core = TypeVar("Core")
 
 
-def weights_folder(settings: EstimatorSettings) -> Path:
+def weights_folder(settings: StepSettings) -> Path:
     """The folder of weights that ``settings`` name; raises ``StartError`` where there is none."""
     folder = Path(settings.weights or Path(get_package_share_directory("ngo_estimator"), "weights", settings.world))
     if not folder.is_dir():

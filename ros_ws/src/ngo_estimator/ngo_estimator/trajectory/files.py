@@ -10,15 +10,15 @@ The KITTI format has no place for stamps: they lie beside it in ``NAME.times.txt
 are those of the robot's base (x forward, y left), as in the other formats; KITTI's own are of a camera.
 """
 
-import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from ngo_estimator.data.whole_files import write_together
 
 ENDINGS = (".tum", ".txt", ".kitti", ".g2o")
 TUM_ENDINGS = (".tum", ".txt")
@@ -102,10 +102,10 @@ def write_trajectory(
         raise ValueError(f"stamps are {len(stamps_ns)} and poses {len(poses_xyyaw)}; expected as many")
     if path.suffix == _KITTI:
         times = (seconds(stamp) for stamp in stamps_ns.tolist())
-        return _write_together({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
+        return _write_lines({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
     if path.suffix in TUM_ENDINGS:
-        return _write_together({path: _tum_lines(stamps_ns, poses_xyyaw)})
-    return _write_together({path: _g2o_lines(poses_xyyaw, edges)})
+        return _write_lines({path: _tum_lines(stamps_ns, poses_xyyaw)})
+    return _write_lines({path: _g2o_lines(poses_xyyaw, edges)})
 
 
 def seconds(stamp_ns: int) -> str:
@@ -200,26 +200,5 @@ def _g2o_lines(poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges]) -> Iterator[
             yield f"EDGE_SE2 {first} {second} {x!r} {y!r} {yaw!r} {of_x!r} 0 0 {of_y!r} 0 {of_yaw!r}"
 
 
-def _write_together(contents: Mapping[Path, Iterator[str]]) -> list[Path]:
-    """Write all files beside their places, and move them there only when each is on the disk."""
-    written: dict[Path, str] = {}
-    try:
-        for path, lines in contents.items():
-            handle, written[path] = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            with os.fdopen(handle, "w") as file:
-                file.writelines(f"{line}\n" for line in lines)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(written[path], 0o644)  # mkstemp's own 0600 would hide the result from others
-        for path in contents:
-            os.replace(written[path], path)
-            del written[path]
-    except OSError as error:
-        if error.errno is None:
-            raise
-        # It names the file beside the one that was asked for.
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
-        for left in written.values():
-            os.unlink(left)
-    return list(contents)
+def _write_lines(contents: Mapping[Path, Iterable[str]]) -> list[Path]:
+    return write_together({path: (f"{line}\n".encode() for line in lines) for path, lines in contents.items()})

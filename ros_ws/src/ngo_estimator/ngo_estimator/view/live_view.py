@@ -4,7 +4,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ngo_estimator.view.shapes import Window, ellipse, scan_points, shown_picture, window_around
+from ngo_estimator.view.shapes import Window, ellipse, known_corners, scan_points, shown_picture, window_around
 from ngo_estimator.view.tracks import (
     RESTART_NS,
     StampedPoses,
@@ -52,6 +52,7 @@ class LiveView:
         self.url = canvas.url
         self.tracks = {"odometry": Track(), "truth": Track()}
         self._window: Window | None = None
+        self._seen = np.zeros((0, 2))
         self._pose = np.zeros(3)
         self._loops = 0
         self._newest_ns: int | None = None
@@ -92,6 +93,7 @@ class LiveView:
     def show_map(self, cells: np.ndarray, resolution_m: float, origin_xyyaw: np.ndarray) -> None:
         """An occupancy grid ``(height, width)`` as ``nav_msgs/OccupancyGrid`` defines its cells."""
         self._canvas.grid(cells, resolution_m, origin_xyyaw)
+        self._keep_in_view(known_corners(cells, resolution_m, origin_xyyaw))
 
     def show_picture(self, message: Any, type_name: str, topic: str) -> None:
         """An image message. Raises ``ValueError`` for one that cannot be read."""
@@ -118,9 +120,13 @@ class LiveView:
         self._canvas.text("\n\n".join(lines))
 
     def _keep_in_view(self, xy: np.ndarray) -> None:
-        low, high = xy.min(axis=0), xy.max(axis=0)
-        if self._window is None or not self._window.holds(low, high):
-            self._window = window_around(low, high)
+        """Look at all that was there so far, and at points ``(n, 2)``."""
+        if not len(xy):
+            return
+        self._seen = np.vstack([self._seen, xy])
+        self._seen = np.stack([self._seen.min(axis=0), self._seen.max(axis=0)])
+        if self._window is None or not self._window.holds(*self._seen):
+            self._window = window_around(*self._seen)
             self._canvas.look_at(self._window)
 
     def _set_time(self, stamp_ns: int) -> None:

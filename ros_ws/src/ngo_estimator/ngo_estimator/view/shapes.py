@@ -53,6 +53,17 @@ def shown_picture(image: np.ndarray) -> np.ndarray:
     return np.repeat(image, _ROWS_OF_A_LINE, axis=0) if len(image) == 1 else image
 
 
+def known_corners(cells: np.ndarray, resolution_m: float, origin_xyyaw: np.ndarray) -> np.ndarray:
+    """Corners ``(4, 2)`` of the part of an occupancy grid that is known; none, ``(0, 2)``, where nothing is."""
+    rows, columns = (np.flatnonzero((cells >= 0).any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return np.zeros((0, 2))
+    x = resolution_m * np.array([columns[0], columns[-1] + 1])
+    y = resolution_m * np.array([rows[0], rows[-1] + 1])
+    corners = np.array([[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]])
+    return np.asarray(transformed(origin_xyyaw, corners))
+
+
 @dataclass(frozen=True)
 class Window:
     """A square of the map that a view looks at: its middle and half its side, m."""

@@ -1,0 +1,1 @@
+"""From ranges at corrected poses to an occupancy grid, and its files."""

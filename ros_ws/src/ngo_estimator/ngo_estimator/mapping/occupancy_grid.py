@@ -1,0 +1,212 @@
+"""An occupancy grid that scans can be taken out of again: it counts, and the counts of a scan are those of its pose.
+
+Log odds of occupancy grids (Moravec and Elfes 1985) are sums over scans. Here the sums are kept as two integers a cell,
+so that a scan which moves is subtracted where it was, to the last bit, and added where it is.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ngo_estimator.mapping.range_scan import Array, RangeScan
+
+UNKNOWN = -1
+"""Value of a cell that nothing is known of."""
+
+_CHUNK = 64  # cells by which the grid grows
+_MOST_CELLS = 40_000_000
+Counts = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class OccupancyConfig:
+    """How counts become probabilities.
+
+    A scan that ends in a cell adds ``hit`` to the cell's log odds, one that looks through it subtracts ``passed``. A
+    cell is occupied from the probability ``occupied`` on, and free up to ``free``; the rest is unknown.
+    """
+
+    hit: float = 0.9
+    passed: float = 0.5
+    occupied: float = 0.65
+    free: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.hit < math.inf and 0.0 < self.passed < math.inf):
+            raise ValueError(f"hit, passed are {self.hit}, {self.passed}; expected positive log odds")
+        if not 0.0 <= self.free < self.occupied <= 1.0:
+            raise ValueError(f"free, occupied are {self.free}, {self.occupied}; expected 0 <= free < occupied <= 1")
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyMap:
+    """Values ``(rows, columns)`` of a map's cells.
+
+    Row 0 is the lowest in y, column 0 the lowest in x, and ``origin_xy`` ``(2,)`` the lower left corner of cell [0, 0]
+    (m). Values are percent, or -1 where nothing is known.
+    """
+
+    values: NDArray[np.int8]
+    resolution_m: float
+    origin_xy: Array
+
+    def trinary(self, free: float, occupied: float) -> "OccupancyMap":
+        """The same map with the values 0 up to the probability ``free``, 100 from ``occupied`` on, else -1."""
+        values = self.values
+        sure = np.select([values < 0, values <= 100.0 * free, values >= 100.0 * occupied], [UNKNOWN, 0, 100], UNKNOWN)
+        return OccupancyMap(sure.astype(np.int8), self.resolution_m, self.origin_xy)
+
+    def cropped(self) -> "OccupancyMap":
+        """The part that anything is known of."""
+        known = self.values != UNKNOWN
+        rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return OccupancyMap(np.zeros((0, 0), np.int8), self.resolution_m, self.origin_xy)
+        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        corner = self.origin_xy + self.resolution_m * np.array((columns[0], rows[0]))
+        return OccupancyMap(self.values[part], self.resolution_m, corner)
+
+
+class MapTooLarge(ValueError):
+    """Scans lie so far apart that no map of them fits into memory; the map is as it was before."""
+
+
+class OccupancyGrid:
+    """Counts, in each cell, the scans that ended there and those that looked through it.
+
+    A scan counts once in a cell. Where one of its rays ends, its other rays do not count. The grid grows with what is
+    entered.
+    """
+
+    def __init__(self, resolution_m: float) -> None:
+        if not 0.0 < resolution_m < math.inf:
+            raise ValueError(f"resolution_m is {resolution_m}; expected a positive length")
+        self.resolution_m = resolution_m
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._low = np.zeros(2, np.int64)  # column and row, counted from the origin of the map's frame
+        self._hits, self._passes, self._marks = (np.zeros((0, 0), np.int32) for _ in range(3))
+        self._mark = 0
+
+    def add(self, scans: Sequence[RangeScan], poses: Array) -> None:
+        """Enter scans at poses ``(scans, 3)`` of their base; raises ``MapTooLarge``."""
+        self._render(scans, poses, 1)
+
+    def remove(self, scans: Sequence[RangeScan], poses: Array) -> None:
+        """Take scans out that were entered at exactly these poses ``(scans, 3)``."""
+        self._render(scans, poses, -1)
+
+    def cells(self, config: OccupancyConfig) -> OccupancyMap:
+        """The probabilities of all cells; the extent grows in large steps, so that it seldom changes."""
+        values = _percent(self._hits, self._passes, config.hit, config.passed)
+        return OccupancyMap(values, self.resolution_m, self._low.astype(np.float64) * self.resolution_m)
+
+    def _render(self, scans: Sequence[RangeScan], poses: Array, sign: int) -> None:
+        if not len(scans):
+            return
+        ends = np.concatenate([scan.ends for scan in scans]).astype(np.float64)
+        hits = np.concatenate([scan.hits for scan in scans])
+        counts = np.array([len(scan.ends) for scan in scans])
+        sensors = np.array([scan.sensor_xyyaw[:2] for scan in scans])
+        eyes = _in_cells(sensors, np.arange(len(scans)), poses, self.resolution_m)
+        ends = _in_cells(ends, np.repeat(np.arange(len(scans)), counts), poses, self.resolution_m)
+        self._cover(np.concatenate((eyes, ends)))
+        if self._mark > np.iinfo(np.int32).max - len(scans):
+            self._marks[:], self._mark = 0, 0
+        starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+        grids = self._hits, self._passes, self._marks
+        _count(*grids, self._low[0], self._low[1], eyes, ends, hits, starts, self._mark, sign)
+        self._mark += len(scans)
+
+    def _cover(self, points: Array) -> None:
+        """Let the grid cover points ``(n, 2)`` in cells."""
+        low, high = np.floor(points.min(axis=0)), np.floor(points.max(axis=0)) + 1.0
+        if self._hits.size:
+            rows, columns = self._hits.shape
+            low, high = np.minimum(low, self._low), np.maximum(high, self._low + (columns, rows))
+        low, high = np.floor(low / _CHUNK) * _CHUNK, np.ceil(high / _CHUNK) * _CHUNK
+        width, height = high - low
+        if not width * height <= _MOST_CELLS:
+            size = f"{width * self.resolution_m:.0f} m x {height * self.resolution_m:.0f} m"
+            raise MapTooLarge(
+                f"the map would be {size}; expected at most {_MOST_CELLS} cells: use a coarser resolution"
+            )
+        if self._hits.shape == (height, width):
+            return
+        corner = low.astype(np.int64)
+        column, row = (self._low - corner if self._hits.size else np.zeros(2, np.int64)).tolist()
+        for name in ("_hits", "_passes", "_marks"):
+            before, grown = getattr(self, name), np.zeros((int(height), int(width)), np.int32)
+            grown[row : row + before.shape[0], column : column + before.shape[1]] = before
+            setattr(self, name, grown)
+        self._low = corner
+
+
+def _in_cells(points: Array, scan_of: NDArray[np.int64], poses: Array, resolution: float) -> Array:
+    """Points ``(n, 2)`` of the frames ``poses[scan_of]`` in the map's frame, in cells."""
+    x, y, yaw = poses[scan_of].T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    moved = np.stack((x + cos * points[:, 0] - sin * points[:, 1], y + sin * points[:, 0] + cos * points[:, 1]), -1)
+    return moved / resolution
+
+
+@njit(cache=True)
+def _count(
+    hits: Counts,
+    passes: Counts,
+    marks: Counts,
+    low_column: int,
+    low_row: int,
+    eyes: Array,
+    ends: Array,
+    is_hit: NDArray[np.bool_],
+    starts: NDArray[np.int64],
+    mark: int,
+    sign: int,
+) -> None:
+    """Count scans; the rays of scan ``s`` are ``starts[s]`` to ``starts[s + 1]``. Cells are traversed from side to side
+    (Amanatides and Woo 1987)."""
+    for s in range(len(eyes)):
+        mark += 1
+        for ray in range(starts[s], starts[s + 1]):
+            column, row = math.floor(ends[ray, 0]) - low_column, math.floor(ends[ray, 1]) - low_row
+            if is_hit[ray] and marks[row, column] != mark:
+                marks[row, column] = mark
+                hits[row, column] += sign
+        for ray in range(starts[s], starts[s + 1]):
+            x, y = eyes[s, 0], eyes[s, 1]
+            along_x, along_y = ends[ray, 0] - x, ends[ray, 1] - y
+            column, row = math.floor(x), math.floor(y)
+            columns, rows = abs(math.floor(ends[ray, 0]) - column), abs(math.floor(ends[ray, 1]) - row)
+            step_x, step_y = 1 if along_x > 0.0 else -1, 1 if along_y > 0.0 else -1
+            per_x = 1.0 / abs(along_x) if along_x != 0.0 else math.inf
+            per_y = 1.0 / abs(along_y) if along_y != 0.0 else math.inf
+            next_x = (column + 1 - x if step_x > 0 else x - column) * per_x if along_x != 0.0 else math.inf
+            next_y = (row + 1 - y if step_y > 0 else y - row) * per_y if along_y != 0.0 else math.inf
+            column, row = column - low_column, row - low_row
+            # As many sides as lie between both cells: rounding cannot lead past the end.
+            while columns + rows > 0:
+                if marks[row, column] != mark:
+                    marks[row, column] = mark
+                    passes[row, column] += sign
+                if rows == 0 or (columns > 0 and next_x < next_y):
+                    column, columns, next_x = column + step_x, columns - 1, next_x + per_x
+                else:
+                    row, rows, next_y = row + step_y, rows - 1, next_y + per_y
+
+
+@njit(cache=True)
+def _percent(hits: Counts, passes: Counts, hit: float, passed: float) -> NDArray[np.int8]:
+    values = np.full(hits.shape, UNKNOWN, np.int8)
+    for row in range(hits.shape[0]):
+        for column in range(hits.shape[1]):
+            if hits[row, column] | passes[row, column]:
+                odds = hits[row, column] * hit - passes[row, column] * passed
+                values[row, column] = round(100.0 / (1.0 + math.exp(-min(max(odds, -10.0), 10.0))))
+    return values

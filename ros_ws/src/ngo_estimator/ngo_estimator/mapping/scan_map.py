@@ -1,0 +1,225 @@
+"""The map of a trajectory that is being corrected: it follows the poses, at a bounded cost an update."""
+
+import math
+import time
+from collections import defaultdict, deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
+from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, OccupancyGrid, OccupancyMap
+from ngo_estimator.mapping.range_scan import Array, RangeScan, range_scan
+
+_RAYS_AT_ONCE, _SCANS_AT_ONCE = 10_000, 256  # between two looks at the clock
+
+
+@dataclass(frozen=True)
+class ScanMapConfig:
+    """Which scans a map is made of.
+
+    A scan is taken if the robot has moved by ``spacing_m`` or turned by ``spacing_deg`` since the last one. Of the
+    scans from one square of ``place_m`` and one sector of ``place_deg``, the map keeps the newest ``most_at_a_place``:
+    its cost grows with the area, not with the time. A scan is entered anew once the ends of its rays have moved by
+    ``moved_cells`` of a cell. At most ``most_waiting`` scans wait for their poses; then the oldest is given up.
+    """
+
+    resolution_m: float = 0.05
+    occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
+    spacing_m: float = 0.1
+    spacing_deg: float = 5.0
+    place_m: float = 0.5
+    place_deg: float = 30.0
+    most_at_a_place: int = 16
+    moved_cells: float = 0.25
+    most_waiting: int = 5000
+
+    def __post_init__(self) -> None:
+        lengths = self.resolution_m, self.spacing_m, self.spacing_deg, self.place_m, self.place_deg, self.moved_cells
+        numbers = self.most_at_a_place, self.most_waiting
+        if not all(0.0 < length < math.inf for length in lengths) or min(numbers) < 1:
+            raise ValueError(
+                f"resolution_m, spacing_m, spacing_deg, place_m, place_deg, moved_cells are {lengths} and "
+                f"most_at_a_place, most_waiting are {numbers}; expected positive numbers"
+            )
+
+
+@dataclass(frozen=True)
+class MapUpdate:
+    """What an update did: scans that were ``entered`` and ``moved``, those ``left`` to move for lack of time, and
+    whether a new trajectory began (``restarted``). ``too_large`` says why scans were left out, if any were."""
+
+    entered: int
+    moved: int
+    left: int
+    restarted: bool
+    too_large: str = ""
+
+    @property
+    def changed(self) -> bool:
+        """Whether any cell may have changed."""
+        return bool(self.entered or self.moved or self.restarted)
+
+
+class ScanMap:
+    """Owns the grid, the scans in it and the poses at which each was entered.
+
+    Scans wait until a trajectory says where they were taken.
+    """
+
+    def __init__(self, config: ScanMapConfig | None = None) -> None:
+        self.config = config or ScanMapConfig()
+        self._grid = OccupancyGrid(self.config.resolution_m)
+        self._source: tuple[int, int] | None = None  # origin and newest stamp of the steps
+        self._run = 0  # counts the starts of the source
+        self._last_odom: Array | None = None  # of the frame whose scan was taken last
+        self._waiting: dict[int, tuple[int, RangeScan]] = {}  # by stamp: the start of the source, and the scan
+        self.lost = 0
+        """Scans that waited in vain: no trajectory has their stamps."""
+        self._forget()
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    @property
+    def waiting(self) -> int:
+        """Scans whose pose is not known yet."""
+        return len(self._waiting)
+
+    def _forget(self) -> None:
+        self._grid.clear()
+        self._span: tuple[int, int] | None = None  # first and last stamp of the trajectory
+        self._map_run = self._run
+        self._stamps = np.zeros(0, np.int64)
+        self._poses = np.zeros((0, 3))  # at which each scan was entered
+        self._reach = np.zeros(0)
+        self._scans: list[RangeScan] = []
+        self._places: defaultdict[tuple[int, ...], deque[int]] = defaultdict(deque)
+
+    def take(self, step: RelativeStep, scans: Iterable[tuple[int, RangeScan]]) -> None:
+        """Take the scans, each with its stamp, that came with a step; those too near the last one are left out."""
+        if self._source is not None:
+            origin, newest = self._source
+            started = origin != step.origin_stamp_ns or step.stamp_ns <= newest - RESTART_AFTER_NS
+            self._run += started
+            self._last_odom = None if started else self._last_odom
+        self._source = step.origin_stamp_ns, step.stamp_ns
+        scans = list(scans)
+        if not scans or not self._is_elsewhere(step.odom_xyyaw):
+            return
+        self._last_odom = step.odom_xyyaw
+        for stamp, scan in scans:
+            self._waiting[stamp] = self._run, scan
+        while len(self._waiting) > self.config.most_waiting:
+            self._waiting.pop(next(iter(self._waiting)))
+            self.lost += 1
+
+    def _is_elsewhere(self, odom: Array) -> bool:
+        """Whether a frame is far enough from the last one whose scan was taken, by their poses ``(3,)`` in odom."""
+        if self._last_odom is None:
+            return True
+        x, y, yaw = (odom - self._last_odom).tolist()
+        turned = abs(math.remainder(yaw, 2.0 * math.pi))
+        return math.hypot(x, y) >= self.config.spacing_m or turned >= math.radians(self.config.spacing_deg)
+
+    def update(self, stamps_ns: np.ndarray, poses_xyyaw: Array, budget_s: float = math.inf) -> MapUpdate:
+        """Follow a trajectory: enter the scans that wait for it, and move those whose poses it has changed.
+
+        Args:
+            stamps_ns: of all its frames ``(n,)``, increasing; poses_xyyaw: ``(n, 3)``. A trajectory with another first
+                stamp, or one that ends sooner than the last one, begins a new map.
+            budget_s: time after which the rest is left to the next update; scans that moved most go first.
+        """
+        deadline = time.monotonic() + budget_s
+        restarted = self._begin_anew_for(stamps_ns)
+        stamps, scans, poses = self._placed(stamps_ns, poses_xyyaw)
+        entered, too_large = len(scans), ""
+        try:
+            self._enter(stamps, scans, poses)
+        except MapTooLarge as error:
+            entered, too_large = 0, str(error)
+        now = poses_xyyaw[np.searchsorted(stamps_ns, self._stamps)]
+        order, done, moved = self._moved_most_first(now), 0, 0
+        while done < len(order) and time.monotonic() < deadline:
+            rays = np.cumsum([len(self._scans[slot].ends) for slot in order[done : done + _SCANS_AT_ONCE]])
+            some = order[done : done + max(1, int(np.searchsorted(rays, _RAYS_AT_ONCE)))]
+            done += len(some)
+            try:
+                self._move(some, now[some])
+                moved += len(some)
+            except MapTooLarge as error:
+                too_large = str(error)
+        return MapUpdate(entered, moved, len(order) - moved, restarted, too_large)
+
+    def _moved_most_first(self, now: Array) -> np.ndarray:
+        """Slots of the scans that have moved, by their poses now ``(scans, 3)``."""
+        away = now - self._poses
+        turned = np.abs(np.remainder(away[:, 2] + math.pi, 2.0 * math.pi) - math.pi)
+        moved_m = np.hypot(away[:, 0], away[:, 1]) + turned * self._reach
+        order = np.argsort(-moved_m, kind="stable")
+        return order[: np.count_nonzero(moved_m > self.config.moved_cells * self.config.resolution_m)]
+
+    def cells(self) -> OccupancyMap:
+        """The probabilities of the map's cells."""
+        return self._grid.cells(self.config.occupancy)
+
+    def _begin_anew_for(self, stamps_ns: np.ndarray) -> bool:
+        """Forget the map of another trajectory than this one; returns whether there was one."""
+        first, last = int(stamps_ns[0]), int(stamps_ns[-1])
+        restarted = self._span is not None and (first != self._span[0] or last < self._span[1])
+        if restarted or self._span is None:
+            self._forget()
+            self._waiting = {
+                stamp: (run, scan)
+                for stamp, (run, scan) in self._waiting.items()
+                if run == self._run and stamp >= first
+            }
+        self._span = first, last
+        return restarted
+
+    def _placed(self, stamps_ns: np.ndarray, poses: Array) -> tuple[np.ndarray, list[RangeScan], Array]:
+        """Stamps ``(n,)``, scans and poses ``(n, 3)`` of those that waited, and whose poses are known now."""
+        mine = np.array([stamp for stamp, (run, _) in self._waiting.items() if run == self._map_run], np.int64)
+        mine.sort()
+        at = np.minimum(np.searchsorted(stamps_ns, mine), len(stamps_ns) - 1)
+        found = stamps_ns[at] == mine
+        return mine[found], [self._waiting.pop(stamp)[1] for stamp in mine[found].tolist()], poses[at[found]]
+
+    def _enter(self, stamps: np.ndarray, scans: list[RangeScan], poses: Array) -> None:
+        if not scans:
+            return
+        self._grid.add(scans, poses)
+        self._scans += scans
+        self._stamps = np.concatenate((self._stamps, stamps))
+        self._poses = np.concatenate((self._poses, poses))
+        self._reach = np.concatenate((self._reach, [scan.reach_m for scan in scans]))
+        unit = np.array((self.config.place_m, self.config.place_m, math.radians(self.config.place_deg)))
+        sectors = round(2.0 * math.pi / unit[2])
+        superseded = []
+        for stamp, (x, y, sector) in zip(stamps.tolist(), np.floor(poses / unit).astype(int).tolist(), strict=True):
+            place = self._places[x, y, sector % sectors]
+            place.append(stamp)
+            if len(place) > self.config.most_at_a_place:
+                superseded.append(place.popleft())
+        if superseded:
+            self._remove(np.isin(self._stamps, superseded))
+
+    def _remove(self, gone: np.ndarray) -> None:
+        self._grid.remove([self._scans[slot] for slot in np.flatnonzero(gone)], self._poses[gone])
+        self._scans = [scan for scan, leaves in zip(self._scans, gone, strict=True) if not leaves]
+        self._stamps, self._poses, self._reach = self._stamps[~gone], self._poses[~gone], self._reach[~gone]
+
+    def _move(self, slots: np.ndarray, poses: Array) -> None:
+        scans = [self._scans[slot] for slot in slots]
+        self._grid.add(scans, poses)
+        self._grid.remove(scans, self._poses[slots])
+        self._poses[slots] = poses
+
+
+def warm_up() -> None:
+    """Compile all that a map needs: the first time it takes seconds."""
+    grid = OccupancyGrid(1.0)
+    scan = range_scan(np.zeros(1), np.ones(1), np.zeros(3), 2.0)
+    grid.add([scan], np.zeros((1, 3)))
+    grid.cells(OccupancyConfig())

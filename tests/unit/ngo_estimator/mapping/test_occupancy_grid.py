@@ -1,0 +1,148 @@
+"""Counts of an occupancy grid against answers by hand, and scans taken out again to the last bit."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, OccupancyGrid, OccupancyMap
+from ngo_estimator.mapping.range_scan import RangeScan, range_scan
+
+ORIGIN = np.zeros((1, 3))
+# One scan decides a cell, so that values can be read as words.
+SURE = OccupancyConfig(hit=20.0, passed=5.0)
+
+
+def rays(*angles_and_ranges: tuple[float, float], max_range_m: float = 100.0) -> RangeScan:
+    angles, ranges = np.array(angles_and_ranges, np.float64).reshape(-1, 2).T
+    return range_scan(angles, ranges, np.zeros(3), max_range_m)
+
+
+def drawn(found: OccupancyMap) -> list[str]:
+    """The map as seen from above: # occupied, . free, ? unknown; one that is neither is its percentage."""
+    names = {-1: "?", 0: ".", 1: ".", 100: "#"}
+    return ["".join(names.get(value, str(value)) for value in row) for row in found.values[::-1].tolist()]
+
+
+def random_scans(count: int, seed: int) -> tuple[list[RangeScan], np.ndarray]:
+    rng = np.random.default_rng(seed)
+    angles = np.linspace(-2.0, 2.0, 61)
+    scans = [range_scan(angles, rng.uniform(0.0, 6.0, 61), rng.normal(size=3) * 0.2, 5.0) for _ in range(count)]
+    return scans, np.column_stack((rng.uniform(-8.0, 8.0, (count, 2)), rng.uniform(-4.0, 4.0, count)))
+
+
+def test_a_ray_frees_the_cells_before_its_end() -> None:
+    grid = OccupancyGrid(1.0)
+    grid.add([rays((0.0, 3.0))], np.array([[0.5, 0.5, 0.0]]))
+    found = grid.cells(SURE).cropped()
+    assert drawn(found) == ["...#"]
+    assert found.origin_xy.tolist() == [0.0, 0.0]
+
+
+def test_a_slanted_ray_passes_the_cells_that_it_crosses() -> None:
+    """From (0.5, 0.5) to (2.5, 1.5): the line crosses x = 1 at y = 0.75, y = 1 at x = 1.5, and x = 2 at y = 1.25."""
+    grid = OccupancyGrid(1.0)
+    grid.add([rays((math.atan2(1.0, 2.0), math.hypot(1.0, 2.0)))], np.array([[0.5, 0.5, 0.0]]))
+    assert drawn(grid.cells(SURE).cropped()) == ["?.#", "..?"]
+
+
+def test_cells_are_counted_from_the_origin_of_the_frame() -> None:
+    grid = OccupancyGrid(0.5)
+    grid.add([rays((math.pi, 1.0))], np.array([[-0.25, -0.75, 0.0]]))
+    found = grid.cells(SURE).cropped()
+    assert drawn(found) == ["#.."]
+    assert found.origin_xy.tolist() == [-1.5, -1.0]
+
+
+def test_probabilities_are_sums_of_log_odds() -> None:
+    grid = OccupancyGrid(1.0)
+    scan, pose = rays((0.0, 1.0)), np.array([[0.5, 0.5, 0.0]])
+    for _ in range(2):
+        grid.add([scan], pose)
+    grid.add([rays((0.0, 2.0))], pose)
+    # The second cell: two ends, one passage.
+    odds = math.exp(2 * 0.9 - 0.5)
+    first, second, third = grid.cells(OccupancyConfig(hit=0.9, passed=0.5)).cropped().values[0].tolist()
+    assert second == round(100.0 * odds / (1.0 + odds)) == 79
+    assert third == round(100.0 * math.exp(0.9) / (1.0 + math.exp(0.9))) == 71
+    assert first == round(100.0 / (1.0 + math.exp(3 * 0.5))) == 18
+
+
+def test_a_scan_counts_once_in_a_cell_and_its_ends_win() -> None:
+    grid = OccupancyGrid(1.0)
+    # The two long rays pass the cell in which the short one ends, and both pass the first.
+    grid.add([rays((0.0, 1.0), (0.01, 3.0), (-0.01, 3.0))], np.array([[0.5, 0.5, 0.0]]))
+    values = grid.cells(OccupancyConfig(hit=1.0, passed=1.0)).cropped().values[0].tolist()
+    once = round(100.0 / (1.0 + math.e))
+    assert values == [once, 100 - once, once, 100 - once]
+
+
+def test_a_ray_longer_than_the_largest_range_is_free_up_to_it() -> None:
+    grid = OccupancyGrid(1.0)
+    grid.add([rays((0.0, 9.0), max_range_m=3.0)], np.array([[0.5, 0.5, 0.0]]))
+    assert drawn(grid.cells(SURE).cropped()) == ["..."]
+
+
+def test_ranges_that_say_nothing_are_not_entered() -> None:
+    grid = OccupancyGrid(1.0)
+    grid.add([rays((0.0, math.nan), (0.1, math.inf), (0.2, 0.0), (0.3, -1.0))], ORIGIN)
+    assert grid.cells(SURE).cropped().values.size == 0
+
+
+def test_the_mounting_of_the_sensor_counts() -> None:
+    grid = OccupancyGrid(1.0)
+    scan = range_scan(np.zeros(1), np.array([2.0]), np.array([1.0, 0.0, math.pi / 2]), 100.0)
+    grid.add([scan], np.array([[0.5, 0.5, math.pi / 2]]))
+    assert drawn(grid.cells(SURE).cropped()) == ["#.."], "the sensor is at (0.5, 1.5) and looks to -x"
+    assert grid.cells(SURE).cropped().origin_xy.tolist() == [-2.0, 1.0]
+
+
+def test_what_is_taken_out_leaves_no_trace() -> None:
+    scans, poses = random_scans(40, 1)
+    some, all_of_them = OccupancyGrid(0.05), OccupancyGrid(0.05)
+    some.add(scans[:20], poses[:20])
+    all_of_them.add(scans, poses)
+    all_of_them.remove(scans[20:], poses[20:])
+    for config in (OccupancyConfig(), SURE):
+        before, after = some.cells(config).cropped(), all_of_them.cells(config).cropped()
+        np.testing.assert_array_equal(before.values, after.values)
+        np.testing.assert_array_equal(before.origin_xy, after.origin_xy)
+
+
+def test_neither_the_order_nor_the_growth_of_the_grid_changes_the_counts() -> None:
+    scans, poses = random_scans(30, 2)
+    together, one_by_one = OccupancyGrid(0.05), OccupancyGrid(0.05)
+    together.add(scans, poses)
+    for k in reversed(range(30)):
+        one_by_one.add(scans[k : k + 1], poses[k : k + 1])
+    np.testing.assert_array_equal(together.cells(SURE).values, one_by_one.cells(SURE).values)
+
+
+def test_a_map_too_large_for_memory_is_refused_and_the_rest_stays() -> None:
+    grid = OccupancyGrid(0.05)
+    grid.add([rays((0.0, 3.0))], ORIGIN)
+    before = grid.cells(SURE).values
+    for x in (1e6, math.nan):
+        with pytest.raises(MapTooLarge, match="expected at most 40000000 cells: use a coarser resolution"):
+            grid.add([rays((0.0, 3.0))], np.array([[x, x, 0.0]]))
+    np.testing.assert_array_equal(grid.cells(SURE).values, before)
+
+
+def test_values_become_free_occupied_and_unknown() -> None:
+    found = OccupancyMap(np.array([[-1, 0, 25, 26, 64, 65, 100]], np.int8), 0.05, np.zeros(2))
+    assert found.trinary(0.25, 0.65).values.tolist() == [[-1, 0, 0, -1, -1, 100, 100]]
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda: OccupancyGrid(0.0), "resolution_m is 0.0; expected a positive length"),
+        (lambda: OccupancyConfig(hit=-1.0), "hit, passed are -1.0, 0.5; expected positive log odds"),
+        (lambda: OccupancyConfig(free=0.7), "free, occupied are 0.7, 0.65; expected 0 <= free < occupied <= 1"),
+        (lambda: range_scan(np.zeros(2), np.zeros(3), np.zeros(3), 1.0), r"shapes \(2,\), \(3,\), \(3,\)"),
+        (lambda: range_scan(np.zeros(2), np.zeros(2), np.zeros(3), 0.0), "max_range_m is 0.0; expected"),
+    ],
+)
+def test_wrong_settings_are_named(make: object, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        make()  # type: ignore[operator]

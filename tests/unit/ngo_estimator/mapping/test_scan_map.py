@@ -1,0 +1,174 @@
+"""The map follows a trajectory that is corrected: it equals one that is drawn from scratch at the poses of now."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.mapping.occupancy_grid import OccupancyGrid
+from ngo_estimator.mapping.range_scan import RangeScan, range_scan
+from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
+
+FRAMES = 60
+STEP_NS = 100_000_000
+# Every frame counts, and the slightest motion.
+EVERY = ScanMapConfig(spacing_m=1e-9, most_at_a_place=1000, moved_cells=1e-9)
+
+
+def scan(seed: int) -> RangeScan:
+    rng = np.random.default_rng(seed)
+    return range_scan(np.linspace(-2.0, 2.0, 31), rng.uniform(0.5, 6.0, 31), np.zeros(3), 5.0)
+
+
+SCANS = [scan(seed) for seed in range(FRAMES)]
+
+
+def path(bend: float = 0.0, frames: int = FRAMES) -> np.ndarray:
+    """Poses of a drive that bends to the left by ``bend`` rad a frame."""
+    yaw = bend * np.arange(frames)
+    return np.column_stack((np.cumsum(0.2 * np.cos(yaw)), np.cumsum(0.2 * np.sin(yaw)), yaw))
+
+
+def stamps(frames: int = FRAMES, first: int = 0) -> np.ndarray:
+    return 1_000_000_000 + STEP_NS * np.arange(first, first + frames)
+
+
+def take(scan_map: ScanMap, frames: range, odometry: np.ndarray | None = None, origin_ns: int = 1) -> None:
+    odometry = path() if odometry is None else odometry
+    for frame in frames:
+        stamp = int(stamps()[frame])
+        step = RelativeStep(
+            stamp, stamp - STEP_NS, np.zeros(3), np.eye(3), origin_ns, odometry[frame], np.zeros(0), np.zeros(0)
+        )
+        scan_map.take(step, [(stamp, SCANS[frame])])
+
+
+def from_scratch(frames: list[int], poses: np.ndarray, config: ScanMapConfig = EVERY) -> np.ndarray:
+    grid = OccupancyGrid(config.resolution_m)
+    grid.add([SCANS[frame] for frame in frames], poses[frames])
+    return grid.cells(config.occupancy).cropped().values
+
+
+def test_the_map_equals_one_from_scratch_after_every_correction() -> None:
+    scan_map = ScanMap(EVERY)
+    for frames, bend in ((20, 0.0), (40, 0.01), (60, -0.02), (60, 0.003)):
+        take(scan_map, range(len(scan_map) + scan_map.waiting, frames))
+        update = scan_map.update(stamps(frames), path(bend, frames))
+        assert (len(scan_map), update.left, update.restarted) == (frames, 0, False)
+        np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(frames)), path(bend)))
+
+
+def test_without_time_the_rest_is_left_and_the_next_updates_do_it() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(), path())
+    late = scan_map.update(stamps(), path(0.01), budget_s=0.0)
+    assert (late.moved, late.left, late.changed) == (0, FRAMES - 1, False), "the first frame is where it was"
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(FRAMES)), path()))
+    assert scan_map.update(stamps(), path(0.01)).left == 0
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(FRAMES)), path(0.01)))
+
+
+def test_scans_that_moved_most_go_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ngo_estimator.mapping.scan_map._RAYS_AT_ONCE", 31 * 10)
+    times = iter([0.0, 0.0, 1.0])  # the deadline, and one look at the clock before each ten scans
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(), path())
+    monkeypatch.setattr("time.monotonic", lambda: next(times))
+    update = scan_map.update(stamps(), path(0.01), budget_s=0.5)
+    monkeypatch.undo()
+    assert 0 < update.moved < 12
+    mixed = np.concatenate((path()[: FRAMES - update.moved], path(0.01)[FRAMES - update.moved :]))
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(FRAMES)), mixed))
+
+
+def test_small_motions_leave_the_map_alone() -> None:
+    config = replace(EVERY, moved_cells=0.25)
+    scan_map = ScanMap(config)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(), path())
+    reach = max(scan.reach_m for scan in SCANS)
+    nearly = path() + np.array([0.0, 0.4 * 0.25 * 0.05, 0.4 * 0.25 * 0.05 / reach])
+    assert not scan_map.update(stamps(), nearly).changed
+    assert scan_map.update(stamps(), path() + np.array([0.0, 0.26 * 0.05, 0.0])).moved == FRAMES
+    turned = path() + np.array([0.0, 0.26 * 0.05, 2.0 * math.pi])
+    assert not scan_map.update(stamps(), turned).changed, "a whole turn is none"
+
+
+def test_a_robot_that_stands_adds_nothing() -> None:
+    scan_map = ScanMap()
+    take(scan_map, range(FRAMES), np.zeros((FRAMES, 3)))
+    assert scan_map.update(stamps(), np.zeros((FRAMES, 3))).entered == 1
+
+
+def test_turning_on_the_spot_adds_scans() -> None:
+    turning = np.column_stack((np.zeros((FRAMES, 2)), np.radians(2.0) * np.arange(FRAMES)))
+    scan_map = ScanMap()
+    take(scan_map, range(FRAMES), turning)
+    assert scan_map.update(stamps(), turning).entered == FRAMES // 3, "every 6 degrees, the first from 5 on"
+
+
+def test_a_place_keeps_its_newest_scans() -> None:
+    config = replace(EVERY, most_at_a_place=8)
+    scan_map = ScanMap(config)
+    there = np.column_stack((0.01 + 1e-3 * np.arange(FRAMES), np.full((FRAMES, 2), 0.01)))
+    for first in range(0, FRAMES, 20):
+        take(scan_map, range(first, first + 20), there)
+        scan_map.update(stamps(first + 20), there[: first + 20])
+        newest = list(range(first + 12, first + 20))
+        assert len(scan_map) == 8
+        np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(newest, there))
+
+
+def test_a_scan_waits_for_its_pose() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(30))
+    assert scan_map.update(stamps(10), path()[:10]).entered == 10
+    assert scan_map.waiting == 20
+    assert scan_map.update(stamps(30), path()[:30]).entered == 20
+
+
+def test_scans_that_no_trajectory_has_are_given_up() -> None:
+    scan_map = ScanMap(replace(EVERY, most_waiting=10))
+    take(scan_map, range(15))
+    assert (scan_map.waiting, scan_map.lost) == (10, 5)
+
+
+@pytest.mark.parametrize("origin_ns", [1, 2], ids=["same origin", "new origin"])
+def test_a_source_that_starts_anew_begins_a_new_map(origin_ns: int) -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(), path())
+    # The same stamps again, and an old trajectory comes once more before the new one does.
+    take(scan_map, range(15), origin_ns=origin_ns)
+    assert not scan_map.update(stamps(), path()).changed
+    update = scan_map.update(stamps(10), path(0.02)[:10])
+    assert (update.restarted, update.entered, scan_map.waiting) == (True, 10, 5)
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(10)), path(0.02)))
+
+
+def test_a_trajectory_that_begins_later_begins_a_new_map() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(40), path()[:40])
+    update = scan_map.update(stamps(10, first=50), path(0.02)[:10])
+    assert (update.restarted, update.entered, len(scan_map), scan_map.waiting) == (True, 10, 10, 0)
+
+
+def test_a_scan_far_outside_is_left_out_and_the_others_move() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(), path())
+    poses = path(0.01)
+    poses[30, :2] = 1e7
+    update = scan_map.update(stamps(), poses)
+    assert "use a coarser resolution" in update.too_large
+    assert update.left >= 1
+
+
+def test_wrong_settings_are_named() -> None:
+    with pytest.raises(ValueError, match="most_at_a_place, most_waiting are"):
+        ScanMapConfig(most_at_a_place=0)
