@@ -107,7 +107,7 @@ def inspect(recording: Recording, topics: RecordingTopics) -> Report:
     count = max(1, recording.topics[topics.image].count)
     wanted = {round(index) for index in np.linspace(0, count - 1, SAMPLES)}
     stamps, poses, residuals, samples, have, image = [], [], [], [], Counter[str](), ""
-    for index, frame in enumerate(tqdm(frames(recording, topics, skipped), "frames", count, leave=False)):
+    for index, frame in enumerate(tqdm(frames(recording, topics, skipped), "frames", count, leave=False, disable=None)):
         stamps.append(frame.stamp_ns)
         poses.append(np.full(3, np.nan) if frame.pose_xyyaw is None else frame.pose_xyyaw)
         residuals.append(np.full(3, np.nan) if frame.pose_residual is None else frame.pose_residual)
@@ -174,7 +174,7 @@ def topic_times(recording: Recording, names: list[str]) -> dict[str, TopicTimes]
     stamps: dict[str, list[int]] = {name: [] for name in names}
     frame_ids: dict[str, set[str]] = {name: set() for name in names}
     total = sum(recording.topics[name].count for name in names)
-    for message in tqdm(recording.messages(names), "times", total, leave=False):
+    for message in tqdm(recording.messages(names), "times", total, leave=False, disable=None):
         logs[message.topic].append(message.log_time_ns)
         stamp_ns, ids = _stamp(message)
         frame_ids[message.topic] |= ids

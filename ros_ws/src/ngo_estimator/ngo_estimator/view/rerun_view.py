@@ -131,7 +131,7 @@ def _raised(xy: np.ndarray, height_m: float) -> np.ndarray:
 
 
 def _blueprint(window: Window | None) -> rrb.Blueprint:
-    eye, whole = None, rr.TimeRangeBoundary.infinite()
+    eye = None
     if window is not None:
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
@@ -144,11 +144,7 @@ def _blueprint(window: Window | None) -> rrb.Blueprint:
             rrb.Spatial3DView(name="Map", origin="map", line_grid=False, background=[255, 255, 255], eye_controls=eye),
             rrb.Vertical(
                 rrb.Spatial2DView(name="Picture", origin="picture"),
-                rrb.TimeSeriesView(
-                    name="Position RMSE (m)",
-                    origin="errors",
-                    axis_x=rrb.TimeAxis(view_range=rr.TimeRange(whole, whole)),
-                ),
+                rrb.TimeSeriesView(name="Position RMSE (m)", origin="errors"),
                 rrb.TextDocumentView(name="State", origin="state"),
             ),
             column_shares=[2, 1],

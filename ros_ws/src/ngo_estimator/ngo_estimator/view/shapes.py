@@ -11,7 +11,7 @@ from ngo_recordings.scan_stream import LidarScan
 _ELLIPSE_POINTS = 48
 _SIGMAS = 2.0
 _ROWS_OF_A_LINE = 40
-_MARGIN = 1.15
+_MARGIN = 1.3
 
 
 def ellipse(pose_xyyaw: np.ndarray, covariance: np.ndarray) -> np.ndarray:
