@@ -11,6 +11,7 @@ import pytest
 
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.trajectory.files import read_tum
+from tests.unit.ngo_estimator.mapping.test_map_files import read_by_nav2
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 pytestmark = pytest.mark.processes
@@ -47,7 +48,7 @@ def test_a_carmen_log_without_named_weights(tmp_path: Path) -> None:
         done = run_recording(tmp_path / "drive.clf.gz", "--out", tmp_path / name)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "Traceback" not in done.stderr and "wheel" in done.stdout
-        outputs.append((tmp_path / name / "corrected.tum").read_bytes())
+        outputs.append([(tmp_path / name / file).read_bytes() for file in ("corrected.tum", "map.pgm", "map.yaml")])
     assert outputs[0] == outputs[1]
     said = json.loads((tmp_path / "first" / "run.json").read_text())
     assert said["weights"] == "scan" and said["frames"] == 80 and said["faults"] == 0 and not said["not_used"]
@@ -55,6 +56,9 @@ def test_a_carmen_log_without_named_weights(tmp_path: Path) -> None:
     moved = np.array([between(true[0], pose) for pose in true])
     assert len(path.positions_xyz) == 80
     assert np.abs(path.positions_xyz[:, :2] - moved[:, :2]).max() < 0.05  # the wheels are 0.1 m off
+    cells, facts = read_by_nav2(tmp_path / "first" / "map.yaml")
+    room = (cells == 0).sum() * facts["resolution"] ** 2
+    assert 20.0 < room < 36.0, "the room has 36 m2, and no wall is seen through"
     picture = (tmp_path / "first" / "plot.png").read_bytes()
     width, height = (int.from_bytes(picture[at : at + 4], "big") for at in (16, 20))
     assert picture.startswith(b"\x89PNG") and width > 2.2 * height  # a panel each: odometry, corrected, walls

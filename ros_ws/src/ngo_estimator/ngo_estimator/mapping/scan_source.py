@@ -79,15 +79,15 @@ class CodeRanges:
         return range_scan(self.angles, ranges, np.zeros(3), self.max_range_m)
 
 
-def scan_source(weights: Path, world: str | None = None, max_range_m: float = 0.0) -> ScanSource:
-    """The source of scans for the relative poses of a folder of weights.
+def scan_source(weights: Path, world: str | None = None, max_range_m: float = 0.0) -> ScanSource | None:
+    """The source of scans for the relative poses of a folder of weights; None where these hold no ranges.
 
     Args:
-        weights: a lidar's settings, or networks whose place codes hold ranges.
+        weights: a lidar's settings, or networks; the place codes of most hold ranges.
         max_range_m: rays count up to it; 0: as far as the sensor is sure.
 
     Raises:
-        ValueError: of one line, about weights that cannot be read or have no ranges.
+        ValueError: of one line, about weights that cannot be read.
     """
     if is_lidar(weights):
         return KeyScans(max_range_m)
@@ -99,5 +99,5 @@ def scan_source(weights: Path, world: str | None = None, max_range_m: float = 0.
     description = load_description(weights / f"{PLACE}.safetensors", PLACE, world)
     config = config_from_dict(PlaceConfig, description.get("config"))
     if config.registration is None:
-        raise ValueError(f"{weights}: its place codes hold no ranges; a map needs a lidar, or weights that see ranges")
+        return None
     return CodeRanges.of(config.code_size, config.registration, max_range_m)

@@ -17,7 +17,7 @@ from ngo_common.nodes.qos import checked_overrides
 from ngo_common.settings import usage
 from ngo_estimator.mapping.map_files import FREE, OCCUPIED, write_map
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig, warm_up
-from ngo_estimator.mapping.scan_source import scan_source
+from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.map_publisher import MapPublisher
 from ngo_estimator.nodes.messages import relative_step
@@ -38,10 +38,7 @@ class NgoMap(Node):
         super().__init__(NAME)
         self._live = LiveSettings(self, MapNodeSettings)
         self._settings = settings = self._live.values
-        try:
-            self._source = scan_source(weights_folder(settings), settings.world, settings.max_range)
-        except ValueError as error:
-            raise StartError(str(error)) from error
+        self._source = self._open_source(settings)
         warm_up()
         self._map = ScanMap(ScanMapConfig(resolution_m=settings.resolution))
         self._trajectory: Trajectory | None = None
@@ -56,6 +53,18 @@ class NgoMap(Node):
         self._live.on_change(self._on_settings)
         self._live.lock()
         self.get_logger().info(f"ready: {self.get_fully_qualified_name()}, {settings.world}")
+
+    def _open_source(self, settings: MapNodeSettings) -> ScanSource:
+        folder = weights_folder(settings)
+        try:
+            source = scan_source(folder, settings.world, settings.max_range)
+        except ValueError as error:
+            raise StartError(str(error)) from error
+        if source is None:
+            raise StartError(
+                f"{folder}: its place codes hold no ranges; a map needs a lidar, or networks that see ranges"
+            )
+        return source
 
     def _create_topics(self, settings: MapNodeSettings) -> None:
         self._status = NodeStatus(

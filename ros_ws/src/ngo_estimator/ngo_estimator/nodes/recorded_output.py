@@ -9,9 +9,13 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.mapping.map_files import write_map
+from ngo_estimator.mapping.scan_map import ScanMap
+from ngo_estimator.mapping.scan_source import ScanSource
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.online.corrected_trajectory import Trajectory
 from ngo_estimator.trajectory.errors import aligned, associate
 from ngo_estimator.trajectory.files import SpatialPoses, write_trajectory
 from ngo_estimator.trajectory.plot import save_plot
@@ -29,6 +33,8 @@ _FILES = (
     "corrected.tum",
     "truth.tum",
     "trajectories.mcap",
+    "map.pgm",
+    "map.yaml",
     "plot.png",
     "metrics.json",
     "run.json",
@@ -53,15 +59,20 @@ class RecordedOutput:
 
     ``trajectories.mcap`` grows with every step; the other files are written when the trajectory is whole:
     ``odometry.tum``, ``online.tum`` (each pose as it was when its frame was the newest), ``corrected.tum``,
-    ``plot.png`` and, where the truth is known, ``truth.tum`` and ``metrics.json``. All stamps are those of the frames,
-    so that the same recording gives the same bytes.
+    ``plot.png``, with a ``source`` of ranges ``map.pgm`` and ``map.yaml``, and, where the truth is known, ``truth.tum``
+    and ``metrics.json``. All stamps are those of the frames, so that the same recording gives the same bytes.
     """
 
-    def __init__(self, folder: Path, base_frame: str, odom_frame: str, map_frame: str) -> None:
+    def __init__(
+        self, folder: Path, base_frame: str, odom_frame: str, map_frame: str, source: ScanSource | None = None
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._frames = {"base": base_frame, "odom": odom_frame, "map": map_frame}
         self._covariance = np.zeros((3, 3))
+        self._source, self._map = source, ScanMap()
+        self.left_out = ""
+        """Why scans are not in the map, where any were left out."""
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = RecordingWriter(folder / "trajectories.mcap", flush_s=None, library="ngo_estimator")
         for topic, type_name in _TYPES.items():
@@ -87,6 +98,17 @@ class RecordedOutput:
         transforms.transforms = [*transforms.transforms, *below.transforms]
         for topic, message in ((ODOMETRY, odometry), (POSE, pose), (TF, transforms)):
             self._writer.write(topic, self._serialise(message, _TYPES[topic]), stamp_ns)
+        if self._source is not None:
+            self._map.take(local, self._source.scans(local))
+
+    @property
+    def waiting(self) -> int:
+        """Scans that wait for the map to follow."""
+        return self._map.waiting
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Let the map follow the trajectory as it is now."""
+        self.left_out = self._map.update(trajectory.stamps_ns, trajectory.poses_xyyaw).too_large or self.left_out
 
     def finish(self, run: RecordedRun, title: str, settings: ReportSettings) -> dict[str, Report]:
         """Write everything about the whole trajectory; returns the errors of each estimate, none without truth.
@@ -112,6 +134,9 @@ class RecordedOutput:
             self._write_path(PATHS["truth"], self._frames["map"], truth.stamps_ns, in_map)
         shown = {name: estimates[name] for name in ("odometry", "corrected")}
         save_plot(self.folder / "plot.png", title, shown, in_map, run.walls)
+        self.follow(trajectory)
+        if len(self._map):
+            write_map(self.folder / "map", self._map.cells())
         if truth is None:
             return {}
         reports = {

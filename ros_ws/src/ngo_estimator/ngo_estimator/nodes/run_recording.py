@@ -6,8 +6,8 @@
 
 RECORDINGS are .mcap files, rosbag2 folders, ROS 1 bags or CARMEN logs, several as one. Laser scans need no --world. OUT
 gets odometry.tum, online.tum (each corrected pose as it was when its frame was the newest), corrected.tum,
-trajectories.mcap (odometry, poses, transforms and paths), plot.png and run.json; where the recording holds the truth,
-also truth.tum and metrics.json. The same recording gives the same bytes.
+trajectories.mcap (odometry, poses, transforms and paths), map.pgm and map.yaml (for Nav2), plot.png and run.json; where
+the recording holds the truth, also truth.tum and metrics.json. The same recording gives the same bytes.
 """
 
 import json
@@ -27,6 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ngo_estimator.data.lidar_file import is_lidar
+from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
 from ngo_recordings.images import SCAN_TYPE
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 NAME = "run_recording"
 LIDAR_WORLD = "scan"
+_SCANS_AT_ONCE = 500
+"""Scans that wait for the map: it follows in between, so that memory does not grow with the recording."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         else:
             world, topics, core, events = _networks(arguments, folder, recording, console)
         began_s = time.monotonic()
-        trajectories = _run(arguments, settings, recording, topics, core, events, console)
+        trajectories = _run(arguments, settings, recording, topics, core, events, scan_source(folder), console)
     took_s = time.monotonic() - began_s
     if not trajectories:
         why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
@@ -159,6 +162,7 @@ def _run(
     topics: RecordingTopics,
     core: "RecordingRun | LidarRun",
     events: "Iterator[RecordedStep | RecordedRun]",
+    source: ScanSource | None,
     console: Console,
 ) -> list[dict[str, Any]]:
     """Run over all frames; for each trajectory the folder of its results and how many poses it has."""
@@ -177,9 +181,11 @@ def _run(
             if output is None:
                 folder = arguments.out if not found else arguments.out / f"{PART}{len(found) + 1}"
                 names = arguments.base_frame, arguments.odom_frame, arguments.map_frame
-                output = stack.enter_context(RecordedOutput(folder, *names))
+                output = stack.enter_context(RecordedOutput(folder, *names, source))
             if isinstance(event, RecordedStep):
                 output.add(event)
+                if output.waiting >= _SCANS_AT_ONCE and (trajectory := core.trajectory()) is not None:
+                    output.follow(trajectory)
                 progress.update(task, completed=core.frames)
                 continue
             found.append(
@@ -194,6 +200,8 @@ def _run(
             except ValueError as error:
                 console.print(f"no errors were measured: {error}", soft_wrap=True, highlight=False)
                 reports = {}
+            if output.left_out:
+                console.print(f"scans are not in the map: {output.left_out}", soft_wrap=True, highlight=False)
             stack.pop_all().close()
             if reports:
                 console.print(report_table(title, reports, ("first", "best")))

@@ -8,6 +8,7 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, Truth
+from ngo_estimator.online.corrected_trajectory import Trajectory
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.scan_stream import LidarScan, WheelPose
@@ -41,6 +42,10 @@ class LidarRun:
         """Scans that did not say where they were taken."""
         self.faults: list[str] = []
         """What failed inside, in words; the trajectory went on by odometry there."""
+
+    def trajectory(self) -> Trajectory | None:
+        """The trajectory as it is now."""
+        return self._online.trajectory()
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -74,6 +74,10 @@ class RecordingRun:
         self.gaps = 0
         """Steps that span more than the usual time between two frames."""
 
+    def trajectory(self) -> Trajectory | None:
+        """The trajectory as it is now."""
+        return self._online.trajectory()
+
     @property
     def facts(self) -> dict[str, Any]:
         """What else is worth keeping of the run."""
