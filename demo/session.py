@@ -42,6 +42,11 @@ class SessionConfig:
     weights: Path | None = None
     views: int = 0
 
+    @property
+    def has_map(self) -> bool:
+        """Whether a map is drawn: the shipped networks see ranges, others may not."""
+        return self.weights is None
+
     def estimators(self) -> list[NodeSpec]:
         """The two estimator nodes and the map; the image comes reliably, because a demo must not depend on luck."""
         weights = {} if self.weights is None else {"weights": str(self.weights.resolve())}
@@ -55,7 +60,7 @@ class SessionConfig:
             # A path after every frame, for the latency.
             NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
             NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
-            NodeSpec("ngo_estimator", "ngo_map", {"world": self.world, **weights}),
+            *([NodeSpec("ngo_estimator", "ngo_map", {"world": self.world})] if self.has_map else []),
         ]
 
     def simulator(self) -> NodeSpec:
@@ -106,8 +111,8 @@ class Session:
                 lambda: (
                     recorder.has_publisher("ngo/path")
                     and recorder.has_publisher("odom")
-                    and recorder.has_publisher("map")
-                    and recorder.has_subscriber("relative_pose", 2)
+                    and (recorder.has_publisher("map") or not config.has_map)
+                    and recorder.has_subscriber("relative_pose", 1 + config.has_map)
                     and recorder.has_subscriber("image", 1 + config.views)
                 ),
                 "the estimators to come up",
