@@ -12,21 +12,26 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.transforms import Affine2D
 
 from demo.trajectories import Poses, Trajectories
+from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 from ngo_sim.mazes import Maze, draw_maze
 
 TRUTH, ODOMETRY, CORRECTED = "#1f6fd6", "#2ca02c", "#ff7f0e"
 
 
-def save_picture(path: Path, maze: Maze, trajectories: Trajectories, result: dict[str, Any]) -> None:
-    """Write a PNG: odometry beside the corrected path, each over the truth and the maze."""
+def save_picture(
+    path: Path, maze: Maze, trajectories: Trajectories, result: dict[str, Any], found: OccupancyMap | None = None
+) -> None:
+    """Write a PNG: odometry, corrected path and map side by side, the paths over the truth and the maze."""
     shown = (("odometry", trajectories.odometry, ODOMETRY), ("corrected", trajectories.corrected, CORRECTED))
     low, high = _view(maze, [trajectories.in_maze(poses) for _, poses, _ in shown])
     width = 6.2
     height = width * float(np.clip((high - low)[1] / (high - low)[0], 0.4, 2.0))
-    figure, panels = plt.subplots(1, 2, figsize=(2 * width, height + 1.7), sharex=True, sharey=True)
-    for axes, (name, estimate, color) in zip(panels, shown, strict=True):
+    count = 2 if found is None else 3
+    figure, panels = plt.subplots(1, count, figsize=(count * width, height + 1.7), sharex=True, sharey=True)
+    for axes, (name, estimate, color) in zip(panels, shown, strict=False):
         draw_maze(axes, maze)
         placed = trajectories.in_maze(estimate)
         _line(axes, trajectories.truth, TRUTH, "truth", 1.6)
@@ -42,6 +47,8 @@ def save_picture(path: Path, maze: Maze, trajectories: Trajectories, result: dic
         )
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.55 / height), ncols=5, frameon=False, fontsize=8)
+    if found is not None:
+        _draw_map(panels[2], found, trajectories)
     panels[1].set_ylabel("")
     total = height + 1.7
     figure.subplots_adjust(left=0.05, right=0.99, wspace=0.06, bottom=0.85 / total, top=1 - 0.85 / total)
@@ -50,6 +57,21 @@ def save_picture(path: Path, maze: Maze, trajectories: Trajectories, result: dic
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def _draw_map(axes: Axes, found: OccupancyMap, trajectories: Trajectories) -> None:
+    """The map, turned into the maze's frame."""
+    rows, columns = found.values.shape
+    (left, bottom), side = found.origin_xy, found.resolution_m
+    x, y, yaw = trajectories.truth[0]
+    in_maze = Affine2D().rotate(yaw).translate(x, y) + axes.transData
+    grey = np.select([found.values == 0, found.values == 100], [255, 0], 190)
+    extent = (left, left + columns * side, bottom, bottom + rows * side)
+    image = axes.imshow(grey, "gray", origin="lower", vmin=0, vmax=255, extent=extent, interpolation="nearest")
+    image.set_transform(in_maze)
+    axes.set_facecolor(str(190 / 255))
+    axes.set(aspect="equal", xlabel="x [m]")
+    axes.set_title(f"map at corrected poses, cells of {side:g} m", fontsize=10)
 
 
 def _mark(axes: Axes, pose: Poses, marker: str, color: str, label: str) -> None:

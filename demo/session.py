@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Pose
+from nav2_msgs.srv import SaveMap
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.serialization import deserialize_message
@@ -18,14 +19,23 @@ from demo.graph import Graph, GraphError, NodeSpec
 from demo.picture import save_picture
 from demo.recording import ALL_TOPICS, StampTimes
 from demo.trajectories import Poses, evaluate, match
+from ngo_estimator.mapping.map_files import read_map
+from ngo_estimator.mapping.scan_source import scan_source
 from ngo_estimator.trajectory.files import write_tum
 from ngo_sim.flow_control import header_stamp_ns
 from ngo_sim.mazes import Maze
+from training.common.runs import WEIGHTS
 from training.recordings.recorder import Recorder
 
 START_TIMEOUT_S = 90.0
 SILENCE_TIMEOUT_S = 60.0
 """How long nothing at all may come through before a run counts as stuck."""
+
+MAP_INTERVAL_S = 2.0
+"""Whole maps are recorded: a few are enough."""
+
+MAP = "map"
+"""Name of the map's files."""
 
 Show = Callable[[str, int], None]
 """Called with what is going on and how many frames are through."""
@@ -43,12 +53,16 @@ class SessionConfig:
     views: int = 0
 
     @property
-    def has_map(self) -> bool:
-        """Whether a map is drawn: the shipped networks see ranges, others may not."""
-        return self.weights is None
+    def draws_map(self) -> bool:
+        """Whether the weights see ranges, which a map needs."""
+        weights = self.weights or WEIGHTS / self.world
+        try:
+            return scan_source(weights) is not None
+        except ValueError:
+            return False  # a node says what is wrong with them
 
     def estimators(self) -> list[NodeSpec]:
-        """The two estimator nodes and the map; the image comes reliably, because a demo must not depend on luck."""
+        """The estimator nodes; the image comes reliably, because a demo must not depend on luck."""
         weights = {} if self.weights is None else {"weights": str(self.weights.resolve())}
         window = {"window_frames": max(2000, self.frames), "relative_pose_depth": max(2000, self.frames)}
         local = {
@@ -56,11 +70,13 @@ class SessionConfig:
             "image_depth": 100,
             "relative_pose_depth": window["relative_pose_depth"],
         }
+        depth = {"relative_pose_depth": window["relative_pose_depth"]}
+        mapper = {"world": self.world, "map_update_interval": MAP_INTERVAL_S, **depth, **weights}
         return [
             # A path after every frame, for the latency.
             NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
             NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
-            *([NodeSpec("ngo_estimator", "ngo_map", {"world": self.world})] if self.has_map else []),
+            *([NodeSpec("ngo_estimator", "ngo_map", mapper)] if self.draws_map else []),
         ]
 
     def simulator(self) -> NodeSpec:
@@ -92,7 +108,7 @@ class Session:
         self._image_times, self._path_times = StampTimes(), StampTimes()
 
     def run(self, show: Show, with_latency: bool = False) -> dict[str, Any]:
-        """Run, write recording.mcap, picture.png, the trajectories and the logs, and return the result."""
+        """Run, write recording.mcap, picture.png, the map, the trajectories and the logs, and return the result."""
         config = self._config
         with (
             Graph(self._out / "logs", self._domain_id) as graph,
@@ -105,15 +121,15 @@ class Session:
             show("loading the networks", 0)
             for spec in config.estimators():
                 graph.start(spec)
-            # The recorder subscribes relative_pose and image, too: the estimators are up when there is one more of
-            # each.
+            draws_map = config.draws_map
+            # The recorder subscribes relative_pose and image, too: the estimators are up when there are more of each.
             graph.wait_for(
                 lambda: (
                     recorder.has_publisher("ngo/path")
                     and recorder.has_publisher("odom")
-                    and (recorder.has_publisher("map") or not config.has_map)
-                    and recorder.has_subscriber("relative_pose", 1 + config.has_map)
-                    and recorder.has_subscriber("image", 1 + config.views)
+                    and recorder.has_subscriber("relative_pose", besides=2 if draws_map else 1)
+                    and (recorder.has_subscriber("ngo/trajectory", besides=1 + config.views) or not draws_map)
+                    and recorder.has_subscriber("image", besides=1 + config.views)
                 ),
                 "the estimators to come up",
                 START_TIMEOUT_S,
@@ -123,6 +139,8 @@ class Session:
             graph.start(config.simulator())
             graph.wait_for(lambda: bool(self._truth), "the first frame", START_TIMEOUT_S, recorder.spin_once)
             self._record(graph, recorder, show)
+            if draws_map:
+                self._save_map(graph, recorder)
             graph.stop()
         return self._evaluate(with_latency)
 
@@ -144,6 +162,14 @@ class Session:
                 )
             show("driving", len(self._path_times.received_ns) + 1)
 
+    def _save_map(self, graph: Graph, recorder: Recorder) -> None:
+        client = recorder.node.create_client(SaveMap, "ngo_map/save_map")
+        graph.wait_for(client.service_is_ready, "ngo_map", START_TIMEOUT_S, recorder.spin_once)
+        future = client.call_async(SaveMap.Request(map_url=str((self._out / MAP).absolute())))
+        graph.wait_for(future.done, "the map", SILENCE_TIMEOUT_S, recorder.spin_once)
+        if not future.result().result:
+            raise GraphError(f"the map was not saved; ngo_map wrote last:\n{graph.tail('ngo_map')}")
+
     def _evaluate(self, with_latency: bool) -> dict[str, Any]:
         message = deserialize_message(self._path, PathMessage)
         corrected = {_stamp_ns(pose.header.stamp): _xyyaw(pose.pose) for pose in message.poses}
@@ -156,7 +182,9 @@ class Session:
             result["latency_ms"] = self._latency_ms()
         for name in ("truth", "odometry", "corrected"):
             write_tum(self._out / f"{name}.tum", trajectories.stamps_ns, getattr(trajectories, name))
-        save_picture(self._out / "picture.png", maze_of(self._config.world, self._config.seed), trajectories, result)
+        maze = maze_of(self._config.world, self._config.seed)
+        found = read_map(self._out / f"{MAP}.yaml") if self._config.draws_map else None
+        save_picture(self._out / "picture.png", maze, trajectories, result, found)
         if (lost := trajectories.frames_published - len(trajectories.stamps_ns)) > 0:
             print(f"{lost} of {trajectories.frames_published} frames did not get into the corrected path")
         return result

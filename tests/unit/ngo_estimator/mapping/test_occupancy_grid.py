@@ -33,30 +33,30 @@ def random_scans(count: int, seed: int) -> tuple[list[RangeScan], np.ndarray]:
 
 def test_a_ray_frees_the_cells_before_its_end() -> None:
     grid = OccupancyGrid(1.0)
-    grid.add([rays((0.0, 3.0))], np.array([[0.5, 0.5, 0.0]]))
+    grid.add([rays((0.0, 3.0))], ORIGIN)
     found = grid.cells(SURE).cropped()
     assert drawn(found) == ["...#"]
-    assert found.origin_xy.tolist() == [0.0, 0.0]
+    assert found.origin_xy.tolist() == [-0.5, -0.5], "the frame's origin is the middle of a cell"
 
 
 def test_a_slanted_ray_passes_the_cells_that_it_crosses() -> None:
-    """From (0.5, 0.5) to (2.5, 1.5): the line crosses x = 1 at y = 0.75, y = 1 at x = 1.5, and x = 2 at y = 1.25."""
+    """From (0, 0) to (2, 1): the line crosses x = 0.5 at y = 0.25, y = 0.5 at x = 1, and x = 1.5 at y = 0.75."""
     grid = OccupancyGrid(1.0)
-    grid.add([rays((math.atan2(1.0, 2.0), math.hypot(1.0, 2.0)))], np.array([[0.5, 0.5, 0.0]]))
+    grid.add([rays((math.atan2(1.0, 2.0), math.hypot(1.0, 2.0)))], ORIGIN)
     assert drawn(grid.cells(SURE).cropped()) == ["?.#", "..?"]
 
 
 def test_cells_are_counted_from_the_origin_of_the_frame() -> None:
     grid = OccupancyGrid(0.5)
-    grid.add([rays((math.pi, 1.0))], np.array([[-0.25, -0.75, 0.0]]))
+    grid.add([rays((math.pi, 1.0))], np.array([[0.0, -0.5, 0.0]]))
     found = grid.cells(SURE).cropped()
     assert drawn(found) == ["#.."]
-    assert found.origin_xy.tolist() == [-1.5, -1.0]
+    assert found.origin_xy.tolist() == [-1.25, -0.75]
 
 
 def test_probabilities_are_sums_of_log_odds() -> None:
     grid = OccupancyGrid(1.0)
-    scan, pose = rays((0.0, 1.0)), np.array([[0.5, 0.5, 0.0]])
+    scan, pose = rays((0.0, 1.0)), ORIGIN
     for _ in range(2):
         grid.add([scan], pose)
     grid.add([rays((0.0, 2.0))], pose)
@@ -71,7 +71,7 @@ def test_probabilities_are_sums_of_log_odds() -> None:
 def test_a_scan_counts_once_in_a_cell_and_its_ends_win() -> None:
     grid = OccupancyGrid(1.0)
     # The two long rays pass the cell in which the short one ends, and both pass the first.
-    grid.add([rays((0.0, 1.0), (0.01, 3.0), (-0.01, 3.0))], np.array([[0.5, 0.5, 0.0]]))
+    grid.add([rays((0.0, 1.0), (0.01, 3.0), (-0.01, 3.0))], ORIGIN)
     values = grid.cells(OccupancyConfig(hit=1.0, passed=1.0)).cropped().values[0].tolist()
     once = round(100.0 / (1.0 + math.e))
     assert values == [once, 100 - once, once, 100 - once]
@@ -79,7 +79,7 @@ def test_a_scan_counts_once_in_a_cell_and_its_ends_win() -> None:
 
 def test_a_ray_longer_than_the_largest_range_is_free_up_to_it() -> None:
     grid = OccupancyGrid(1.0)
-    grid.add([rays((0.0, 9.0), max_range_m=3.0)], np.array([[0.5, 0.5, 0.0]]))
+    grid.add([rays((0.0, 9.0), max_range_m=3.0)], ORIGIN)
     assert drawn(grid.cells(SURE).cropped()) == ["..."]
 
 
@@ -92,9 +92,9 @@ def test_ranges_that_say_nothing_are_not_entered() -> None:
 def test_the_mounting_of_the_sensor_counts() -> None:
     grid = OccupancyGrid(1.0)
     scan = range_scan(np.zeros(1), np.array([2.0]), np.array([1.0, 0.0, math.pi / 2]), 100.0)
-    grid.add([scan], np.array([[0.5, 0.5, math.pi / 2]]))
-    assert drawn(grid.cells(SURE).cropped()) == ["#.."], "the sensor is at (0.5, 1.5) and looks to -x"
-    assert grid.cells(SURE).cropped().origin_xy.tolist() == [-2.0, 1.0]
+    grid.add([scan], np.array([[0.0, 0.0, math.pi / 2]]))
+    assert drawn(grid.cells(SURE).cropped()) == ["#.."], "the sensor is at (0, 1) and looks to -x"
+    assert grid.cells(SURE).cropped().origin_xy.tolist() == [-2.5, 0.5]
 
 
 def test_what_is_taken_out_leaves_no_trace() -> None:
@@ -128,6 +128,18 @@ def test_a_map_too_large_for_memory_is_refused_and_the_rest_stays() -> None:
     np.testing.assert_array_equal(grid.cells(SURE).values, before)
 
 
+def test_walls_of_a_corridor_fill_a_row_of_cells_each() -> None:
+    """A robot drives along the middle of a corridor of 1 m: both walls are 10 cells away, to the rounding of floats."""
+    angles = np.linspace(-2.6, 2.6, 241)
+    ranges = np.minimum(0.5 / np.abs(np.sin(angles)), 4.0 + 1e-9)
+    scan = range_scan(angles, ranges, np.zeros(3), 4.0)
+    grid = OccupancyGrid(0.05)
+    poses = np.column_stack((np.arange(0.0, 3.0, 0.06), np.zeros((50, 2))))
+    grid.add([scan] * len(poses), poses)
+    found = grid.cells(OccupancyConfig()).trinary(0.25, 0.65).cropped()
+    assert (found.values[:, 20:60] == 100).sum(axis=1).tolist() == [40] + 19 * [0] + [40]
+
+
 def test_values_become_free_occupied_and_unknown() -> None:
     found = OccupancyMap(np.array([[-1, 0, 25, 26, 64, 65, 100]], np.int8), 0.05, np.zeros(2))
     assert found.trinary(0.25, 0.65).values.tolist() == [[-1, 0, 0, -1, -1, 100, 100]]
@@ -137,7 +149,7 @@ def test_values_become_free_occupied_and_unknown() -> None:
     ("make", "complaint"),
     [
         (lambda: OccupancyGrid(0.0), "resolution_m is 0.0; expected a positive length"),
-        (lambda: OccupancyConfig(hit=-1.0), "hit, passed are -1.0, 0.5; expected positive log odds"),
+        (lambda: OccupancyConfig(hit=-1.0), "hit, passed are -1.0, 0.7; expected positive log odds"),
         (lambda: OccupancyConfig(free=0.7), "free, occupied are 0.7, 0.65; expected 0 <= free < occupied <= 1"),
         (lambda: range_scan(np.zeros(2), np.zeros(3), np.zeros(3), 1.0), r"shapes \(2,\), \(3,\), \(3,\)"),
         (lambda: range_scan(np.zeros(2), np.zeros(2), np.zeros(3), 0.0), "max_range_m is 0.0; expected"),

@@ -105,10 +105,10 @@ def test_a_robot_that_stands_adds_nothing() -> None:
 
 
 def test_turning_on_the_spot_adds_scans() -> None:
-    turning = np.column_stack((np.zeros((FRAMES, 2)), np.radians(2.0) * np.arange(FRAMES)))
+    turning = np.column_stack((np.zeros((FRAMES, 2)), np.radians(2.4) * np.arange(FRAMES)))
     scan_map = ScanMap()
     take(scan_map, range(FRAMES), turning)
-    assert scan_map.update(stamps(), turning).entered == FRAMES // 3, "every 6 degrees, the first from 5 on"
+    assert scan_map.update(stamps(), turning).entered == FRAMES // 5, "every 12 degrees, the first from 10 on"
 
 
 def test_a_place_keeps_its_newest_scans() -> None:

@@ -67,6 +67,18 @@ def write_map(
     return write_together({image: [picture.getvalue()], description: [text.encode()]})
 
 
+def read_map(description: Path) -> OccupancyMap:
+    """Read a map of the mode trinary, as Nav2's map server does; raises ``ValueError`` for another mode."""
+    facts = yaml.safe_load(description.read_text())
+    if facts["mode"] != "trinary":
+        raise ValueError(f"{description}: its mode is {facts['mode']}; expected trinary")
+    with Image.open(description.with_name(facts["image"])) as image:
+        occupancy = 1.0 - np.asarray(image.convert("L"), np.float64)[::-1] / 255.0
+    sure = [occupancy > facts["occupied_thresh"], occupancy < facts["free_thresh"]]
+    values = np.select(sure, [100, 0], -1).astype(np.int8)
+    return OccupancyMap(values, float(facts["resolution"]), np.array(facts["origin"][:2], np.float64))
+
+
 def _check(name: Path, found: OccupancyMap, image_format: str, mode: str, free: float, occupied: float) -> None:
     if mode not in MODES:
         raise ValueError(f"map mode is '{mode}'; expected {', '.join(MODES[:-1])} or {MODES[-1]}")

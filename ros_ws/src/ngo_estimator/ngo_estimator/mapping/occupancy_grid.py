@@ -30,8 +30,8 @@ class OccupancyConfig:
     cell is occupied from the probability ``occupied`` on, and free up to ``free``; the rest is unknown.
     """
 
-    hit: float = 0.9
-    passed: float = 0.5
+    hit: float = 2.2
+    passed: float = 0.7
     occupied: float = 0.65
     free: float = 0.25
 
@@ -90,7 +90,7 @@ class OccupancyGrid:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._low = np.zeros(2, np.int64)  # column and row, counted from the origin of the map's frame
+        self._low = np.zeros(2, np.int64)  # column and row, counted from the cell round the frame's origin
         self._hits, self._passes, self._marks = (np.zeros((0, 0), np.int32) for _ in range(3))
         self._mark = 0
 
@@ -105,7 +105,7 @@ class OccupancyGrid:
     def cells(self, config: OccupancyConfig) -> OccupancyMap:
         """The probabilities of all cells; the extent grows in large steps, so that it seldom changes."""
         values = _percent(self._hits, self._passes, config.hit, config.passed)
-        return OccupancyMap(values, self.resolution_m, self._low.astype(np.float64) * self.resolution_m)
+        return OccupancyMap(values, self.resolution_m, (self._low.astype(np.float64) - 0.5) * self.resolution_m)
 
     def _render(self, scans: Sequence[RangeScan], poses: Array, sign: int) -> None:
         if not len(scans):
@@ -153,7 +153,9 @@ def _in_cells(points: Array, scan_of: NDArray[np.int64], poses: Array, resolutio
     x, y, yaw = poses[scan_of].T
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved = np.stack((x + cos * points[:, 0] - sin * points[:, 1], y + sin * points[:, 0] + cos * points[:, 1]), -1)
-    return moved / resolution
+    # The frame's origin is the middle of a cell. A robot often begins in the middle of a corridor, along a wall: that
+    # wall then lies within a row of cells, and not where two rows meet, whose cells would take turns.
+    return moved / resolution + 0.5
 
 
 @njit(cache=True)

@@ -27,11 +27,11 @@ class ScanMapConfig:
 
     resolution_m: float = 0.05
     occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
-    spacing_m: float = 0.1
-    spacing_deg: float = 5.0
+    spacing_m: float = 0.2
+    spacing_deg: float = 10.0
     place_m: float = 0.5
     place_deg: float = 30.0
-    most_at_a_place: int = 16
+    most_at_a_place: int = 8
     moved_cells: float = 0.25
     most_waiting: int = 5000
 

@@ -1,5 +1,6 @@
 """Node that draws an occupancy grid from the ranges in relative poses, at the corrected poses of their frames."""
 
+import math
 import sys
 import traceback
 from pathlib import Path
@@ -28,7 +29,7 @@ from ngo_estimator.trajectory.files import seconds
 
 NAME = "ngo_map"
 _SUMMARY = "Publishes a map from the ranges in relative poses, at their corrected poses."
-_BUDGET_S = 0.25  # of an update, for scans that the trajectory moved; the rest is moved by the next one
+_BUDGET_S = 0.35  # of an update, for scans that the trajectory moved; the rest is moved by the next one
 
 
 class NgoMap(Node):
@@ -109,17 +110,17 @@ class NgoMap(Node):
         if self._trajectory is None or not self._due:
             return
         try:
-            self._draw(self._trajectory)
+            self._draw(self._trajectory, _BUDGET_S)
         except Exception:
             # A fault of ours: a robot is better off with an old map than without the node.
             self._due = False
             self.get_logger().error(f"internal error, the map stays as it is:\n{traceback.format_exc()}")
 
-    def _draw(self, trajectory: Trajectory) -> None:
+    def _draw(self, trajectory: Trajectory, budget_s: float) -> None:
         stamps_ns = np.array(trajectory.stamps_ns)
         poses = np.column_stack((trajectory.x, trajectory.y, trajectory.yaw))
         with self._status.timed("time an update"):
-            update = self._map.update(stamps_ns, poses, _BUDGET_S)
+            update = self._map.update(stamps_ns, poses, budget_s)
             if update.changed:
                 free, occupied = self._map.config.occupancy.free, self._map.config.occupancy.occupied
                 self._publisher.publish(int(stamps_ns[-1]), self._map.cells().trinary(free, occupied))
@@ -147,6 +148,8 @@ class NgoMap(Node):
             raise ValueError(f"map_topic is '{request.map_topic}'; expected '{own}', or nothing")
         if not request.map_url:
             raise ValueError("map_url is empty; expected the path of the files, without an ending")
+        if self._trajectory is not None and self._due:  # a file holds all that is known by now
+            self._draw(self._trajectory, math.inf)
         return write_map(
             Path(request.map_url).expanduser().absolute(),
             self._map.cells(),
