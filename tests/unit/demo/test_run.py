@@ -50,3 +50,10 @@ def test_refuses_what_makes_no_sense(argument: str, capsys: Any) -> None:
     with pytest.raises(SystemExit):
         run.parse_arguments([argument])
     assert "is not allowed; at least" in capsys.readouterr().err
+
+
+def test_a_view_shows_one_maze(capsys: Any) -> None:
+    assert run.parse_arguments(["--view"]).view and not run.parse_arguments([]).view
+    with pytest.raises(SystemExit):
+        run.parse_arguments(["--view", "--mazes", "2"])
+    assert "it shows one maze" in capsys.readouterr().err
