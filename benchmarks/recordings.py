@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 BAR_FRAMES_PER_S = 1_000
 PERIOD_NS = 57_142_857
@@ -230,7 +231,7 @@ def main(args: Arguments) -> int:
             ("read messages, rosbags", read_rosbags, ours),
         ]
         megabytes = 0.0
-        for name, function, path in plan:
+        for name, function, path in tqdm(plan, unit="task"):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
                 (wall_s, cpu_s, size), peak_mb = process.submit(measured, function, path, args.frames).result()
             megabytes = size / 1e6 or megabytes

@@ -21,6 +21,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from ngo_sim.driver_choice import DRIVER_NAMES, driver_generator, make_driver
 
 BARS_STEPS_PER_S = {"maze2d": 10_000, "maze3d": 2_500}
@@ -101,7 +103,7 @@ def measure(world_name: str, args: Arguments) -> Measurement:
     world = make_world(world_name, seeds)
     walls_s, resets_s, cpu_total_s, driver_s, metres = [], [], 0.0, 0.0, 0.0
     try:
-        for seed in seeds:
+        for seed in tqdm(seeds, world_name, unit="maze"):
             reset_s, (observation, info) = timed(partial(world.reset, seed=seed))
             driver = make_driver(args.driver, world.maze, driver_generator(seed))
             frames, travelled = [], 0.0

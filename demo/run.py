@@ -3,6 +3,7 @@
     python demo/run.py --world maze3d --seed 2000 --frames 1000
     python demo/run.py --world maze2d --mazes 20          # seeds 2000 to 2019, and a summary
     python demo/run.py --rate 35 --latency                # also how long a frame takes to the corrected path
+    python demo/run.py --view                             # a live view in the browser: `make demo VIEW=1` installs it
 
 The last line printed is the result as one JSON object.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from demo.graph import GraphError
 from demo.report import latency_table, print_json, result_table, summary_table
 from demo.session import Session, SessionConfig
 from demo.trajectories import summarise
+from demo.view import DemoView
 
 OUT = Path(__file__).resolve().parent / "out"
 
@@ -42,16 +45,21 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         help="frames a second; 0, the default: as fast as the estimators take them, none lost",
     )
     parser.add_argument("--latency", action="store_true", help="report the time from image to corrected path")
+    parser.add_argument("--view", action="store_true", help="show the run live in the browser; needs rerun")
     parser.add_argument("--weights", type=Path, help="folder of weights (default: those that ship)")
     parser.add_argument("--out", type=Path, help="folder for recording, picture, logs (default demo/out/WORLD_SEED)")
     arguments = parser.parse_args(argv)
     for name, low in (("seed", 0), ("frames", 3), ("mazes", 1), ("rate", 0)):
         if not getattr(arguments, name) >= low:
             parser.error(f"argument --{name}: {getattr(arguments, name)} is not allowed; at least {low}")
+    if arguments.view and arguments.mazes > 1:
+        parser.error(f"argument --view: it shows one maze; --mazes is {arguments.mazes}")
     return arguments
 
 
-def run_one(arguments: argparse.Namespace, seed: int, out: Path, console: Console) -> dict[str, Any]:
+def run_one(
+    arguments: argparse.Namespace, seed: int, out: Path, console: Console, view: DemoView | None = None
+) -> dict[str, Any]:
     """Drive through one maze with a progress bar; return its result, which also lies in out."""
     columns = (
         TextColumn("{task.description}"),
@@ -60,14 +68,30 @@ def run_one(arguments: argparse.Namespace, seed: int, out: Path, console: Consol
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    config = SessionConfig(arguments.world, seed, arguments.frames, arguments.rate, arguments.weights)
+    drive = (arguments.world, seed, arguments.frames, arguments.rate)
+    config = SessionConfig(*drive, arguments.weights, views=int(arguments.view))
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(f"{arguments.world} seed {seed}: starting", total=arguments.frames)
 
         def show(state: str, frames: int) -> None:
             progress.update(task, description=f"{arguments.world} seed {seed}: {state}", completed=frames)
 
-        return Session(config, out).run(show, with_latency=arguments.latency)
+        return Session(config, out, view.domain_id if view else None).run(show, with_latency=arguments.latency)
+
+
+def show_one(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+    """Drive through one maze, with a live view on request, and print its result."""
+    with DemoView(out / "logs") if arguments.view else nullcontext() as view:
+        if view is not None:
+            console.print(f"live view: {view.url}", soft_wrap=True)
+        result = run_one(arguments, arguments.seed, out, console, view)
+        console.print(result_table(result))
+        if "latency_ms" in result:
+            console.print(latency_table(result["latency_ms"]))
+        console.print(f"picture, recording and logs: {out}", soft_wrap=True)
+        print_json(result, out / "result.json")
+        if view is not None:
+            view.stay()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -77,12 +101,7 @@ def main(argv: list[str] | None = None) -> int:
     out = arguments.out or OUT / f"{arguments.world}_{arguments.seed}"
     try:
         if arguments.mazes == 1:
-            result = run_one(arguments, arguments.seed, out, console)
-            console.print(result_table(result))
-            if "latency_ms" in result:
-                console.print(latency_table(result["latency_ms"]))
-            console.print(f"picture, recording and logs: {out}", soft_wrap=True)
-            print_json(result, out / "result.json")
+            show_one(arguments, out, console)
         else:
             seeds = range(arguments.seed, arguments.seed + arguments.mazes)
             out = arguments.out or OUT / f"{arguments.world}_{seeds[0]}_to_{seeds[-1]}"

@@ -43,13 +43,14 @@ Show = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """Which maze is driven, how fast, and with which weights (None: those that ship)."""
+    """Which maze is driven, how fast, with which weights (None: those that ship), and how many views listen, too."""
 
     world: str
     seed: int
     frames: int
     rate: float = 0.0
     weights: Path | None = None
+    views: int = 0
 
     @property
     def draws_map(self) -> bool:
@@ -79,7 +80,7 @@ class SessionConfig:
         ]
 
     def simulator(self) -> NodeSpec:
-        """The simulator, which waits for local_node and the recorder."""
+        """The simulator, which waits for local_node, the recorder and the views."""
         return NodeSpec(
             "ngo_sim",
             self.world,
@@ -87,7 +88,7 @@ class SessionConfig:
                 "seed": self.seed,
                 "frames": self.frames,
                 "rate": float(self.rate),
-                "wait_for_subscribers": 2,
+                "wait_for_subscribers": 2 + self.views,
                 "wait_for_flow_control": True,
             },
         )
@@ -96,8 +97,10 @@ class SessionConfig:
 class Session:
     """Runs the graph once; everything it leaves behind lies below out."""
 
-    def __init__(self, config: SessionConfig, out: Path) -> None:
+    def __init__(self, config: SessionConfig, out: Path, domain_id: int | None = None) -> None:
+        """Run in a ROS domain that is free, or in ``domain_id``."""
         self._config = config
+        self._domain_id = domain_id
         self._out = out
         self._truth: dict[int, Poses] = {}
         self._odometry: dict[int, Poses] = {}
@@ -108,7 +111,7 @@ class Session:
         """Run, write recording.mcap, picture.png, the map, the trajectories and the logs, and return the result."""
         config = self._config
         with (
-            Graph(self._out / "logs") as graph,
+            Graph(self._out / "logs", self._domain_id) as graph,
             Recorder(self._out / "recording.mcap", graph.domain_id, ALL_TOPICS) as recorder,
         ):
             recorder.listen("ground_truth", self._on_truth)
@@ -125,8 +128,8 @@ class Session:
                     recorder.has_publisher("ngo/path")
                     and recorder.has_publisher("odom")
                     and recorder.has_subscriber("relative_pose", besides=2 if draws_map else 1)
-                    and (recorder.has_subscriber("ngo/trajectory") or not draws_map)
-                    and recorder.has_subscriber("image")
+                    and (recorder.has_subscriber("ngo/trajectory", besides=1 + config.views) or not draws_map)
+                    and recorder.has_subscriber("image", besides=1 + config.views)
                 ),
                 "the estimators to come up",
                 START_TIMEOUT_S,

@@ -7,7 +7,7 @@ one_at_a_time
 
 underlay="$(find_underlay)"
 # The key depends on the pins, not on times of files: a fresh checkout of the same pins changes nothing.
-key="$(cat "$ROOT"/requirements/*.txt | sha256sum | cut -c 1-16) $underlay"
+key="$(cat "$ROOT"/requirements/{build,constraints,ros,runtime,test}.txt | sha256sum | cut -c 1-16) $underlay"
 if [ -x "$VENV/bin/python" ] && [ "$(cat "$VENV/ngo_key" 2>/dev/null)" = "$key" ]; then
     if [ -z "${PYTHON-}" ] || [ "$("$PYTHON" -V 2>&1)" = "$("$VENV/bin/python" -V)" ]; then
         exit 0

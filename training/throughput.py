@@ -12,6 +12,7 @@ from typing import Literal
 
 import tyro
 from torch.utils.data import IterableDataset
+from tqdm import tqdm
 
 from training.common.curves import batch_size, memory_mb
 from training.data.batches import Batch
@@ -48,7 +49,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     }
     table: dict[str, float] = {}
     memory = 0.0
-    for name, (stream, datapoints_a_row) in streams.items():
+    for name, (stream, datapoints_a_row) in tqdm(streams.items(), unit="stream"):
         batches = iter(loader(stream, arguments.workers))
         for _ in range(_WARM_UP):
             next(batches)

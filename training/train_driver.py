@@ -25,6 +25,7 @@ import tyro
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from tqdm import tqdm
 
 from ngo_sim.policy_network import SHIPPED, PolicyConfig
 from training.common import runs
@@ -100,6 +101,8 @@ class Progress(BaseCallback):
         self.begun_s = time.monotonic()
 
     def _on_training_start(self) -> None:
+        begun, total = self.num_timesteps, self.arguments.decisions
+        self.bar = tqdm(total=total, initial=begun, desc="driver", unit="decision")
         self.due = self.num_timesteps + self.arguments.checkpoint_decisions
 
     def _on_step(self) -> bool:
@@ -107,10 +110,15 @@ class Progress(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         model: Any = self.model
+        self.bar.update(self.num_timesteps - self.bar.n)
         model.ent_coef = self.arguments.entropy * (1.0 - self.num_timesteps / self.arguments.decisions)
         if self.num_timesteps >= self.due:
             self.due += self.arguments.checkpoint_decisions
             self.keep()
+
+    def _on_training_end(self) -> None:
+        self.bar.update(self.num_timesteps - self.bar.n)
+        self.bar.close()
 
     def keep(self) -> None:
         """Write a row and a checkpoint now."""

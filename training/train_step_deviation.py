@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ngo_estimator.checkpoint import STEP_DEVIATION, save_checkpoint
 from ngo_estimator.networks.step_deviation import StepDeviation, StepDeviationConfig
@@ -73,7 +74,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     train = data_of(building_drives(arguments, _TRAIN_SEED, arguments.buildings, arguments.without_wheels))
     validation = data_of(building_drives(arguments, _VALIDATION_SEED, *half))
     logs = [
-        _stored(arguments.runs, f"log-{path.name}-{_sha(path)}", partial(log_steps, path)) for path in arguments.logs
+        _stored(arguments.runs, f"log-{path.name}-{_sha(path)}", partial(log_steps, path))
+        for path in tqdm(arguments.logs, "logs")
     ]
     if logs:
         of_logs = data_of(logs, LOG_WINDOWS, REFERENCE)
@@ -99,7 +101,7 @@ def main(arguments: Arguments) -> dict[str, float]:
 def building_drives(arguments: Arguments, seed: int, with_wheels: int, without: int) -> list[KeySteps]:
     """Drives through normal and aliased buildings, the latter ones without wheels."""
     drives = []
-    for k in range(with_wheels + without):
+    for k in tqdm(range(with_wheels + without), f"buildings from {seed}"):
         for aliased in (False, True):
             settings = (seed + k, arguments.length_m, aliased, k < with_wheels)
             name = "-".join(map(str, settings))
@@ -126,7 +128,7 @@ def fitted(data: Data, arguments: Arguments) -> tuple[StepDeviation, float]:
     optimizer = torch.optim.AdamW(network.parameters(), lr=arguments.learning_rate, weight_decay=1e-3)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, arguments.learning_rate, total_steps=arguments.steps)
     losses = []
-    for _ in range(arguments.steps):
+    for _ in tqdm(range(arguments.steps), "train", unit="step"):
         loss = torch.zeros(())
         for steps, windows in data.items():
             some = windows[torch.from_numpy(random.permutation(len(windows))[: _BATCH[steps]])]
@@ -146,7 +148,7 @@ def _stored(folder: Path, name: str, make: Callable[[], KeySteps]) -> KeySteps:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         make().save(path)
-        print(f"stored {path.name}", flush=True)
+        tqdm.write(f"stored {path.name}")
     return KeySteps.load(path)
 
 

@@ -7,7 +7,7 @@ import re
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,9 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import ReliabilityPolicy
+
+from ngo_common.settings import Settings, described
+from ngo_estimator.nodes.view_settings import ViewNodeSettings
 
 from .processes import NodeProcess, Probe
 
@@ -31,6 +34,7 @@ NODES = {
 }
 BEGIN = "<!-- Written by `python -m tests.ros.readme_tables`; a test compares it with the nodes. -->\n"
 END = "<!-- End of the parameters. -->\n"
+HEAD = ("| Parameter | Default | Meaning | Allowed |", "|---|---|---|---|")
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
@@ -58,7 +62,7 @@ class NodeFacts:
         names = sorted(name for name in names if not name.startswith(_OF_RCLPY))
         values = self._ask(GetParameters, "get_parameters", GetParameters.Request(names=names)).values
         described = self._ask(DescribeParameters, "describe_parameters", DescribeParameters.Request(names=names))
-        rows = ["| Parameter | Default | Meaning | Allowed |", "|---|---|---|---|"]
+        rows = list(HEAD)
         for name, value, descriptor in zip(names, values, described.descriptors, strict=True):
             default = default_text(parameter_value_to_python(value))
             rows.append(f"| `{name}` | {default} | {descriptor.description} | {allowed_text(descriptor)} |")
@@ -140,9 +144,21 @@ def allowed_text(descriptor: ParameterDescriptor) -> str:
     return ""
 
 
+def settings_rows(settings_type: type[Settings]) -> list[str]:
+    """The same rows of a node that cannot run everywhere: `view_node` needs an extra."""
+    rows = list(HEAD)
+    for entry in sorted(fields(settings_type), key=lambda entry: entry.name):
+        allowed = entry.metadata["allowed"] + ("; at any time" if entry.metadata["live"] else "")
+        rows.append(f"| `{entry.name}` | {default_text(entry.default)} | {described(entry)} | {allowed} |")
+    return rows
+
+
 def parameter_section(facts: dict[str, NodeFacts]) -> str:
     """The generated part of the page of parameters."""
-    parts = [f"## `{name}`\n\n" + "\n".join(node.parameter_rows()) + "\n" for name, node in facts.items()]
+    rows = {name: node.parameter_rows() for name, node in facts.items()} | {
+        "view_node": settings_rows(ViewNodeSettings)
+    }
+    parts = [f"## `{name}`\n\n" + "\n".join(lines) + "\n" for name, lines in rows.items()]
     return BEGIN + "\n" + "\n".join(parts) + "\n" + END
 
 

@@ -35,6 +35,7 @@ BEGIN_NS = 50_000_000_000
 ANGLES = np.radians(np.arange(-120.0, 120.5, 1.0))
 MOUNTING = np.array([0.12, -0.05, math.radians(30.0)])
 RELIABLE = {"world": "scan", "image_reliability": "reliable", "image_depth": 1000}
+AHEAD_S = 0.2
 
 
 def drive() -> list[np.ndarray]:
@@ -67,13 +68,13 @@ def scan_message(true: np.ndarray, stamp_ns: int, upside_down: bool, noise: np.r
     return message
 
 
-def mounting_message(upside_down: bool) -> TFMessage:
+def mounting_message(upside_down: bool, base_frame: str = "base_link") -> TFMessage:
     """Two static transforms from the robot to its scanner, the second with the roll of one that hangs."""
     x, y, yaw = MOUNTING.tolist()
     half = 0.5 * yaw
     turned = Quaternion(z=math.sin(half), w=math.cos(half))
     mast = TransformStamped(child_frame_id="mast")
-    mast.header.frame_id = "base_link"
+    mast.header.frame_id = base_frame
     mast.transform.translation, mast.transform.rotation = Vector3(x=x, y=y, z=0.2), turned
     laser = TransformStamped(child_frame_id="laser")
     laser.header.frame_id = "mast"
@@ -132,6 +133,12 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
     wheels = probe.node.create_publisher(Odometry, "wheels", 1000)
     tf = probe.node.create_publisher(TFMessage, "/tf", 1000)
     settings = {**RELIABLE, "robot_odometry": robot_odometry, "robot_odometry_topic": "wheels"}
+    ngo_settings: dict[str, Any] = {"world": "scan"}
+    base_frame, odom_frame = "base_link", "odom"
+    if robot_odometry == "tf":  # a robot's own names, as a configuration of slam_toolbox has them
+        base_frame, odom_frame = "base_footprint", "wheels"
+        settings |= {"odom_frame": odom_frame, "base_frame": base_frame}
+        ngo_settings |= {"odom_frame": odom_frame, "map_frame": "world", "tf_ahead_s": AHEAD_S}
     noise, poses = np.random.default_rng(0), drive()
     core, online = LidarOdometry(), ScanTrajectory(iterations_per_step=1)
     core.mounting = mounting_of(mounting_message(upside_down))
@@ -139,7 +146,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
     expected = []
     with (
         NodeProcess("ngo_estimator", "local_node", settings) as local,
-        NodeProcess("ngo_estimator", "ngo_node", {"world": "scan"}) as ngo,
+        NodeProcess("ngo_estimator", "ngo_node", ngo_settings) as ngo,
     ):
         local.wait_for_log("ready: /local_node, scan, LaserScan on '/scan'")
         ngo.wait_for_log("ready: /ngo_node, scan")
@@ -164,14 +171,14 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
                 odometry.pose.pose.orientation.w = math.cos(0.5 * wheel[2])
                 wheels.publish(odometry)
             if robot_odometry == "tf":
-                tf.publish(transform_message(stamp_ns, "odom", "base_link", wheel))
+                tf.publish(transform_message(stamp_ns, odom_frame, base_frame, wheel))
             if robot_odometry != "none":
                 core.add_wheels(stamp_ns, wheel)
             scans.publish(message)
             core.add_scan(scan_of(message, "scan"))
             expected += list(core.ready())
             if step == 5:  # the scans before it wait for the mounting
-                static.publish(mounting_message(upside_down))
+                static.publish(mounting_message(upside_down, base_frame))
             if step >= 5:  # scans that run ahead of the robot's odometry would not wait for it
                 probe.spin_until(lambda: len(out.relative_poses) == step, f"the motion to scan {step}")  # noqa: B023
         probe.spin_until(lambda: len(out.poses) == FRAMES - 1, "a pose for every scan")
@@ -195,9 +202,16 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
         assert len(out.odometry) == FRAMES - 1
         return
     assert not out.odometry, "the robot's own odometry is the one of odom"
-    frames = {t.child_frame_id for message in out.transforms for t in message.transforms if t.header.frame_id == "map"}
-    assert frames == {"odom"}
-    corrections = [t for message in out.transforms for t in message.transforms if t.header.frame_id == "map"]
+    transforms = [t for message in out.transforms for t in message.transforms]
+    assert {(t.header.frame_id, t.child_frame_id) for t in transforms} == {
+        ("wheels", "base_footprint"),
+        ("world", "wheels"),
+    }
+    assert sum(t.header.frame_id == "wheels" for t in transforms) == FRAMES, "those of the robot, and no other"
+    corrections = [t for t in transforms if t.header.frame_id == "world"]
+    ahead_ns = round(1e9 * AHEAD_S)
+    assert {to_ns(t.header.stamp) - ahead_ns for t in corrections} == {to_ns(each.header.stamp) for each in out.poses}
+    assert last.header.frame_id == "world"
     map_from_base = compose(xyyaw(corrections[-1].transform), wheel_pose(poses[-1], poses[0]))
     assert close(map_from_base, xyyaw(last.pose.pose), 0.01, 0.2)
 

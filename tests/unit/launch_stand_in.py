@@ -112,10 +112,13 @@ class Node(Entity):
         remappings: list[tuple[Any, Any]] | None = None,
         output: str = "log",
         on_exit: list[Entity] | None = None,
+        arguments: list[Any] | None = None,
+        respawn: bool = False,
     ) -> None:
         self.executable, self.package, self.name = texts(executable), texts(package), texts(name)
         self.namespace, self.output, self.on_exit = texts(namespace or ""), output, on_exit or []
         self.remappings = [(texts(old), texts(new)) for old, new in remappings or []]
+        self.arguments, self.respawn = [texts(item) for item in arguments or []], respawn
         self.files = [texts(item) for item in parameters or [] if not isinstance(item, dict)]
         self.parameters: dict[str, Any] = {}
         for item in parameters or []:

@@ -132,7 +132,7 @@ def test_commands_are_right(page: Path) -> None:
             wrong += [] if f"| `{name}` |" in parameters else [f"{command}: {name}"]
         if target := re.match(r"make ([a-z]+)", command):
             wrong += [] if re.search(rf"^{target[1]}:", makefile, re.MULTILINE) else [command]
-        if launch := re.match(r"ros2 launch (\w+) ([\w.]+)", command):
+        if launch := re.match(r"ros2 launch (ngo_\w+) ([\w.]+)", command):
             wrong += [] if (ROOT / "ros_ws/src" / launch[1] / "launch" / launch[2]).exists() else [command]
     assert wrong == []
 

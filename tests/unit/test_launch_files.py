@@ -18,10 +18,15 @@ from ngo_sim.simulator_config import SimulatorConfig
 from ngo_sim.wheels import WheelsConfig
 from tests.unit.launch_stand_in import SRC, FindPackageShare, Launched, PathJoinSubstitution, Shutdown, install
 
-GRAPH, MAZE = SRC / "ngo_bringup/launch/graph.launch.py", SRC / "ngo_bringup/launch/maze.launch.py"
+LAUNCH = SRC / "ngo_bringup/launch"
+GRAPH, MAZE, SLAM = LAUNCH / "graph.launch.py", LAUNCH / "maze.launch.py", LAUNCH / "slam_launch.py"
 # The names by which the files were documented first.
 FORWARDED = {GRAPH: SRC / "ngo_estimator/launch/graph.launch.py", MAZE: SRC / "ngo_sim/launch/maze.launch.py"}
 ARGUMENTS = ["world", "parameters", "namespace", "seed", "record", "use_sim_time"]
+VIEWS = ["rviz", "view"]
+# What Nav2's bringup_launch.py gives to its slam_launch.py, and what that takes besides.
+OF_NAV2 = ["namespace", "params_file", "use_sim_time", "autostart", "use_respawn", "log_level"]
+ESTIMATORS = ["local_node", "ngo_node", "ngo_map"]
 SETTINGS: dict[str, tuple[type[Settings], ...]] = {
     "maze2d": (SimulatorConfig, Maze2DConfig),
     "maze3d": (SimulatorConfig, Maze3DConfig),
@@ -35,25 +40,25 @@ def launch_stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_launch_file_is_tested() -> None:
-    assert sorted(SRC.glob("*/launch/*")) == sorted([*FORWARDED, *FORWARDED.values()])
+    assert sorted(SRC.glob("*/launch/*")) == sorted([*FORWARDED, *FORWARDED.values(), SLAM])
 
 
 @pytest.mark.parametrize("path", [*FORWARDED, *FORWARDED.values()], ids=lambda path: f"{path.parts[-3]}-{path.stem}")
 @pytest.mark.parametrize("world", SETTINGS)
 def test_nodes_start_with_the_shipped_parameters(path: Path, world: str) -> None:
     launched = Launched(path, world=world, namespace="red")
-    assert launched.arguments == ARGUMENTS
     graph = path.name == GRAPH.name
+    assert launched.arguments == ARGUMENTS + (VIEWS if graph else [])
     text = launched.context.text
     executables = [text(node.executable) for node in launched.nodes]
-    assert executables == ["local_node", "ngo_node", world] if graph else [world]
+    assert executables == [*ESTIMATORS, world] if graph else [world]
     for node in launched.nodes:
         assert text(node.namespace) == "red" and text(node.name) == text(node.executable)
         assert node.output == "screen" and node.parameters == {}
         (file,) = (Path(text(parts)) for parts in node.files)
         assert any(f"/**/{text(node.name)}" in name for name in yaml.safe_load(file.read_text()))
         remapped = {text(old): text(new) for old, new in node.remappings}
-        assert remapped == ({"/tf": "tf", "/tf_static": "tf_static"} if graph else {})
+        assert remapped == {"/tf": "tf", "/tf_static": "tf_static"}
     if graph:
         assert isinstance(launched.nodes[-1].on_exit[0], Shutdown), "when the simulator ends, everything ends"
 
@@ -67,6 +72,50 @@ def test_arguments_become_parameters_of_the_nodes_that_have_them(path: Path, wor
     SETTINGS[world][0](**simulator.parameters)
     assert all(node.parameters == {"use_sim_time": True} for node in estimators)
     assert {launched.context.text(parts) for node in launched.nodes for parts in node.files} == {"/own.yaml"}
+
+
+def test_a_view_comes_on_request() -> None:
+    for path in (GRAPH, SLAM):
+        launched = Launched(path, rviz="true", view="True", namespace="red", use_sim_time="true")
+        *_, rviz, view = launched.nodes
+        text = launched.context.text
+        assert [text(each.executable) for each in (rviz, view)] == ["rviz2", "view_node"]
+        assert {text(each.namespace) for each in (rviz, view)} == {"red"}
+        assert rviz.parameters == view.parameters == {"use_sim_time": True}
+        (option, file) = (text(parts) for parts in rviz.arguments)
+        assert option == "-d" and Path(file).is_file()
+
+
+def test_slam_takes_the_names_of_nav2_and_needs_none() -> None:
+    launched = Launched(SLAM)
+    assert launched.arguments == OF_NAV2 + VIEWS
+    text = launched.context.text
+    assert [text(node.executable) for node in launched.nodes] == ESTIMATORS
+    (shipped,) = {text(parts) for node in launched.nodes for parts in node.files}
+    names = yaml.safe_load(Path(shipped).read_text())
+    assert list(names) == [f"/**/{name}" for name in ESTIMATORS]
+    assert [node.parameters for node in launched.nodes] == [{}, {"autostart": True}, {}]
+    assert not any(node.respawn for node in launched.nodes)
+
+
+def test_slam_does_what_nav2_asks_for() -> None:
+    given = dict.fromkeys(("use_sim_time", "use_respawn"), "True") | {"autostart": "False", "log_level": "debug"}
+    launched = Launched(SLAM, params_file="/nav2.yaml", namespace="red", **given)
+    text = launched.context.text
+    for node in launched.nodes:
+        assert text(node.namespace) == "red" and node.respawn and node.parameters["use_sim_time"]
+        assert [text(parts) for parts in node.files][1:] == ["/nav2.yaml"], "the later file wins"
+        assert [text(parts) for parts in node.arguments] == ["--ros-args", "--log-level", "debug"]
+    assert launched.nodes[1].parameters["autostart"] is False
+
+
+def test_the_shipped_parameters_of_slam_leave_odom_to_the_robot() -> None:
+    values = yaml.safe_load((SRC / "ngo_bringup/config/slam.yaml").read_text())
+    local = LocalNodeSettings(**values["/**/local_node"]["ros__parameters"])
+    ngo = NgoNodeSettings(**values["/**/ngo_node"]["ros__parameters"])
+    assert (local.world, local.robot_odometry, ngo.world) == ("scan", "tf", "scan")
+    assert local.odom_frame == ngo.odom_frame
+    assert ngo.tf_ahead_s >= 0.1, "a scanner of 10 Hz"
 
 
 def test_what_is_not_allowed_is_refused() -> None:

@@ -56,7 +56,7 @@ LAYERS = {
         {"optimizer"},
         {"checkpoint"},
         {"odometry", "online", "trajectory", "mapping"},
-        {"offline"},
+        {"offline", "view"},
         {"nodes"},
     ],
     "training": [{"common"}, {"data"}, {"recordings", "driver", "baselines"}, {"scoring"}, {"report"}],
@@ -122,6 +122,8 @@ def crossings(imports: Mapping[str, set[str]]) -> Iterator[str]:
                     yield f"{module} imports {name}: a package imports nothing that is not installed with it"
             if target == "vizdoom" and module != "ngo_sim.doom_engine" and top != "tests":
                 yield f"{module} imports {name}: only ngo_sim.doom_engine does"
+            if target == "rerun" and module != "ngo_estimator.view.rerun_view":
+                yield f"{module} imports {name}: only ngo_estimator.view.rerun_view does"
             for package in PACKAGES:
                 own = is_below(module, f"{package}.nodes") or (package in SHARED and in_node)
                 own |= top == "benchmarks" and any(is_below(name, part) for part in PARTS_OF_NODES)
@@ -176,6 +178,7 @@ def test_no_import_crosses_a_layer() -> None:
         ("ngo_sim.mazes", "def late():\n    from nav_msgs.msg import Path", "only nodes know of ROS"),
         ("ngo_sim.maze3d", "import vizdoom as vzd", "only ngo_sim.doom_engine does"),
         ("training.data", "import vizdoom", "only ngo_sim.doom_engine does"),
+        ("ngo_estimator.view.live_view", "import rerun as rr", "only ngo_estimator.view.rerun_view does"),
         ("ngo_sim.nodes.maze2d_node", "from ngo_estimator.geometry import se2", "the packages meet"),
         ("ngo_estimator.data.a", "import importlib\nimportlib.import_module('ngo_sim.mazes')", "the packages meet"),
         ("ngo_estimator.geometry.se2", "from training import losses", "not installed with it"),

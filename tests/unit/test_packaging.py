@@ -22,7 +22,7 @@ PYTHON = [name for name, folder in SOURCES.items() if (folder / "setup.py").exis
 # Programs of the repository, which are not installed: requirements/ has what they import.
 PROGRAMS = ("training", "benchmarks", "demo", "tests", "tools", "scripts")
 # Modules whose distribution has another name.
-DISTRIBUTIONS = {"PIL": "pillow", "yaml": "pyyaml", "mcap_ros2": "mcap-ros2-support"}
+DISTRIBUTIONS = {"PIL": "pillow", "yaml": "pyyaml", "mcap_ros2": "mcap-ros2-support", "rerun": "rerun-sdk"}
 OWN = {*PYTHON, *PROGRAMS, "ros2_stand_in"}
 ROS = ("rclpy", "ament_index_python", "launch", "launch_ros")
 VERSION = "0.1.0"
@@ -45,7 +45,7 @@ def imports_below(folder: Path) -> set[str]:
 def ros_packages_in_launch_files(folder: Path) -> set[str]:
     """Packages that launch files name: those whose nodes they start, and whose folders they look into."""
     named: set[str] = set()
-    for path in folder.glob("launch/*.py"):
+    for path in [*folder.glob("launch/*.py"), *folder.glob("ngo_bringup/*.py")]:
         named |= {
             node.value
             for node in ast.walk(ast.parse(path.read_text()))
@@ -85,7 +85,11 @@ def test_a_package_declares_what_it_imports_and_no_more(name: str, monkeypatch: 
     forwarded = {"ngo_bringup"} if name != "ngo_bringup" else set()  # which depends on those that forward to it
     assert declared_for_ros(folder) == of_ros | ros_packages_in_launch_files(folder) - forwarded - {name}
     of_pip = {module if module in SOURCES else distribution(module) for module in imported if not is_of_ros(module)}
-    assert set(setup_of(folder, monkeypatch).get("install_requires", [])) == of_pip
+    declared = setup_of(folder, monkeypatch)
+    on_request = set(declared["extras_require"].get("view", []))
+    assert set(declared.get("install_requires", [])) == of_pip - on_request
+    assert on_request <= of_pip & required("view.txt") - required("runtime.txt", "test.txt")
+    of_pip -= on_request
     assert of_pip - set(SOURCES) <= required("runtime.txt"), "requirements/runtime.txt has all that is imported"
 
 
@@ -127,7 +131,7 @@ for package in ("ngo_common", "ngo_recordings", "ngo_estimator"):
     module = importlib.import_module(package)
     assert Path(module.__file__).is_relative_to(here), module.__file__
     for found in pkgutil.walk_packages(module.__path__, package + "."):
-        if ".nodes" not in found.name:
+        if ".nodes" not in found.name and found.name != "ngo_estimator.view.rerun_view":  # rerun is an extra
             importlib.import_module(found.name)
 
 import torch

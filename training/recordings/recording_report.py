@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from tqdm import tqdm
 
 from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.frames import NO_DEPTH, UNUSABLE, Frame, frames
@@ -106,7 +107,7 @@ def inspect(recording: Recording, topics: RecordingTopics) -> Report:
     count = max(1, recording.topics[topics.image].count)
     wanted = {round(index) for index in np.linspace(0, count - 1, SAMPLES)}
     stamps, poses, residuals, samples, have, image = [], [], [], [], Counter[str](), ""
-    for index, frame in enumerate(frames(recording, topics, skipped)):
+    for index, frame in enumerate(tqdm(frames(recording, topics, skipped), "frames", count, leave=False, disable=None)):
         stamps.append(frame.stamp_ns)
         poses.append(np.full(3, np.nan) if frame.pose_xyyaw is None else frame.pose_xyyaw)
         residuals.append(np.full(3, np.nan) if frame.pose_residual is None else frame.pose_residual)
@@ -172,7 +173,8 @@ def topic_times(recording: Recording, names: list[str]) -> dict[str, TopicTimes]
     logs: dict[str, list[int]] = {name: [] for name in names}
     stamps: dict[str, list[int]] = {name: [] for name in names}
     frame_ids: dict[str, set[str]] = {name: set() for name in names}
-    for message in recording.messages(names):
+    total = sum(recording.topics[name].count for name in names)
+    for message in tqdm(recording.messages(names), "times", total, leave=False, disable=None):
         logs[message.topic].append(message.log_time_ns)
         stamp_ns, ids = _stamp(message)
         frame_ids[message.topic] |= ids

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
@@ -70,7 +71,7 @@ def odometry_errors(
     heading over so many steps (deg, RMS of all such windows).
     """
     squares, steps, over_many, windows, final_percent = [], [], [], [], []
-    for episode in validation_episodes(world, mazes, frames):
+    for episode in tqdm(validation_episodes(world, mazes, frames), f"{world.name} odometry", mazes, unit="maze"):
         estimated, true = estimated_steps(network, world, episode), true_steps(episode)
         errors = step_errors(estimated, true)
         squares.append(np.square(errors).sum(axis=0))

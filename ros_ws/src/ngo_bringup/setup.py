@@ -1,4 +1,4 @@
-"""Installs the launch files and the parameters of the whole graph."""
+"""Installs the launch files, the parameters and the views of the whole graph."""
 
 from glob import glob
 
@@ -9,11 +9,14 @@ NAME = "ngo_bringup"
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[],
+    packages=[NAME],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        *((f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*.*"))) for folder in ("config", "launch")),
+        *(
+            (f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*.*")))
+            for folder in ("config", "foxglove", "launch", "rviz")
+        ),
     ],
     zip_safe=False,
     maintainer="NGO maintainers",

@@ -37,13 +37,14 @@ setup(
     maintainer_email="maintainers@ngo.invalid",
     description="Local odometry and the Neural Graph Optimizer, and the nodes that run them.",
     license="Apache-2.0",
-    extras_require={"test": ["pytest"]},
+    extras_require={"test": ["pytest"], "view": ["rerun-sdk"]},
     entry_points={
         "console_scripts": [
             "local_node = ngo_estimator.nodes.local_node:main",
             "ngo_map = ngo_estimator.nodes.ngo_map:main",
             "ngo_node = ngo_estimator.nodes.ngo_node:main",
             "run_recording = ngo_estimator.nodes.run_recording:main",
+            "view_node = ngo_estimator.nodes.view_node:main",
         ],
     },
 )

@@ -13,7 +13,7 @@ def fake_result(seed: int) -> dict[str, Any]:
     return {"world": "maze2d", "seed": seed, "frames": 30, "path_m": 9.0, "odometry": errors[0], "corrected": errors[1]}
 
 
-def fake_run_one(arguments: Any, seed: int, out: Path, console: Any) -> dict[str, Any]:
+def fake_run_one(arguments: Any, seed: int, out: Path, console: Any, view: Any = None) -> dict[str, Any]:
     return fake_result(seed)
 
 
@@ -50,3 +50,10 @@ def test_refuses_what_makes_no_sense(argument: str, capsys: Any) -> None:
     with pytest.raises(SystemExit):
         run.parse_arguments([argument])
     assert "is not allowed; at least" in capsys.readouterr().err
+
+
+def test_a_view_shows_one_maze(capsys: Any) -> None:
+    assert run.parse_arguments(["--view"]).view and not run.parse_arguments([]).view
+    with pytest.raises(SystemExit):
+        run.parse_arguments(["--view", "--mazes", "2"])
+    assert "it shows one maze" in capsys.readouterr().err

@@ -6,12 +6,18 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ngo_common.settings import BadParameter, described, make_settings
+from ngo_common.settings import BadParameter, Settings, described, make_settings
 from ngo_estimator.nodes.settings import LocalNodeSettings, MapNodeSettings, NgoNodeSettings
+from ngo_estimator.nodes.view_settings import ViewNodeSettings
 
 SRC = Path(__file__).parents[4] / "ros_ws/src"
 CONFIG = SRC / "ngo_estimator/config"
-KINDS = {"local_node": LocalNodeSettings, "ngo_node": NgoNodeSettings, "ngo_map": MapNodeSettings}
+KINDS: dict[str, type[Settings]] = {
+    "local_node": LocalNodeSettings,
+    "ngo_node": NgoNodeSettings,
+    "ngo_map": MapNodeSettings,
+    "view_node": ViewNodeSettings,
+}
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -40,6 +46,11 @@ def test_frames_that_would_coincide_and_a_short_queue_are_errors() -> None:
         NgoNodeSettings(map_frame="odom")
     with pytest.raises(BadParameter, match="at least window_frames, which is 3000"):
         NgoNodeSettings(window_frames=3000)
+
+
+def test_a_view_serves_its_page_and_its_data_from_two_ports() -> None:
+    with pytest.raises(BadParameter, match="'data_port' is 9090; allowed: another port than web_port"):
+        ViewNodeSettings(data_port=9090)
 
 
 def test_any_world_may_be_named_together_with_its_weights() -> None:

@@ -271,7 +271,8 @@ class NgoNode(LifecycleNode):
             map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
             newest = self._origin.poses(update.map_from_odom_xyyaw)
             map_from_odom = self._smoothing.update(stamp_ns, newest, odom_xyyaw)
-            self._tf.publish(messages.transform_message(stamp_ns, map_frame, odom_frame, map_from_odom))
+            ahead_ns = round(1e9 * settings.tf_ahead_s)
+            self._tf.publish(messages.transform_message(stamp_ns + ahead_ns, map_frame, odom_frame, map_from_odom))
 
     def _trajectory(self) -> "Trajectory | None":
         """The whole trajectory, with its poses in map."""

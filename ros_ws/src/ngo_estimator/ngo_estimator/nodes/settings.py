@@ -174,6 +174,14 @@ class NgoNodeSettings(EstimatorSettings):
         maximum=60.0,
         live=True,
     )
+    tf_ahead_s: float = setting(
+        0.0,
+        "Time by which the stamp of the transform on tf_topic is ahead of its frame's. Nav2 asks for newer poses than "
+        "the last frame: the time between two frames and their processing fit in here.",
+        minimum=0.0,
+        maximum=10.0,
+        live=True,
+    )
     lost_position_std_m: float = setting(
         2.0,
         "Standard deviation of the newest position above which diagnostics call the robot lost, m.",

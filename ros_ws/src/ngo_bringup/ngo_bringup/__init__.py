@@ -1,0 +1,1 @@
+"""What the launch files of the whole graph have in common."""

@@ -1,0 +1,94 @@
+"""The arguments and the nodes that launch files put together."""
+
+from launch import LaunchContext
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+WORLDS = ["maze2d", "maze3d", "building2d"]
+TRUTH_VALUES = {"true": True, "false": False, "True": True, "False": False}  # Nav2 writes them with a capital letter
+_DESCRIPTIONS = {
+    "world": "simulator",
+    "parameters": "YAML with parameters of all nodes",
+    "params_file": "YAML whose parameters replace those of config/slam.yaml; empty: none",
+    "namespace": "namespace of all nodes; empty: none",
+    "seed": "seed of the simulator; empty: of parameters",
+    "record": "new .mcap file or folder for what the simulator publishes",
+    "use_sim_time": "follow /clock, which a simulator started here then publishes",
+    "autostart": "whether ngo_node begins by itself; else it waits for lifecycle transitions",
+    "use_respawn": "whether a node that ends is started again, with an empty map",
+    "log_level": "lowest severity that nodes print",
+    "rviz": "show the graph in RViz",
+    "view": "show the graph in the browser; needs requirements/view.txt",
+}
+
+
+def argument(name: str, default: object, choices: list[str] | None = None) -> DeclareLaunchArgument:
+    """One of the arguments that the launch files share."""
+    return DeclareLaunchArgument(name, default_value=default, description=_DESCRIPTIONS[name], choices=choices)
+
+
+def switch(name: str, default: str = "false") -> DeclareLaunchArgument:
+    """An argument that is true or false."""
+    return argument(name, default, list(TRUTH_VALUES))
+
+
+def simulator_arguments(shipped: str) -> list[DeclareLaunchArgument]:
+    """The arguments of ``simulator``; the file of parameters is one of ``shipped``, a package and a prefix."""
+    package, prefix = shipped.split("/", 1)
+    # PathJoinSubstitution takes no nested lists before launch 3.4.5: texts side by side are concatenated instead.
+    file = [FindPackageShare(package), f"/{prefix}", LaunchConfiguration("world"), ".yaml"]
+    return [
+        argument("world", "maze3d", WORLDS),
+        argument("parameters", file),
+        argument("namespace", ""),
+        argument("seed", ""),
+        argument("record", ""),
+        switch("use_sim_time"),
+    ]
+
+
+def text(context: LaunchContext, name: str) -> str:
+    """The value of an argument."""
+    return str(LaunchConfiguration(name).perform(context))
+
+
+def is_on(context: LaunchContext, name: str) -> bool:
+    """The value of a ``switch``."""
+    return TRUTH_VALUES[text(context, name)]
+
+
+def node(package: str, executable: str, files: list[object], own: dict, **options: object) -> Node:
+    """A node in the launch file's namespace, with all its topics; ``own`` parameters replace those of ``files``."""
+    return Node(
+        package=package,
+        executable=executable,
+        name=executable,
+        namespace=LaunchConfiguration("namespace"),
+        remappings=[("/tf", "tf"), ("/tf_static", "tf_static")],
+        parameters=[*files, *([own] if own else [])],
+        output="screen",
+        **options,
+    )
+
+
+def simulator(context: LaunchContext, **options: object) -> Node:
+    """The simulator; arguments that are empty leave the file of parameters as it is."""
+    seed, record = text(context, "seed"), text(context, "record")
+    own = {"seed": int(seed)} if seed else {}
+    own |= {"record": record} if record else {}
+    own |= {"publish_clock": True} if is_on(context, "use_sim_time") else {}
+    return node("ngo_sim", text(context, "world"), [LaunchConfiguration("parameters")], own, **options)
+
+
+def viewers(context: LaunchContext) -> list[Node]:
+    """What the arguments rviz and view ask for."""
+    own = {"use_sim_time": True} if is_on(context, "use_sim_time") else {}
+    wanted = []
+    if is_on(context, "rviz"):
+        shown = [FindPackageShare("ngo_bringup"), "/rviz/ngo.rviz"]
+        wanted.append(node("rviz2", "rviz2", [], own, arguments=["-d", shown]))
+    if is_on(context, "view"):
+        wanted.append(node("ngo_estimator", "view_node", [], own))
+    return wanted
