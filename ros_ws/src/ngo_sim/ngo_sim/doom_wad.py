@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ngo_common.files import read_file
+
 Lump = tuple[str, bytes]
 
 # Numbers of line types: of Doom and Boom (exits, then teleporters), and of Hexen, which ZDoom's text format shares.
@@ -95,7 +97,7 @@ def find_wad(wad: str, shipped: Path) -> Path:
 
 def read_wad(path: Path) -> Wad:
     """Read a WAD file. Raises ValueError where it is none."""
-    content = path.read_bytes()
+    content = read_file(path)
     try:
         magic, count, offset = struct.unpack_from("<4sii", content)
         entries = [struct.unpack_from("<ii8s", content, offset + 16 * index) for index in range(count)]

@@ -22,6 +22,7 @@ from tf2_msgs.msg import TFMessage
 from ngo_common.nodes.last_catch import spin_once
 from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.nodes.process import RunError
 from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
@@ -163,7 +164,10 @@ class SimulatorNode(Node):
             message = DiscreteAction(action=int(action))
             message.header.stamp, message.header.frame_id = self._stamp, self.framed(config.base_frame)
             self._action.publish(message)
-            simulation.advance(action)
+            try:
+                simulation.advance(action)
+            except RuntimeError as error:  # the world's process has ended
+                raise RunError(str(error)) from None
         frame = simulation.frame
         simulated_ns = config.stamp_ns(frame.index, simulation.world.period_s)
         stamp_ns = time.time_ns() if config.use_wall_stamps else simulated_ns
