@@ -122,7 +122,7 @@ def load_network(
     description = load_description(path, kind, world)
     try:
         network = build(config_from_dict(config, _without_retired(kind, description.get("config"))))
-    except (ValueError, RuntimeError) as error:  # RuntimeError: sizes that no memory holds
+    except (ValueError, RuntimeError, TypeError) as error:  # the latter two: sizes that no memory holds
         raise CheckpointError(f"{path.with_suffix('.json')}: {' '.join(str(error).split())}") from error
     try:
         content = read_file(path)
