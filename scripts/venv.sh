@@ -50,8 +50,9 @@ install() {
     "$VENV/bin/python" -m pip install --disable-pip-version-check --no-deps --require-hashes "$@"
 }
 step "install the pinned requirements" install "${requirements[@]}"
-if ! "$VENV/bin/python" -m pip show torch 2>/dev/null | grep -q '^Version: .*+cpu'; then
-    step "install the libraries of PyTorch's build for GPUs" install -r requirements/locked_gpu.txt
+# The CPU build where an index has it; PyPI has the one for GPUs alone.
+if ! install -q -r requirements/locked_cpu.txt >/dev/null 2>&1; then
+    step "install PyTorch's build for GPUs" install -r requirements/locked_gpu.txt
 fi
 echo "$underlay" >"$VENV/ngo_underlay"
 echo "$key" >"$VENV/ngo_key"
