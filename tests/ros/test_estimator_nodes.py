@@ -46,8 +46,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def graph(weights: Path) -> Iterator[Graph]:
+def graph(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
     """A running, connected pair of estimators."""
+    own = {"path_rate_hz": 0.0, "save_directory": str(tmp_path_factory.getbasetemp())}
     shared = {
         "world": "maze2d",
         "weights": str(weights / "maze2d"),
@@ -58,7 +59,7 @@ def graph(weights: Path) -> Iterator[Graph]:
         NodeProcess(
             "ngo_estimator", "local_node", {**shared, "image_reliability": "reliable", "image_depth": 1000}
         ) as local,
-        NodeProcess("ngo_estimator", "ngo_node", {**shared, "path_rate_hz": 0.0}) as ngo,
+        NodeProcess("ngo_estimator", "ngo_node", {**shared, **own}) as ngo,
     ):
         graph = Graph(local, ngo, weights / "maze2d", probe)
         graph.connect()
@@ -235,6 +236,7 @@ def test_saved_trajectory_is_what_was_published(graph: Graph, tmp_path: Path) ->
     for path, reason in (
         (tmp_path / "path.csv", "ends in .tum, .txt, .kitti or .g2o"),
         (tmp_path / "no" / "a.tum", "No such file"),
+        (Path("/a.tum"), "expected a file in"),
     ):
         response = save(path)
         assert not response.success

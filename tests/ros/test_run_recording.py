@@ -356,6 +356,27 @@ def test_old_results_are_replaced_as_a_whole(recording: Path, weights: Path, tmp
     assert not list((out / "part2").iterdir())
 
 
+def test_a_run_that_fails_leaves_earlier_results_and_no_others(
+    recording: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    arguments = Arguments((recording,), out, weights=weights, overwrite=True)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("ngo_estimator.nodes.recorded_output.save_plot", full)
+    with pytest.raises(OSError, match="No space left"):
+        run_in_process(arguments, Console(quiet=True))
+    assert not out.exists()
+    out.mkdir()
+    (out / "corrected.tum").write_text("old")
+    with pytest.raises(OSError, match="No space left"):
+        run_in_process(arguments, Console(quiet=True))
+    assert [path.name for path in out.iterdir()] == ["corrected.tum"]
+    assert (out / "corrected.tum").read_text() == "old"
+
+
 def write_wide(path: Path, frames: int) -> None:
     """A drive in the 2D world beside the pictures of another camera, 2 MB each, that nothing makes smaller."""
     noise = np.random.default_rng(0).integers(0, 256, (700, 1000, 3), np.uint8)

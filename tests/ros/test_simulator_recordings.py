@@ -1,9 +1,12 @@
 """What a simulator records is what it publishes: whole, readable by other tools, and after a kill to its last chunk."""
 
+import resource
 import signal
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -139,3 +142,38 @@ def test_the_recorder_script_gets_the_same_bytes_over_dds(tmp_path: Path) -> Non
             chosen = [connection for connection in bag.connections if connection.topic == "/image"]
             images.append([bytes(data) for _, _, data in bag.messages(chosen)])
     assert images[0] == images[1] and len(images[0]) == FRAMES
+
+
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """Files of this process's children end at so many bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_ends_the_node_with_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with full_disk(2**20 + 2**19), NodeProcess("ngo_sim", "maze2d", {"rate": 0.0, "record": str(path)}) as node:
+        assert node.wait() == 1, node.log
+        assert "Traceback" not in node.log, node.log
+        assert f"parameter 'record': {path} cannot be written any further: File too large" in node.lines[-1]
+    with open_recording([path]) as recording:
+        assert recording.topics["/image"].count > 10
+
+
+def test_a_full_disk_ends_the_recorder_with_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    command = [sys.executable, "-m", "training.record", "--out", str(path), "--topics", "image"]
+    with full_disk(2**20 + 2**19):
+        recorder = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    with recorder, NodeProcess("ngo_sim", "maze2d", {"rate": 500.0}):
+        try:
+            _, errors = recorder.communicate(timeout=60)
+        finally:
+            recorder.kill()
+    assert recorder.returncode == 1
+    assert errors == f"record: {path} cannot be written any further: File too large\n"

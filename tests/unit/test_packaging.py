@@ -102,6 +102,41 @@ def test_programs_import_what_the_requirements_have() -> None:
     assert names <= required("runtime.txt", "test.txt", "build.txt")
 
 
+def pins(*files: str) -> set[tuple[str, str, str]]:
+    """Name, version and marker of each pinned requirement; of the marker only what it says about Python 3.11."""
+    found = set()
+    for name in files:
+        text = (ROOT / "requirements" / f"{name}.txt").read_text().replace('"', "'")
+        for package, version, marker in re.findall(r"^([\w.-]+)(?:\[[\w,]+\])?==([^\s;]+) *;?(.*)", text, re.MULTILINE):
+            side = re.search(r"(<|>=) '3\.11'", marker)
+            found.add((package, version, side.group(1) if side else ""))
+    return found
+
+
+def test_every_pin_is_locked_with_hashes_and_nothing_else_is() -> None:
+    """`make venv` installs the locked files alone, each of whose packages needs the hashes of its files."""
+    locked = pins("locked", "locked_ros", "locked_gpu")
+    given = pins("constraints", "runtime", "test", "build", "ros")
+    assert given - locked == set(), "run scripts/lock.sh"
+    windows = {"coloredlogs", "humanfriendly", "pyreadline3", "pywin32"}
+    libraries = {package for package, *_ in pins("locked_gpu")}  # of PyTorch's build for GPUs
+    assert {package for package, *_ in locked - given} <= windows | libraries, (
+        "run scripts/lock.sh, and add them to constraints.txt"
+    )
+    for name in ("locked", "locked_ros", "locked_gpu", "locked_cpu"):
+        entries = re.split(r"(?m)^(?=\w)", (ROOT / "requirements" / f"{name}.txt").read_text())[1:]
+        assert entries and all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries), name
+
+
+def test_licences_of_all_requirements_are_listed_and_the_gpl_stays_in_the_tests() -> None:
+    page = (ROOT / "docs" / "reference" / "licences.md").read_text()
+    listed = set(re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE))
+    assert required("runtime.txt", "test.txt", "build.txt") <= listed
+    outside = [*SOURCES.values(), *(ROOT / folder for folder in PROGRAMS if folder != "tests")]
+    assert not [folder for folder in outside if "evo" in imports_below(folder)]
+    assert "evo" in imports_below(ROOT / "tests"), "otherwise this test says nothing"
+
+
 @pytest.mark.parametrize("name", SOURCES)
 def test_all_packages_have_one_version(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     root = ElementTree.parse(SOURCES[name] / "package.xml").getroot()

@@ -51,10 +51,12 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.writer.close()
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        try:
+            self.writer.close()
+        finally:
+            self._executor.shutdown()
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self._context)
 
     def listen(self, topic: str, listener: Listener) -> None:
         """Call listener with every message of a recorded topic, too."""

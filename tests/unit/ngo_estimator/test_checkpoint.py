@@ -1,6 +1,7 @@
 """Checkpoints: bitwise round trips, and one clear line for every way in which they can be wrong."""
 
 import json
+import os
 import pickle
 import shutil
 from collections.abc import Callable
@@ -182,12 +183,24 @@ def test_another_network_is_refused(weights: Path) -> None:
     assert_one_line(error.value, f"{LOCAL}.json")
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe\x00", b'{"format": 99}', b"\x00" * 50])
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"null", b"\xff\xfe\x00", b'{"format": 99}', b"\x00" * 50, b"[" * 10**6]
+)
 def test_a_description_that_is_none_is_refused(content: bytes, weights: Path) -> None:
     (weights / f"{LOCAL}.json").write_bytes(content)
     with pytest.raises(CheckpointError) as error:
         load_local(weights)
     assert_one_line(error.value, f"{LOCAL}.json")
+
+
+@pytest.mark.parametrize("suffix", [".json", ".safetensors"])
+def test_a_pipe_is_refused_and_not_waited_for(suffix: str, weights: Path) -> None:
+    path = (weights / LOCAL).with_suffix(suffix)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(CheckpointError, match=r"cannot be read \(it is no regular file\)") as error:
+        load_local(weights)
+    assert_one_line(error.value, path.name)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +215,8 @@ def test_a_description_that_is_none_is_refused(content: bytes, weights: Path) ->
         (("width",), True, "width"),
         (("hidden_size",), 2.5, "hidden_size"),
         (("hidden_size",), "256", "hidden_size"),
-        (("hidden_size",), 10**15, "json"),
+        (("hidden_size",), 10**15, "1000000000000000 is given where an integer up to 1000000 is expected"),
+        (("hidden_size",), 10**30, "is given where an integer up to 1000000 is expected"),
         (("relative_std",), 5.0, "relative_std"),
         (("relative_std",), [1.0, 1.0], "relative_std"),
         (("relative_std",), ["a", 1.0, 1.0], "relative_std"),

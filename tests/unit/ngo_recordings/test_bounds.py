@@ -187,3 +187,31 @@ def test_times_that_are_none_are_refused(tmp_path: Path) -> None:
         (tmp_path / "a.tum").write_text(f"1 0 0 0 0 0 0 1\n{stamp} 0 0 0 0 0 0 1\n")
         with pytest.raises(RecordingError, match=r"a\.tum has the stamp"):
             read_tum(tmp_path / "a.tum", 10**9)
+
+
+def test_a_full_disk_ends_the_recording_with_one_line(tmp_path: Path) -> None:
+    """Whatever was asked last: a message, a topic, the end. What was written before can be read."""
+    code = (
+        "import resource, sys; from pathlib import Path\n"
+        "from ngo_recordings.errors import RecordingError\n"
+        "from ngo_recordings.writer import RecordingWriter\n"
+        "writer = RecordingWriter(Path(sys.argv[1]), chunk_bytes=1000)\n"
+        "writer.add_topic('/text', 'std_msgs/msg/String', 'string data')\n"
+        "for k in range(10): writer.write('/text', bytes([k]) * 1000, k)\n"
+        "writer._stream.flush()\n"
+        "size = Path(sys.argv[1]).stat().st_size\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (size + 100, -1))\n"
+        "for work in (lambda: [writer.write('/text', __import__('os').urandom(10**5), k) for k in range(10)],\n"
+        "    lambda: writer.add_topic('/more', 'std_msgs/msg/String', 'string data'),\n"
+        "    lambda: writer.write('/text', b'', 1)):\n"
+        "    try: work()\n"
+        "    except RecordingError as error: print(error)\n"
+        "writer.close()\n"
+    )
+    path = tmp_path / "a.mcap"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert lines == [f"{path} cannot be written any further: File too large", *2 * [f"{path} is closed"]]
+    with open_recording([path]) as recording:
+        assert recording.unfinished == (path,) and recording.topics["/text"].count >= 9

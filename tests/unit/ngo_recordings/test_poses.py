@@ -121,6 +121,7 @@ def test_a_ring_of_transforms_is_no_endless_loop() -> None:
 def test_poses_that_are_no_numbers_are_no_poses() -> None:
     assert make_pose((math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) is None
     assert make_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)) is None
+    assert make_pose((0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 1e300)) is None
     assert make_pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 2.0)) is not None
 
 

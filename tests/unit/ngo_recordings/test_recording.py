@@ -347,3 +347,15 @@ def test_definitions_are_those_that_rosbags_knows() -> None:
         own = get_typestore(Stores.EMPTY)
         own.register(types)
         assert own.hash_rihs01(name) == jazzy.hash_rihs01(name)
+
+
+def test_the_first_message_is_there_or_its_lack_is_said(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/empty", "std_msgs/msg/String", "string data")
+        writer.add_topic("/action", "ngo_msgs/msg/DiscreteAction")
+        for k in range(3):
+            writer.write("/action", m.serialised(m.action(k, k)), 5 - k)
+    with open_recording([tmp_path / "a.mcap"]) as recording:
+        assert recording.first("/action").log_time_ns == 3
+        with pytest.raises(RecordingError, match=r"topic /empty has no message in .*a.mcap"):
+            recording.first("/empty")

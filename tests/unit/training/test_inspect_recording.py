@@ -195,3 +195,12 @@ def test_what_is_unusable_ends_with_one_line_and_exit_code_1(tmp_path: Path) -> 
     assert ended.returncode == 1
     assert ended.stderr.startswith("unusable: images of /image are 'yuv422'; supported: rgb8")
     assert ended.stderr.count("\n") == 1
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_picture(tmp_path: Path) -> None:
+    path = m.write_mcap(tmp_path / "a.mcap", drive(square()))
+    limit = ["prlimit", "--fsize=2000", sys.executable, "-B", "-m", "training.inspect_recording", str(path)]
+    ended = subprocess.run(limit, capture_output=True, text=True, cwd=ROOT)
+    assert (ended.returncode, ended.stderr.count("\n")) == (1, 1), ended.stderr
+    assert ended.stderr.startswith("inspect_recording: the picture cannot be written: ")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]

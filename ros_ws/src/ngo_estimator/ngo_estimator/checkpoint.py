@@ -12,6 +12,7 @@ import safetensors
 from safetensors.torch import load, save
 from torch import nn
 
+from ngo_common.files import read_file
 from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
@@ -94,12 +95,12 @@ def load_description(path: Path, kind: str, world: str | None = None) -> dict[st
     """The JSON beside ``path``, checked to describe a network of ``kind``, trained for ``world`` if one is given."""
     beside = path.with_suffix(".json")
     try:
-        description = json.loads(beside.read_text())
+        description = json.loads(read_file(beside))
     except OSError as error:
         raise CheckpointError(
             f"{beside}: cannot be read ({error.strerror}); expected the description of a {kind}"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{beside}: is not JSON ({error})") from error
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise CheckpointError(f"{beside}: is not a checkpoint description of format {FORMAT}")
@@ -121,10 +122,10 @@ def load_network(
     description = load_description(path, kind, world)
     try:
         network = build(config_from_dict(config, _without_retired(kind, description.get("config"))))
-    except (ValueError, RuntimeError) as error:  # RuntimeError: sizes that no memory holds
+    except (ValueError, RuntimeError, TypeError) as error:  # the latter two: sizes that no memory holds
         raise CheckpointError(f"{path.with_suffix('.json')}: {' '.join(str(error).split())}") from error
     try:
-        content = path.read_bytes()
+        content = read_file(path)
         tensors = load(content)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error

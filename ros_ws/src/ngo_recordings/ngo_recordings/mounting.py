@@ -92,7 +92,7 @@ def mounting_in(tree: TransformTree, base: str, scan_frame: str, source: str = "
 
 
 def _scan_frame(recording: Recording, topics: RecordingTopics) -> str:
-    first = next(iter(recording.messages([topics.image])))
+    first = recording.first(topics.image)
     return str(first.value.header.frame_id).strip("/")
 
 
@@ -101,7 +101,7 @@ def _wheel_frame(recording: Recording, topics: RecordingTopics) -> str:
         return ""
     if topics.wheels.tf is not None:
         return topics.wheels.tf[1]
-    first = next(iter(recording.messages([str(topics.wheels.topic)])))
+    first = recording.first(str(topics.wheels.topic))
     return str(first.value.child_frame_id).strip("/")
 
 

@@ -16,6 +16,7 @@ from ngo_recordings.errors import RecordingError
 
 # Stamps that went through a text file come back rounded; so close they are the same.
 _SAME_NS = 1_000_000
+_LONGEST_QUATERNION = 1e100  # the square of a longer one may overflow
 # Nanoseconds of a later stamp do not fit into 64 bits.
 _END_OF_TIME_S = 9.2e9
 
@@ -49,7 +50,7 @@ class Pose:
 def make_pose(position: tuple[float, float, float], quaternion_xyzw: tuple[float, float, float, float]) -> Pose | None:
     """A pose of numbers; None where they are none, as of a tracker that has lost its target."""
     values = np.array([*position, *quaternion_xyzw])
-    if not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 1e-6:
+    if not np.isfinite(values).all() or not 1e-6 <= math.hypot(*values[3:]) <= _LONGEST_QUATERNION:
         return None
     return Pose(values[:3], Rotation.from_quat(values[3:]))
 

@@ -104,6 +104,12 @@ class Recording:
         streams = [_decoded(source, decoder, wanted) for source, decoder in self._sources]
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
+    def first(self, name: str) -> Message:
+        """The first message of a topic. Raises RecordingError where there is none, whatever the file's index says."""
+        for message in self.messages([name]):
+            return message
+        raise RecordingError(f"topic {name} has no message in {_names(self.paths)}: copy the recording again")
+
 
 def open_recording(paths: Sequence[Path], max_chunk_bytes: int = MAX_CHUNK_BYTES) -> Recording:
     """Open recordings, several as one in order of log time.

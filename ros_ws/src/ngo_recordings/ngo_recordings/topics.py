@@ -250,7 +250,7 @@ def _choose_wheels(
 
 
 def _odometry_frame(recording: Recording, name: str) -> str:
-    first = next(iter(recording.messages([name])))
+    first = recording.first(name)
     return str(getattr(getattr(first.value, "header", None), "frame_id", "")).strip("/")
 
 
@@ -282,7 +282,7 @@ def _filled(recording: Recording, types: Collection[str]) -> list[str]:
 
 
 def _encoding(recording: Recording, name: str) -> str:
-    first = next(iter(recording.messages([name])))
+    first = recording.first(name)
     return str(getattr(first.value, "encoding", ""))  # damaged definitions are told when frames are read
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -46,8 +48,9 @@ class RecordingWriter:
         flush_s: None ends chunks by their size alone: then the same messages make the same bytes.
 
     Raises:
-        RecordingError: the folder exists and is not empty.
-        OSError: the file cannot be written.
+        RecordingError: the folder exists and is not empty. Later, by any method: the disk is full, or gone; the file is
+            closed then, and what it holds can be read.
+        OSError: the file cannot be made.
     """
 
     def __init__(
@@ -109,11 +112,13 @@ class RecordingWriter:
             raise RecordingError(f"topic {topic} was announced twice")
         if type_name not in self._schemas:
             text = message_definition(type_name) if definition is None else definition
-            self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
+            with self._writing():
+                self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
         qos = [_qos(depth, reliable, transient_local)]
-        channel_id = self._writer.register_channel(
-            topic, "cdr", self._schemas[type_name], {"offered_qos_profiles": yaml.safe_dump(qos, sort_keys=False)}
-        )
+        with self._writing():
+            channel_id = self._writer.register_channel(
+                topic, "cdr", self._schemas[type_name], {"offered_qos_profiles": yaml.safe_dump(qos, sort_keys=False)}
+            )
         self._topics[topic] = _Topic(channel_id, type_name, qos)
 
     def write(self, topic: str, cdr: bytes, log_time_ns: int, publish_time_ns: int | None = None) -> None:
@@ -125,7 +130,8 @@ class RecordingWriter:
         published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
         if not (0 <= log_time_ns < 2**63 and 0 <= published_ns < 2**63):
             raise RecordingError(f"a message of {topic} has the time {log_time_ns} ns; expected 0 to 2^63 ns")
-        self._writer.add_message(entry.channel_id, log_time_ns, cdr, published_ns, sequence=entry.count)
+        with self._writing():
+            self._writer.add_message(entry.channel_id, log_time_ns, cdr, published_ns, sequence=entry.count)
         entry.count += 1
         self._first_ns, self._last_ns = min(self._first_ns, log_time_ns), max(self._last_ns, log_time_ns)
         self.flush_if_due()
@@ -135,18 +141,34 @@ class RecordingWriter:
         now_s = time.monotonic()
         if self._flush_s is not None and now_s - self._flushed_s >= self._flush_s:
             self._flushed_s = now_s
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            with self._writing():
+                self._writer.flush()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
         """Write the index (and metadata.yaml) and close the file."""
         if self._closed:
             return
+        with self._writing():
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.close()
+            if self._folder is not None:
+                facts = {"rosbag2_bagfile_information": self._metadata()}
+                text = yaml.dump(facts, Dumper=_WithoutAliases, sort_keys=False)
+                (self._folder / "metadata.yaml").write_text(text)
         self._closed = True
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.close()
-        if self._folder is not None:
-            text = yaml.dump({"rosbag2_bagfile_information": self._metadata()}, Dumper=_WithoutAliases, sort_keys=False)
-            (self._folder / "metadata.yaml").write_text(text)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Around everything that writes: a disk that takes no more ends the recording, with one line."""
+        if self._closed:
+            raise RecordingError(f"{self.file} is closed")
+        try:
+            yield
+        except OSError as error:
+            self._closed = True
+            with suppress(OSError):  # of what is still in its buffer
+                self._stream.close()
+            raise RecordingError(f"{self.file} cannot be written any further: {error.strerror}") from None
 
     def _metadata(self) -> dict[str, object]:
         """What rosbag2 of Jazzy (version 9) writes about a recording of one file."""

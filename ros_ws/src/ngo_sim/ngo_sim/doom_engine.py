@@ -6,6 +6,8 @@ import math
 import os
 import shlex
 import shutil
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Sequence
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from vizdoom import Button, GameVariable, ScreenResolution
 
 from ngo_sim.doom_map import UNITS_PER_M
-from ngo_sim.doom_wad import Lump, write_lumps
+from ngo_sim.doom_wad import Lump, read_wad, write_lumps
 
 SHIPPED = Path(vizdoom.__file__).parent
 """Where ViZDoom keeps the two games of freedoom, and below it its scenarios."""
@@ -38,6 +40,8 @@ RESOLUTIONS = {
 # A new map ignores input for 7 tics, and its field of view changes by 7 degrees a tic at most.
 _SETTLING_TICS = 20
 _ENGINE_SEED = 1
+_REHEARSED_STEPS = 35
+_REHEARSAL_S = 60.0
 _WORKING_DIRECTORY_LOCK = threading.Lock()
 
 
@@ -57,12 +61,23 @@ class DoomEngine:
     def running(self) -> bool:
         return self._game is not None
 
-    def start(self, lumps: Sequence[Lump], first_map: str, game_wad: Path = MAZE_GAME, harmless: bool = False) -> None:
+    def start(
+        self,
+        lumps: Sequence[Lump],
+        first_map: str,
+        game_wad: Path = MAZE_GAME,
+        harmless: bool = False,
+        rehearse: bool = False,
+    ) -> None:
         """Start the process anew with the maps in these lumps; `game_wad` has the textures.
 
         harmless: no monsters, no harm to the player, and doors open to the player that stands still before them.
+        rehearse: first in a process of its own, because a bad map ends the engine and the process that has started it.
+        Raises ValueError where that one dies.
         """
         self.close()
+        if rehearse:
+            _rehearse(lumps, first_map, game_wad)
         self._harmless = harmless
         # The running process keeps its files open and needs their names no more: nothing is left of a killed one.
         with tempfile.TemporaryDirectory(prefix="ngo_maze3d_", ignore_cleanup_errors=True) as folder:
@@ -161,3 +176,31 @@ def _launcher(folder: Path) -> Path:
     script.write_text(f'#!/bin/sh\nexec {shlex.quote(setpriv)} --pdeathsig KILL -- {shlex.quote(str(engine))} "$@"\n')
     script.chmod(0o700)
     return script
+
+
+def _rehearse(lumps: Sequence[Lump], first_map: str, game_wad: Path) -> None:
+    """Have a process of its own start the engine and walk; raises ValueError where it does not come back well."""
+    with tempfile.TemporaryDirectory(prefix="ngo_maze3d_", ignore_cleanup_errors=True) as folder:
+        write_lumps(Path(folder, "maps.wad"), lumps)
+        command = [sys.executable, "-m", __name__, str(Path(folder, "maps.wad")), first_map, str(game_wad)]
+        try:
+            done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=_REHEARSAL_S)
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"map is {first_map!r}, with which the engine hangs") from None
+    if done.returncode:
+        line = done.stderr.strip().splitlines()[-1] if done.returncode > 0 and done.stderr.strip() else "it dies"
+        raise ValueError(f"map is {first_map!r}, which is damaged: the engine cannot run it ({line})")
+
+
+def _walk(wad: Path, name: str, game_wad: Path) -> None:
+    """Start the engine with a map and walk; what a bad map does to the engine happens in this process."""
+    engine = DoomEngine(*min(RESOLUTIONS), 90, 2)
+    engine.start(read_wad(wad).lumps, name, game_wad, harmless=True)
+    engine.enter(name)
+    for step in range(_REHEARSED_STEPS):
+        engine.advance(25, 10.0, use=step % 8 == 0)
+    engine.close()
+
+
+if __name__ == "__main__":
+    _walk(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))

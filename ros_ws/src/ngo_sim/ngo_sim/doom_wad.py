@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ngo_common.files import read_file
+
 Lump = tuple[str, bytes]
 
 # Numbers of line types: of Doom and Boom (exits, then teleporters), and of Hexen, which ZDoom's text format shares.
@@ -24,6 +26,7 @@ _BINARY_MAP = {
     *("THINGS", "LINEDEFS", "SIDEDEFS", "VERTEXES", "SEGS", "SSECTORS", "NODES", "SECTORS", "REJECT", "BLOCKMAP"),
     *("BEHAVIOR", "SCRIPTS", "DIALOGUE"),
 }
+_MOST_SHARED = 8
 _EMPTY_SCRIPTS = b"ACS\0" + struct.pack("<iii", 8, 0, 0)
 
 
@@ -51,15 +54,19 @@ class Wad:
                 found[name] = range(first, end)
         return found
 
+    def map_lumps(self, name: str) -> list[Lump]:
+        """The lumps of the map of this name (in any case). Raises ValueError where there is none."""
+        maps = self.maps()
+        if name.upper() not in maps:
+            raise ValueError(f"map is {name!r}; {self.path.name} has {', '.join(maps) or 'none'}")
+        return [self.lumps[index] for index in maps[name.upper()]]
+
     def still_map(self, name: str) -> list[Lump]:
         """The lumps of the map of this name (in any case), without exits, teleporters and scripts.
 
         Raises ValueError where there is none.
         """
-        maps = self.maps()
-        if name.upper() not in maps:
-            raise ValueError(f"map is {name!r}; {self.path.name} has {', '.join(maps) or 'none'}")
-        lumps = [self.lumps[index] for index in maps[name.upper()]]
+        lumps = self.map_lumps(name)
         names = {lump for lump, _ in lumps}
         if "TEXTMAP" in names:
             return [
@@ -95,12 +102,14 @@ def find_wad(wad: str, shipped: Path) -> Path:
 
 def read_wad(path: Path) -> Wad:
     """Read a WAD file. Raises ValueError where it is none."""
-    content = path.read_bytes()
+    content = read_file(path)
     try:
         magic, count, offset = struct.unpack_from("<4sii", content)
         entries = [struct.unpack_from("<ii8s", content, offset + 16 * index) for index in range(count)]
         if magic not in (b"IWAD", b"PWAD") or any(at < 0 or at + size > len(content) for at, size, _ in entries):
             raise ValueError(magic)
+        if sum(size for _, size, _ in entries) > _MOST_SHARED * len(content):  # the same bytes over and over
+            raise ValueError(count)
         lumps = [(name.split(b"\0")[0].decode("ascii").upper(), content[at : at + size]) for at, size, name in entries]
     except (struct.error, ValueError):
         raise ValueError(f"wad is {str(path)!r}, which is damaged or no WAD file") from None

@@ -207,7 +207,8 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
             if "maze_seed" in options:
                 raise ValueError("options has 'maze_seed'; a Doom map has no maze of a seed")
             if not self._engine.running:
-                self._engine.start(self._level.lumps, self._level.name, self._level.game_wad, harmless=True)
+                level = self._level
+                self._engine.start(level.lumps, level.name, level.game_wad, harmless=True, rehearse=not level.shipped)
             map_name = self._level.name
         else:
             seeds = (seed, int(options.get("maze_seed", seed)))

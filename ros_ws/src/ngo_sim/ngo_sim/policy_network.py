@@ -14,6 +14,8 @@ import numpy.typing as npt
 import safetensors
 from safetensors.numpy import load
 
+from ngo_common.files import read_file
+
 FORMAT = 1
 NETWORK = "driver"
 SHIPPED = Path(__file__).with_name("weights") / "driver.safetensors"
@@ -202,13 +204,13 @@ def load_policy(path: Path = SHIPPED) -> PolicyNetwork:
     """
     beside = path.with_suffix(".json")
     try:
-        description, content = json.loads(beside.read_text()), path.read_bytes()
+        description, content = json.loads(read_file(beside)), read_file(path)
         tensors = load(content)
     except OSError as error:
         raise ValueError(
             f"{error.filename}: cannot be read ({error.strerror}); expected a driver's weights, or the JSON beside them"
         ) from error
-    except (ValueError, safetensors.SafetensorError) as error:
+    except (ValueError, RecursionError, safetensors.SafetensorError) as error:
         raise ValueError(f"{path}: it or the JSON beside it is damaged ({error})") from error
     if not isinstance(description, dict) or (description.get("format"), description.get("network")) != (
         FORMAT,

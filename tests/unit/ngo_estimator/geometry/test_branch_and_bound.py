@@ -137,3 +137,12 @@ def test_wrong_arguments_are_refused() -> None:
         search(CONFIG, grid, room(), np.zeros(3), np.array((1.0, -1.0, 0.1)))
     with pytest.raises(ValueError, match="resolution_m"):
         SearchConfig(resolution_m=0.0)
+
+
+@pytest.mark.parametrize("far", [1e4, 1e9, 1e30])
+def test_a_wild_point_takes_no_memory(far: float) -> None:
+    room = np.random.default_rng(0).uniform(-5.0, 5.0, (200, 2))
+    wild = np.concatenate((room, [[far, 0.0], [0.0, -far]]))
+    grid, alone = pooled_grid(SearchConfig(), wild), pooled_grid(SearchConfig(), room)
+    np.testing.assert_array_equal(grid.levels, alone.levels)
+    assert pooled_grid(SearchConfig(), np.array([[far, 0.0], [0.0, -far]])).levels.nbytes < 1e8

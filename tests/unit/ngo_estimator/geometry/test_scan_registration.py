@@ -124,3 +124,15 @@ def test_no_steps_and_no_pairs_give_back_what_came() -> None:
 def test_a_registration_that_cannot_be_is_refused(change: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RegistrationConfig(**{**vars(CONFIG), **change})
+
+
+def test_pairs_about_which_nothing_is_known_stay_and_harm_no_other() -> None:
+    """Without points and without a prior no direction is fixed: the equations of that pair are singular."""
+    a, b = pose(1.5, 1.2, 0.3), pose(1.7, 1.0, 0.7)
+    seen = torch.cat((ranges_at(a), torch.zeros(1, RAYS))), torch.cat((ranges_at(b), torch.zeros(1, RAYS)))
+    start = se2.between(a, b).repeat(2, 1) + 0.02
+    log_std = torch.stack((PRIOR, torch.full((2,), 100.0)))
+    found, after = register(CONFIG, *seen, start, log_std, 5)
+    alone, _ = register(CONFIG, ranges_at(a), ranges_at(b), start[:1], PRIOR, 5)
+    assert torch.equal(found[0], alone[0]) and torch.equal(found[1], start[1].float().double())
+    assert torch.equal(after[1], log_std[1])

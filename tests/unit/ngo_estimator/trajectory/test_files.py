@@ -140,12 +140,25 @@ def test_tum_of_others_is_read(tmp_path: Path) -> None:
         ("1 0 0 0 0 0 0 0\n", "orientation 0 0 0 0"),
         ("1 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n", "line 2 has the stamp 1.0; expected one later"),
         ("# nothing\n", "has no poses"),
+        ("1e999999999 0 0 0 0 0 0 1\n", "stamp 1e999999999; expected seconds from 0 to 9223372036"),
+        ("-1 0 0 0 0 0 0 1\n", "stamp -1; expected seconds from 0"),
+        ("9223372037 0 0 0 0 0 0 1\n", "stamp 9223372037; expected seconds"),
+        ("1 0 0 0 1e300 1e300 0 1\n", "orientation 1e300 1e300 0 1; expected"),
     ],
 )
 def test_what_is_not_tum_is_an_error_that_names_the_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "bad.tum").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_tum(tmp_path / "bad.tum")
+
+
+def test_what_is_no_text_or_no_file_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "bad.tum").write_bytes(b"\xff\xfe1 0 0 0")
+    with pytest.raises(ValueError, match=r"bad\.tum is no text"):
+        read_tum(tmp_path / "bad.tum")
+    os.mkfifo(tmp_path / "pipe.tum")
+    with pytest.raises(OSError, match="it is no regular file"):
+        read_tum(tmp_path / "pipe.tum")
 
 
 def test_other_endings_and_empty_trajectories_are_errors(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from ngo_common.nodes.last_catch import answer_always, spin_once
 from ngo_common.settings import BadParameter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -25,12 +26,16 @@ class StartError(Exception):
     """A node cannot start; the message is one line for the user."""
 
 
+class RunError(Exception):
+    """A running node cannot go on; the message is one line for the user."""
+
+
 def spin(node: Node, ended: Callable[[], bool]) -> None:
-    """Call the node's callbacks until ``ended()``."""
+    """Call the node's callbacks until ``ended()``; an error in one is reported, and does not end the node."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not ended():
-        executor.spin_once(timeout_sec=_WAIT_S)
+        spin_once(node, executor, _WAIT_S)
 
 
 def run_node(
@@ -43,8 +48,8 @@ def run_node(
     """Make a node, run it until SIGINT or SIGTERM or until ``run`` returns, and return the process's exit code.
 
     The code is 0 after a signal and at the end of ``run``. It is 2 where the node could not start (arguments that
-    cannot be read, a ``BadParameter``, a ``StartError``), with one line that says why. ``--help`` prints ``usage``
-    instead of starting the node.
+    cannot be read, a ``BadParameter``, a ``StartError``) and 1 where it could not go on (a ``RunError``), with one line
+    that says why. ``--help`` prints ``usage`` instead of starting the node.
 
     args: the command line, ``sys.argv`` by default.
     """
@@ -65,19 +70,25 @@ def run_node(
             return 0
         with _argument_errors():
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = create()
-        run(node, lambda: signalled)
+        try:
+            node = create()
+            answer_always(node, node.services)
+            run(node, lambda: signalled)
+        finally:
+            if node is not None:
+                node.destroy_node()
         return 0
     except (BadParameter, StartError, InvalidParameterTypeException) as error:
         get_logger(name).fatal(" ".join(str(error).split()))
         return 2
-    except Exception:
-        if not signalled:
+    except Exception as error:
+        if signalled:
+            return 0  # a child process, which a terminal signals as well, ended sooner
+        if not isinstance(error, RunError):
             raise
-        return 0  # a child process, which a terminal signals as well, ended sooner
+        get_logger(name).fatal(" ".join(str(error).split()))
+        return 1
     finally:
-        if node is not None:
-            node.destroy_node()
         rclpy.try_shutdown()
 
 

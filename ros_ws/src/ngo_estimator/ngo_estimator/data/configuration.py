@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 
 Config = TypeVar("Config")
 
+_LARGEST_INTEGER = 10**6  # of a network's sizes: a layer of a larger one may take all memory before it fails
+
 
 def config_from_dict(kind: type[Config], values: Any) -> Config:
     """Build a (nested) configuration dataclass from JSON values; unknown and missing keys are errors."""
@@ -44,6 +46,8 @@ def _from_json(hint: Any, value: Any) -> Any:
     allowed = (int, float) if hint is float else hint
     if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
         raise ValueError(f"{value!r} is given where {hint.__name__} is expected")
+    if hint is int and abs(value) > _LARGEST_INTEGER:
+        raise ValueError(f"{str(value)[:20]} is given where an integer up to {_LARGEST_INTEGER} is expected")
     if hint is not float:
         return value
     try:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import TypeVar
 
+from ngo_common.files import read_file
 from ngo_estimator.data.configuration import config_from_dict
 
 LIDAR_FILE = "lidar.json"
@@ -30,7 +31,7 @@ def read_lidar_file(weights: Path, section: str, kind: type[Config], world: str 
     """
     path = weights / LIDAR_FILE
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(read_file(path))
     except OSError as error:
         raise LidarFileError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:

@@ -132,6 +132,7 @@ def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Te
     pose = start
     information = torch.diag_embed(prior)
     share = torch.zeros_like(start[:, 0])
+    solved = torch.ones_like(share, dtype=torch.bool)  # not where prior and points together leave a direction open
     variance = config.noise_m**2 + points.square().sum(-1) * config.noise_share**2
     least = config.last_tolerance * variance.sqrt()
     for step in range(steps):
@@ -153,9 +154,11 @@ def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Te
         moved = se2.wrapped(start - pose)
         information = weighted.mT @ jacobian + torch.diag_embed(prior)
         gradient = -(weighted * distance.unsqueeze(-1)).sum(1) + prior * moved
-        pose = pose + torch.linalg.solve(information, gradient)
+        change, singular = torch.linalg.solve_ex(information, gradient)
+        solved &= (singular == 0) & change.isfinite().all(-1)
+        pose = torch.where(solved.unsqueeze(-1), pose + change, pose)
         share = weight.sum(-1) / both.sum(-1).clamp(min=_SEEN_BY_BOTH * config.rays)
-    return _where_better(start, log_std, prior, se2.wrapped(pose), information, share)
+    return _where_better(start, log_std, prior, se2.wrapped(pose), information, share * solved)
 
 
 def _surfaces(a: Tensor, b: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -179,9 +182,10 @@ def _where_better(
     start: Tensor, log_std: Tensor, prior: Tensor, pose: Tensor, information: Tensor, share: Tensor
 ) -> tuple[Tensor, Tensor]:
     moved = se2.wrapped(pose - start)
-    covariance = torch.linalg.inv(information)
+    covariance, singular = torch.linalg.inv_ex(information)
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     after = torch.stack((variance[:, :2].mean(-1), variance[:, 2]), dim=-1).log() * 0.5
     good = (share >= _FEWEST) & ((moved.square() * prior).sum(-1) <= _FARTHEST) & after.isfinite().all(-1)
+    good &= singular == 0
     good = (good & pose.isfinite().all(-1)).unsqueeze(-1)
     return torch.where(good, pose, start), torch.where(good, after, log_std)

@@ -48,7 +48,7 @@ _PATH_TYPE = "nav_msgs/msg/Path"
 
 
 def remove_results(folder: Path) -> None:
-    """Remove the results of an earlier run, so that none of them passes for one of the next."""
+    """Remove the results of an earlier run, so that none of them passes for one of this."""
     for place in (folder, *folder.glob(f"{PART}[0-9]*")):
         for name in _FILES:
             (place / name).unlink(missing_ok=True)

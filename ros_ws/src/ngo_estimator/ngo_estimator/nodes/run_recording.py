@@ -26,6 +26,7 @@ from ament_index_python.packages import get_package_share_directory
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ngo_common.files import folder_whole
 from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
@@ -117,11 +118,23 @@ class Arguments:
 def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     """Run both estimators over the recording, write the results and return the content of run.json.
 
+    The results come all at once, at the end; those of an earlier run stay until then.
+
     Raises:
-        ValueError, OSError: with one line about a file that cannot be read, used or written.
+        ValueError, OSError: with one line about a file that cannot be read, used or written. There are no results then.
     """
     arguments.check()
-    settings = arguments.report_settings
+    with folder_whole(arguments.out) as out:
+        result = _run(arguments, out, console)
+        (out / "run.json").write_text(json.dumps(result, indent=1) + "\n")
+        from ngo_estimator.nodes.recorded_output import remove_results
+
+        remove_results(arguments.out)
+    return result
+
+
+def _run(arguments: Arguments, out: Path, console: Console) -> dict[str, Any]:
+    """Run both estimators, write into ``out``, and return the content of run.json."""
     with open_recording(arguments.recordings) as recording:
         folder = arguments.weights_folder(recording)
         core: RecordingRun | LidarRun
@@ -130,7 +143,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         else:
             world, topics, core, events = _networks(arguments, folder, recording, console)
         began_s = time.monotonic()
-        trajectories = _run(arguments, settings, recording, topics, core, events, scan_source(folder), console)
+        trajectories = _write(arguments, out, recording, topics, core, events, scan_source(folder), console)
     took_s = time.monotonic() - began_s
     if not trajectories:
         why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
@@ -138,7 +151,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     for line in _losses(core, max(core.frames, recording.topics[topics.image].count)):
         console.print(line, soft_wrap=True, highlight=False)
     console.print(f"{core.frames} frames in {took_s:.1f} s, {core.frames / took_s:.0f} frames/s", highlight=False)
-    result = {
+    return {
         "recordings": [str(path) for path in arguments.recordings],
         "weights": world,
         "window_frames": arguments.window_frames,
@@ -151,13 +164,11 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
         **core.facts,
         "trajectories": trajectories,
     }
-    (arguments.out / "run.json").write_text(json.dumps(result, indent=1) + "\n")
-    return result
 
 
-def _run(
+def _write(
     arguments: Arguments,
-    settings: ReportSettings,
+    out: Path,
     recording: Recording,
     topics: RecordingTopics,
     core: "RecordingRun | LidarRun",
@@ -166,20 +177,20 @@ def _run(
     console: Console,
 ) -> list[dict[str, Any]]:
     """Run over all frames; for each trajectory the folder of its results and how many poses it has."""
-    from ngo_estimator.nodes.recorded_output import PART, RecordedOutput, remove_results
+    from ngo_estimator.nodes.recorded_output import PART, RecordedOutput
     from ngo_estimator.offline.recording_run import RecordedStep
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     found: list[dict[str, Any]] = []
     output: RecordedOutput | None = None
-    remove_results(arguments.out)
+    settings = arguments.report_settings
     screen = Console(stderr=True)
     bar = Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal)
     with ExitStack() as stack, bar as progress:
         task = progress.add_task(topics.image, total=recording.topics[topics.image].count)
         for event in events:
             if output is None:
-                folder = arguments.out if not found else arguments.out / f"{PART}{len(found) + 1}"
+                folder = out if not found else out / f"{PART}{len(found) + 1}"
                 names = arguments.base_frame, arguments.odom_frame, arguments.map_frame
                 output = stack.enter_context(RecordedOutput(folder, *names, source))
             if isinstance(event, RecordedStep):
@@ -190,7 +201,7 @@ def _run(
                 continue
             found.append(
                 {
-                    "folder": output.folder.relative_to(arguments.out).as_posix(),
+                    "folder": output.folder.relative_to(out).as_posix(),
                     "poses": len(event.trajectory.stamps_ns),
                 }
             )
@@ -229,7 +240,8 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
     _check_side_information(topics, local)
     console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
     core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
-    return local.world, topics, core, core.run(frames_of(recording, topics, core.rejected))
+    frames = frames_of(recording, topics, core.rejected, local.image_format.largest_picture)
+    return local.world, topics, core, core.run(frames)
 
 
 def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":

@@ -143,7 +143,10 @@ class MetaGraph:
     def _complete_block(self) -> None:
         block = self.blocks
         count = (block + 1) * self._block
-        self._register(count - self._block)
+        try:
+            self._register(count - self._block)
+        except Exception as error:  # numerics of a library, or a fault of ours: the steps stay as they came
+            self.fail(error, "the registration of steps")
         steps = torch.from_numpy(self._relative.slice(count - self._block)).unsqueeze(0)
         in_block = poses_in_blocks(steps, self._block)
         log_std = torch.from_numpy(self._log_std.slice(count - self._block)).unsqueeze(0)
@@ -155,19 +158,27 @@ class MetaGraph:
         self._nodes.append(se2.compose(torch.from_numpy(self._nodes.values[-1]), relative).numpy())
         if self._optimizer.config.network or self._optimizer.config.smoother is not None:
             self._aggregate(block)
-        if self._loops is not None:
-            fresh = self.blocks - self._result_last <= _FRESH
-            if fresh and block - _AGAIN >= self._first:
-                self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
-            found = self._loops.find(block, self._first, self._keys)
-            if fresh:
-                found = found.and_also(self._loops.find_overlaps(block, self._first, self._nodes.values, self._keys))
-            if len(self._keys):
-                self._loops.limit_drift(found, self._drift(found))
+        try:
+            self._find_loops(block)
+        except Exception as error:  # as above: it may cost loops, and nothing else
+            self.fail(error, "the search for loops")
         while self.blocks - self._first > self._window:
             self._slide()
         if self._keys.crowded:
             self._thin()
+
+    def _find_loops(self, block: int) -> None:
+        """Look for loops of the newest block, whose number is ``block``, and for overlaps of a slightly older one."""
+        if self._loops is None:
+            return
+        fresh = self.blocks - self._result_last <= _FRESH
+        if fresh and block - _AGAIN >= self._first:
+            self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
+        found = self._loops.find(block, self._first, self._keys)
+        if fresh:
+            found = found.and_also(self._loops.find_overlaps(block, self._first, self._nodes.values, self._keys))
+        if len(self._keys):
+            self._loops.limit_drift(found, self._drift(found))
 
     def _register(self, first: int) -> None:
         """Measure the newest block again, which begins with the step of number ``first``."""
@@ -304,9 +315,13 @@ class MetaGraph:
         running.took_s += time.perf_counter() - began
         if running.left or running.result is None:
             return False
+        end = self._scale * running.result.end_covariance()[0].numpy()
+        poses = running.result.meta_relative[-1]
+        if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running, self.took_s = None, running.took_s
         self._apply(running, running.result)
-        self._pose, self._covariance = self._newest()
+        self._pose, self._covariance = self._newest(end)
         self.optimized = True
         return True
 
@@ -338,9 +353,9 @@ class MetaGraph:
         """Leave undone what has begun."""
         self._running = None
 
-    def fail(self, error: Exception) -> None:
+    def fail(self, error: Exception, work: str = "an optimisation") -> None:
         """Leave undone what has begun, and keep why: every node is where it was."""
-        self.fault = f"an optimisation failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self.fault = f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
         self.abandon()
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
@@ -359,18 +374,16 @@ class MetaGraph:
         poses: np.ndarray = torch.cat((nodes[:1], corrected, tail)).numpy()
         return poses
 
-    def _newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
+    def _newest(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``.
+
+        Args:
+            covariance: that of the last node in the map ``(3, 3)``.
+        """
         whole = self.blocks * self._block
         odometry = torch.from_numpy(self.odometry.values[whole:])
         poses = se2.compose(torch.from_numpy(self._nodes.values[-1]), se2.between(odometry[0], odometry)).numpy()
-        covariance = self.end_covariance()
         steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
         for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
             covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))
         return poses[-1], covariance
-
-    def end_covariance(self) -> np.ndarray:
-        """Covariance ``(3, 3)`` of the last node that was optimised, in the map."""
-        assert self._result is not None
-        return self._scale * self._result.end_covariance()[0].numpy()

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.data.relative_step import (
+    LARGEST_ODOMETRY,
     LARGEST_VALUE,
     RESTART_AFTER_NS,
     DuplicateStep,
@@ -95,7 +96,8 @@ class StepLog:
             self._begin(step)
         self.stamps_ns.append(step.stamp_ns)
         self.odometry.append(step.odom_xyyaw)
-        self.odometry_std.append(np.sqrt(np.diagonal(covariance)))
+        # Beyond it the motion is unknown all the same, and float32 would hold infinity, which no file takes.
+        self.odometry_std.append(np.sqrt(np.diagonal(covariance)).clip(max=LARGEST_ODOMETRY))
         return TakenStep(relative, covariance, begins, restarted, gap)
 
     def _over_gap(self, step: RelativeStep, last_ns: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ The KITTI format has no place for stamps: they lie beside it in ``NAME.times.txt
 are those of the robot's base (x forward, y left), as in the other formats; KITTI's own are of a camera.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -18,12 +19,16 @@ from typing import Any
 
 import numpy as np
 
+from ngo_common.files import read_file
 from ngo_estimator.data.whole_files import write_together
+from ngo_estimator.trajectory.save_path import check_replaceable
 
 ENDINGS = (".tum", ".txt", ".kitti", ".g2o")
 TUM_ENDINGS = (".tum", ".txt")
 
 _NS = 1_000_000_000
+_LONGEST_QUATERNION = 1e100  # the square of a longer one may overflow
+_END_OF_TIME_S = (2**63 - 1) // _NS  # nanoseconds of a later stamp do not fit into 64 bits
 _KITTI, _TIMES = ".kitti", ".times.txt"
 
 
@@ -91,7 +96,7 @@ def write_trajectory(
         The files written: ``path``, and for ``.kitti`` the one of the stamps.
 
     Raises:
-        ValueError: another ending, or no pose to write.
+        ValueError: another ending, no pose to write, or something at its place that is no regular file.
         OSError: a file cannot be written; those that were there before still are.
     """
     if path.suffix not in ENDINGS:
@@ -148,7 +153,11 @@ def read_tum(path: Path) -> SpatialPoses:
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    try:
+        text = read_file(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no text ({error.reason}); expected a TUM file") from None
+    for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -159,8 +168,10 @@ def read_tum(path: Path) -> SpatialPoses:
             raise ValueError(f"{where} is '{line[:80]}'; expected numbers: timestamp tx ty tz qx qy qz qw") from None
         if len(row) != 7 or not stamp.is_finite() or not np.isfinite(row).all():
             raise ValueError(f"{where} has {len(words)} numbers; expected 8 that are finite")
-        if not np.linalg.norm(row[3:]) > 0.0:
-            raise ValueError(f"{where} has the orientation 0 0 0 0; expected a quaternion qx qy qz qw")
+        if not 0.0 < math.hypot(*row[3:]) < _LONGEST_QUATERNION:
+            raise ValueError(f"{where} has the orientation {' '.join(words[4:])}; expected a quaternion qx qy qz qw")
+        if not 0 <= stamp < _END_OF_TIME_S:
+            raise ValueError(f"{where} has the stamp {words[0][:40]}; expected seconds from 0 to {_END_OF_TIME_S}")
         stamps.append(int((stamp * _NS).to_integral_value()))
         if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
             raise ValueError(f"{where} has the stamp {words[0]}; expected one later than in the line before")
@@ -201,4 +212,6 @@ def _g2o_lines(poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges]) -> Iterator[
 
 
 def _write_lines(contents: Mapping[Path, Iterable[str]]) -> list[Path]:
+    for path in contents:
+        check_replaceable(path)
     return write_together({path: (f"{line}\n".encode() for line in lines) for path, lines in contents.items()})

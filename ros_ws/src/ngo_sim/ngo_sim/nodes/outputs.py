@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 
+from ngo_common.nodes.process import RunError
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import BadParameter
 from ngo_recordings.errors import RecordingError
@@ -31,7 +34,8 @@ class Output:
             self.publisher.publish(message)
             return
         cdr = serialize_message(message)
-        self._recording.writer.write(self.publisher.topic_name, cdr, self._recording.now_ns)
+        with _disk_errors():
+            self._recording.writer.write(self.publisher.topic_name, cdr, self._recording.now_ns)
         self.publisher.publish(cdr)
 
 
@@ -43,11 +47,20 @@ class Recording:
         self.now_ns = 0
 
 
+@contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Around the recording of a running node: a run whose recording has ended ends, too."""
+    try:
+        yield
+    except RecordingError as error:
+        raise RunError(f"parameter 'record': {error}") from None
+
+
 class Outputs:
     """All topics of a node. record: a file ending in .mcap, or a folder for rosbag2's layout; empty: no recording.
 
     Log times are the stamps of the frames, so a recording does not depend on how fast it was made. Raises BadParameter
-    where something is there already, or nothing can be written.
+    where something is there already, or nothing can be written, and RunError where the disk takes no more later on.
     """
 
     def __init__(self, node: Node, qos: QoSProfile, record: str) -> None:
@@ -66,7 +79,7 @@ class Outputs:
             except (OSError, RecordingError) as error:
                 raise BadParameter(f"parameter 'record' is {record!r}, which cannot be written: {error}") from None
             # Nothing else closes the file of a node that is interrupted while it starts.
-            weakref.finalize(self, self._recording.writer.close)
+            weakref.finalize(self, _closed, self._recording.writer)
 
     def create(self, message_type: type, topic: str, qos: QoSProfile | None = None) -> Output:
         """A topic to publish on; qos: that of the sensors by default."""
@@ -94,9 +107,16 @@ class Outputs:
     def flush_if_due(self) -> None:
         """Write buffered messages to the file once a period."""
         if self._recording is not None:
-            self._recording.writer.flush_if_due()
+            with _disk_errors():
+                self._recording.writer.flush_if_due()
 
     def close(self) -> None:
         """End the recording."""
         if self._recording is not None:
-            self._recording.writer.close()
+            with _disk_errors():
+                self._recording.writer.close()
+
+
+def _closed(writer: RecordingWriter) -> None:
+    with suppress(RecordingError):  # nobody is left to be told
+        writer.close()

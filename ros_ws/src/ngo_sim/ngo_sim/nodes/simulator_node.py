@@ -19,7 +19,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.last_catch import spin_once
+from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.nodes.process import RunError
 from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
@@ -48,6 +51,7 @@ class SimulatorNode(Node):
         self.world_config: Any = world.values
         self._live.lock()
         world.lock()
+        self._name_watch = NameWatch(self)
         self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
         # Deep enough for late acknowledgements of a reliable reader: far more than the frames in flight.
         qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
@@ -115,6 +119,7 @@ class SimulatorNode(Node):
             if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
                 self._looked_s = now_s
                 self._consumers.look()
+                self._name_watch.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
                     self.image_publisher.wait_for_all_acked(Duration(seconds=5))
@@ -126,7 +131,7 @@ class SimulatorNode(Node):
             self.outputs.flush_if_due()
             if idle_s > 0.0 or now_s - listened_s >= _LISTEN_S:
                 listened_s = now_s
-                executor.spin_once(timeout_sec=idle_s)
+                spin_once(self, executor, idle_s)
 
     def _ready_line(self) -> str:
         """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""
@@ -159,7 +164,10 @@ class SimulatorNode(Node):
             message = DiscreteAction(action=int(action))
             message.header.stamp, message.header.frame_id = self._stamp, self.framed(config.base_frame)
             self._action.publish(message)
-            simulation.advance(action)
+            try:
+                simulation.advance(action)
+            except RuntimeError as error:  # the world's process has ended
+                raise RunError(str(error)) from None
         frame = simulation.frame
         simulated_ns = config.stamp_ns(frame.index, simulation.world.period_s)
         stamp_ns = time.time_ns() if config.use_wall_stamps else simulated_ns

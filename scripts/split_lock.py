@@ -1,0 +1,28 @@
+"""Sorts one lock file into requirements/locked.txt, locked_ros.txt, locked_gpu.txt and locked_cpu.txt."""
+
+import re
+import sys
+from pathlib import Path
+
+REQUIREMENTS = Path(__file__).parents[1] / "requirements"
+KINDS = {"locked_gpu": r"(nvidia[\w-]*|cuda[\w-]*|triton|torch)==", "locked_ros": r"ros-", "locked": r""}
+
+
+def main(whole: Path, torch_hashes: list[str]) -> None:
+    """Write the four files; their comments stay. torch_hashes: of PyTorch's CPU builds, which are not on PyPI."""
+    parts: dict[str, list[str]] = {kind: [] for kind in (*KINDS, "locked_cpu")}
+    for entry in filter(str.strip, re.split(r"(?m)^(?=[A-Za-z0-9])", whole.read_text())):
+        kind = next(kind for kind, begin in KINDS.items() if re.match(begin, entry))
+        parts[kind].append(entry.rstrip() + "\n")
+        if entry.startswith("torch=="):
+            # A version of its own: where an index has no CPU build, pip says so at once.
+            build = [entry.split()[0] + "+cpu", *(f"--hash=sha256:{one}" for one in torch_hashes)]
+            parts["locked_cpu"].append(" \\\n    ".join(build) + "\n")
+    for kind, entries in parts.items():
+        path = REQUIREMENTS / f"{kind}.txt"
+        comments = [line for line in path.read_text().splitlines(keepends=True) if line.startswith("#")]
+        path.write_text("".join([*comments, *entries]))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])
