@@ -16,6 +16,7 @@ from ngo_msgs.srv import Reset, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecyclePublisher, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
@@ -33,12 +34,14 @@ from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.trajectory.files import edges_of, write_trajectory
+from ngo_estimator.trajectory.save_path import path_inside
 
 if TYPE_CHECKING:
     from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
+_SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
 _PENDING_S = 0.3
 _SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -149,7 +152,8 @@ class NgoNode(LifecycleNode):
             (Reset, "~/reset", self._on_reset, None),
             (SetBool, "~/pause", self._on_pause, None),
         ):
-            built.callback(self.destroy_service, self.create_service(kind, name, callback, callback_group=group))
+            service = self.create_service(kind, name, callback, qos_profile=_SERVICES, callback_group=group)
+            built.callback(self.destroy_service, service)
         self._configured = True
         built.callback(setattr, self, "_configured", False)
 
@@ -296,11 +300,11 @@ class NgoNode(LifecycleNode):
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
         """Write the file in a thread, so that relative poses are processed meanwhile."""
-        path, trajectory = Path(request.path).expanduser().absolute(), self._trajectory()
+        trajectory, folder = self._trajectory(), Path(self._settings.save_directory)
         done, executor = Future(), self.executor
 
         def write() -> None:
-            done.set_result(_written(path, trajectory))
+            done.set_result(_written(request.path, folder, trajectory))
             executor.wake()
 
         self._files.submit(write)
@@ -362,9 +366,10 @@ class NgoNode(LifecycleNode):
         return found
 
 
-def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
-    """Write a file; returns whether it succeeded, and a message for the user."""
+def _written(name: str, folder: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
+    """Write a file in the folder; returns whether it succeeded, and a message for the user."""
     try:
+        path = path_inside(folder, name)
         if trajectory is None:
             raise ValueError("the trajectory is empty; nothing was written")
         edges = edges_of(trajectory) if path.suffix == ".g2o" else ()

@@ -148,6 +148,9 @@ class NgoNodeSettings(EstimatorSettings):
     initial_pose_topic: str = topic(
         "initialpose", "Current pose of the robot in map_frame; the whole trajectory moves there."
     )
+    save_directory: str = setting(
+        "", "Folder in which ~/save_trajectory may write; empty: the working directory of the node."
+    )
     path_topic: str = topic("ngo/path", "Corrected trajectory.")
     pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, after every relative pose.")
     trajectory_topic: str = topic(
