@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 import torch
 
-from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
 from ngo_estimator.geometry import se2
@@ -200,6 +200,7 @@ class CorrectedTrajectory(ABC):
     def _restore(self, arrays: Arrays) -> None:
         self._log.restore(part(arrays, "log"))
         self._graph.restore(part(arrays, "graph"))
+        self._loaded = True
         self._online.restore(arrays, "online")
         self._optimized = bool(taken(arrays, "optimized", np.bool_))
         self._odom = taken(arrays, "odom", np.float64, 3)
@@ -226,6 +227,7 @@ class CorrectedTrajectory(ABC):
         self._begin()
 
     def _begin(self) -> None:
+        self._loaded = False  # and no step taken since
         self._online = GrowingRows((3,), np.float64)
         self._graph = self._new_graph()
         self._optimized = False
@@ -244,10 +246,17 @@ class CorrectedTrajectory(ABC):
 
         Raises:
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
-                that is a little late. The trajectory is as it was before.
+                that is a little late; after loading, the first step of another odometry. The trajectory is as it was
+                before.
         """
         step = self._checked(step)
+        if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
+            raise RejectedStep(
+                f"step to {step.stamp_ns} ns is of an odometry that began at {step.origin_stamp_ns} ns, or older than "
+                "the loaded trajectory; expected the odometry of that one to go on, or a reset"
+            )
         taken = self._log.take(step)
+        self._loaded = False
         if taken.restarted:
             self._begin()
         if taken.begins:

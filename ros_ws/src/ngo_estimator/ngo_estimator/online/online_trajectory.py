@@ -111,10 +111,10 @@ class OnlineTrajectory(CorrectedTrajectory):
                 digest.update(json.dumps(dataclasses.asdict(network.config), sort_keys=True).encode())
                 digest.update(save({name: tensor.contiguous() for name, tensor in network.state_dict().items()}))
         return {
+            "weights_sha256": digest.hexdigest(),
             "window_frames": self._window,
             "key_frames": self._key_frames,
             "iterations_per_step": self._iterations_per_step,
-            "weights_sha256": digest.hexdigest(),
         }
 
     def _new_graph(self) -> MetaGraph:

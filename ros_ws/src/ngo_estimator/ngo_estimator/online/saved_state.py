@@ -63,7 +63,7 @@ def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
     path = folder / DESCRIPTION
     description = _description(path)
     saved, here = description["identity"], json.loads(json.dumps(identity))
-    for key in sorted({*saved, *here}):
+    for key in {**here, **saved}:
         if saved.get(key) != here.get(key):
             raise StateError(f"{path}: was saved with {_difference(key, saved.get(key), here.get(key))}")
     arrays = folder / Path(description["arrays"]).name

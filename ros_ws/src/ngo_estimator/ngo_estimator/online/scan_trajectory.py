@@ -46,7 +46,7 @@ class ScanTrajectory(CorrectedTrajectory):
     @property
     def identity(self) -> dict[str, Any]:
         """The settings: there are no networks."""
-        return {"iterations_per_step": self._iterations_per_step, "graph": asdict(self._config)}
+        return {"graph": asdict(self._config), "iterations_per_step": self._iterations_per_step}
 
     def _new_graph(self) -> ScanGraph:
         return ScanGraph(self._config)
