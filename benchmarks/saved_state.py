@@ -3,8 +3,9 @@
     python -m benchmarks.saved_state
 
 The trajectory is synthetic: random steps and place codes, or the scans of a few places over and over. It goes through
-the real classes, paused, and ends with one optimisation. For scans no loops are searched. One thread. The last line is
-one JSON object; exit code 1 where a state takes 5 s or longer to load.
+the real classes, paused, and ends with one optimisation. Loops are searched as little as settings allow: a search takes
+long, and what a state keeps of loops is bounded. One thread. The last line is one JSON object; exit code 1 where one
+takes 5 s or longer to load.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import torch
 import tyro
 
 from benchmarks.pinned import in_process, two_cores
+from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import compose
@@ -90,13 +92,15 @@ def trajectory(world: str, frames: int) -> CorrectedTrajectory:
     """A trajectory of so many frames, with the weights or the settings of a world."""
     if world == "scan":
         config = ScanGraphConfig()
-        scans = ScanTrajectory(replace(config, loops=replace(config.loops, most_per_key=0)))
+        scans = ScanTrajectory(replace(config, loops=replace(config.loops, every=1000, most_per_key=0)))
         for step in steps(frames, 0, 0, keys=True):
             scans.update(step, optimize=False)
         return scans
-    core = OnlineTrajectory.load(WEIGHTS / world, world=world)
-    head, motion = core._pair_head, core._optimizer.config.aggregation.motion_feature_size
-    code = 0 if head is None else head.config.code_length
+    optimizer, head = load_optimizer(WEIGHTS / world)[0], load_place(WEIGHTS / world)[0].pair_head
+    search = replace(optimizer.config.search, per_pose=1, views=1, registrations=0, overlaps=0)
+    optimizer.config = replace(optimizer.config, search=search)
+    core, code = OnlineTrajectory(optimizer, head), head.config.code_length
+    motion = optimizer.config.aggregation.motion_feature_size
     for k, step in enumerate(steps(frames, motion, code, keys=False), start=1):
         core.update(step, optimize=k == frames)
     return core
