@@ -307,7 +307,7 @@ def test_mistakes_of_the_caller_are_refused() -> None:
     for action in (3, -1, 0.5):
         with pytest.raises(ValueError, match=f"action is {action}; it must be 0 "):
             env.step(action)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"options has \['pose'\]; it may have 'maze' and 'pose_xyyaw'"):
+    with pytest.raises(ValueError, match=r"options has \['pose'\]; it may have 'maze', 'maze_seed' and 'pose_xyyaw'"):
         env.reset(options={"pose": (1, 1, 0)})
     with pytest.raises(ValueError, match=r"options\['maze'\] has \(5, 13\) blocks"):
         env.reset(options={"maze": CORRIDOR})
