@@ -1,5 +1,6 @@
 """What people do with ngo_node: start and stop it, ask and tell it things, and run several of it."""
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from evo.tools import file_interface
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
@@ -31,8 +33,9 @@ pytestmark = pytest.mark.processes
 
 
 @pytest.fixture(scope="module")
-def parameters(weights: Path) -> dict[str, Any]:
-    return {"world": "maze2d", "weights": str(weights), "diagnostics_period_s": 0.1}
+def parameters(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    saved = str(tmp_path_factory.getbasetemp())
+    return {"world": "maze2d", "weights": str(weights), "diagnostics_period_s": 0.1, "save_directory": saved}
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +110,30 @@ def test_a_trajectory_that_cannot_be_saved_is_said_in_one_line(optimizer: Optimi
         response = optimizer.probe.call(SaveTrajectory, "ngo_node/save_trajectory", request)
         assert not response.success and reason in response.message and "\n" not in response.message
     assert not list(tmp_path.iterdir())
+
+
+def test_no_path_ends_the_node_or_leads_out_of_its_folder(optimizer: Optimizer, tmp_path: Path) -> None:
+    optimizer.pose_after(*optimizer.drive().steps(1, 9))
+    os.mkfifo(tmp_path / "pipe.tum")
+    (tmp_path / "out.tum").symlink_to("/tmp/outside.tum")
+    refused = ["~nosuchuser/a.tum", "/a.tum", f"{tmp_path}/../../../a.tum", "a\0.tum", "", "x" * 5000]
+    for path in [*refused, str(tmp_path / "pipe.tum"), str(tmp_path / "out.tum")]:
+        response = optimizer.probe.call(SaveTrajectory, "ngo_node/save_trajectory", SaveTrajectory.Request(path=path))
+        assert not response.success and response.message and "\n" not in response.message, path
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.tum", "pipe.tum"]
+
+
+def test_two_hundred_calls_at_once_are_all_answered(optimizer: Optimizer, tmp_path: Path) -> None:
+    optimizer.pose_after(*optimizer.drive().steps(1, 9))
+    client = optimizer.probe.node.create_client(
+        SaveTrajectory, "ngo_node/save_trajectory", qos_profile=QoSProfile(depth=200)
+    )
+    optimizer.probe.spin_until(client.service_is_ready, "the service")
+    answers = [client.call_async(SaveTrajectory.Request(path=str(tmp_path / f"{k % 7}.tum"))) for k in range(200)]
+    optimizer.probe.spin_until(lambda: all(answer.done() for answer in answers), "200 answers")
+    optimizer.probe.node.destroy_client(client)
+    assert all(answer.result().success for answer in answers)
+    assert len(list(tmp_path.iterdir())) == 7
 
 
 # ---- where the map is
@@ -276,6 +303,9 @@ def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: di
             assert "cannot change now" in probe.set_parameter(name, "weights", "")
             assert probe.node.count_subscribers("/managed/relative_pose") == 0
             assert node.change(Transition.TRANSITION_ACTIVATE) and node.state() == "active"
+            for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE, 255):
+                assert not node.change(transition), "it is active already"
+            assert node.state() == "active"
             optimizer = Optimizer(process, weights, probe, "/managed")
             drive = optimizer.drive()
             optimizer.pose_after(*drive.steps(1, 10))
@@ -302,6 +332,20 @@ def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: di
 
 
 # ---- several robots
+
+
+def test_two_nodes_of_one_name_are_told(weights: Path, parameters: dict[str, Any]) -> None:
+    namespace = ("-r", "__ns:=/twins")
+    with (
+        Probe("midwife") as probe,
+        NodeProcess("ngo_estimator", "ngo_node", parameters, namespace) as estimator,
+        NodeProcess("ngo_sim", "maze2d", {"rate": 1.0}, (*namespace, "-r", "__node:=ngo_node")) as simulator,
+    ):
+        for process in (estimator, simulator):
+            process.wait_for_log("WARN.*two nodes are named /twins/ngo_node")
+        statuses = probe.collect(DiagnosticArray, "/diagnostics")
+        problem = "two nodes are named /twins/ngo_node"
+        probe.spin_until(lambda: any(problem in array.status[0].message for array in statuses), "diagnostics")
 
 
 @pytest.mark.parametrize("shared_tf", [True, False], ids=["one tf", "a tf each"])

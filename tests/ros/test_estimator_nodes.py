@@ -235,6 +235,7 @@ def test_saved_trajectory_is_what_was_published(graph: Graph, tmp_path: Path) ->
     for path, reason in (
         (tmp_path / "path.csv", "ends in .tum, .txt, .kitti or .g2o"),
         (tmp_path / "no" / "a.tum", "No such file"),
+        (Path("/a.tum"), "expected a file in"),
     ):
         response = save(path)
         assert not response.success

@@ -65,10 +65,11 @@ class Example(FramedSettings):
         ("place", "", "a frame name without / in front"),
         ("above", "/map", "a frame name without / in front, or nothing"),
         ("frame_prefix", "/red/", "a text that a frame name may begin with, as in robot_1/, or nothing"),
-        ("start", (1.0, 2.0), "three numbers: x (m), y (m), yaw (rad)"),
-        ("start", (1.0, 2.0, float("nan")), "three numbers: x (m), y (m), yaw (rad)"),
-        ("start", ("a", "b", "c"), "three numbers: x (m), y (m), yaw (rad)"),
-        ("start", 3.0, "three numbers: x (m), y (m), yaw (rad)"),
+        ("start", (1.0, 2.0), "three numbers up to 1e+09: x (m), y (m), yaw (rad)"),
+        ("start", (1.0, 2.0, float("nan")), "three numbers up to 1e+09: x (m), y (m), yaw (rad)"),
+        ("start", (1.0, 2.0, 1e308), "three numbers up to 1e+09: x (m), y (m), yaw (rad)"),
+        ("start", ("a", "b", "c"), "three numbers up to 1e+09: x (m), y (m), yaw (rad)"),
+        ("start", 3.0, "three numbers up to 1e+09: x (m), y (m), yaw (rad)"),
     ],
 )
 def test_a_bad_value_is_named_with_what_is_allowed(name: str, value: Any, allowed: str) -> None:

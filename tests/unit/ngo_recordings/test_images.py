@@ -1,6 +1,9 @@
 """Every sensor message becomes the same kind of array, pixel by pixel; what is not supported is named."""
 
 import math
+import struct
+import tracemalloc
+import zlib
 from typing import Any
 
 import numpy as np
@@ -121,6 +124,35 @@ def test_images_that_are_cut_short_are_refused(missing: int) -> None:
     squeezed.data = squeezed.data[: len(squeezed.data) - 40 - missing]
     with pytest.raises(RecordingError, match="cannot be decoded"):
         picture(squeezed, COMPRESSED_TYPE, "/image")
+
+
+def declaring(width: int, height: int) -> Any:
+    """A PNG of a few bytes that declares a size of its own choice, and holds one pixel."""
+    message = m.compressed(1, RGB[:1, :1], "png")
+    content = bytes(message.data)
+    header = b"IHDR" + struct.pack(">II", width, height) + content[24:29]
+    message.data = np.frombuffer(content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:], np.uint8)
+    return message
+
+
+@pytest.mark.parametrize("side", [13_000, 20_000, 2**31 - 1])
+def test_a_picture_is_refused_by_the_size_that_it_declares(side: int) -> None:
+    tracemalloc.start()
+    try:
+        for largest in (None, (60, 80)):
+            with pytest.raises(RecordingError, match=r"^an image of /image .*(expected at most|cannot be decoded)"):
+                picture(declaring(side, side), COMPRESSED_TYPE, "/image", largest)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_largest_size_is_taken_and_no_larger_one() -> None:
+    message = m.compressed(1, RGB, "png")
+    assert picture(message, COMPRESSED_TYPE, "/image", (4, 6))[0].shape == RGB.shape
+    for largest in ((3, 6), (4, 5)):
+        with pytest.raises(RecordingError, match=rf"is 6 x 4; expected at most {largest[1]} x {largest[0]}$"):
+            picture(message, COMPRESSED_TYPE, "/image", largest)
 
 
 def test_depth_becomes_a_fourth_channel_of_colour_alone() -> None:

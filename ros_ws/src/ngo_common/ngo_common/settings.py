@@ -8,6 +8,9 @@ from dataclasses import Field, dataclass, field, fields
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
+LARGEST_POSE_M = 1e9
+"""Largest coordinate of a pose that a user gives (m, rad): products of two of them are far from overflow."""
+
 _KINDS = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
 # A relative, absolute or private name, whose parts may hold substitutions such as {node}.
 _PART = r"(?:[A-Za-z_]|\{[A-Za-z_]\w*\})(?:\w|\{[A-Za-z_]\w*\})*"
@@ -71,7 +74,8 @@ def optional_frame(default: str, description: str) -> Any:
 
 def pose(default: tuple[float, float, float], description: str, live: bool = False) -> Any:
     """A field that holds a planar pose (x, y, yaw)."""
-    return setting(default, description, allowed="three numbers: x (m), y (m), yaw (rad)", check=_is_pose, live=live)
+    allowed = f"three numbers up to {LARGEST_POSE_M:g}: x (m), y (m), yaw (rad)"
+    return setting(default, description, allowed=allowed, check=_is_pose, live=live)
 
 
 @dataclass(frozen=True)
@@ -208,4 +212,4 @@ def _is_frame_name(value: str) -> bool:
 
 
 def _is_pose(value: tuple[Any, ...]) -> bool:
-    return len(value) == 3 and all(type(item) is float and math.isfinite(item) for item in value)
+    return len(value) == 3 and all(type(item) is float and abs(item) <= LARGEST_POSE_M for item in value)

@@ -54,20 +54,26 @@ class Frame:
     pose_residual: np.ndarray | None = None
 
 
-def frames(recording: Recording, topics: RecordingTopics, skipped: Counter[str] | None = None) -> Iterator[Frame]:
+def frames(
+    recording: Recording,
+    topics: RecordingTopics,
+    skipped: Counter[str] | None = None,
+    largest: tuple[int, int] | None = None,
+) -> Iterator[Frame]:
     """The frames of a recording in the order of its images; stamps are the recording's own and may jump.
 
     Reads the recording once. An image waits for what belongs to it, at most 2 s of the recording, so memory is bounded.
 
     Args:
         skipped: counts images that gave no frame, by the reason (NO_DEPTH, UNUSABLE).
+        largest: see `picture`.
 
     Raises:
         RecordingError: an image that is damaged, of an encoding that is not supported, or of another size than those
             before. Where skipped is given, only for the first; later ones are counted.
     """
     try:
-        yield from _Frames(recording, topics, skipped).run()
+        yield from _Frames(recording, topics, skipped, largest).run()
     except AttributeError as error:
         raise RecordingError(f"a message is not what its type should be ({error}): is the recording damaged?") from None
 
@@ -75,8 +81,14 @@ def frames(recording: Recording, topics: RecordingTopics, skipped: Counter[str] 
 class _Frames:
     """One pass over a recording."""
 
-    def __init__(self, recording: Recording, topics: RecordingTopics, skipped: Counter[str] | None) -> None:
-        self._recording, self._topics = recording, topics
+    def __init__(
+        self,
+        recording: Recording,
+        topics: RecordingTopics,
+        skipped: Counter[str] | None,
+        largest: tuple[int, int] | None,
+    ) -> None:
+        self._recording, self._topics, self._largest = recording, topics, largest
         self._tolerant = skipped is not None
         self._skipped: Counter[str] = Counter() if skipped is None else skipped
         tolerance_ns, gap_ns = round(topics.tolerance_s * 1e9), round(topics.interpolation_s * 1e9)
@@ -170,7 +182,8 @@ class _Frames:
 
     def _decoded(self, message: Message, stamp_ns: int) -> tuple[np.ndarray, ScanGeometry | None] | None:
         """The image with its depth; None where that is missing."""
-        image, scan = picture(message.value, self._recording.topics[message.topic].type_name, message.topic)
+        type_name = self._recording.topics[message.topic].type_name
+        image, scan = picture(message.value, type_name, message.topic, self._largest)
         if self._topics.depth is not None:
             depth = self._depth.at(stamp_ns)
             if depth is None:
@@ -183,6 +196,7 @@ class _Frames:
                 f"{self._shape} (height, width, channels): split the recording there"
             )
         self._shape = image.shape
+        self._largest = image.shape[0], image.shape[1]
         return image, scan
 
     def _frame(self, stamp_ns: int, before_ns: int | None, image: np.ndarray, scan: ScanGeometry | None) -> Frame:

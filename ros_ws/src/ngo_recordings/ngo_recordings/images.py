@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from PIL import Image as Picture
-from PIL import UnidentifiedImageError
 
 from ngo_recordings.errors import RecordingError
 
@@ -16,6 +16,9 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 SENSOR_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE, SCAN_TYPE)
+
+MAX_PIXELS = 2**25
+"""Most pixels of a picture that is decoded where its size is not known, 8K video: a few bytes may declare any size."""
 
 _MM = 1e-3
 
@@ -58,19 +61,25 @@ class ScanGeometry:
     range_max_m: float
 
 
-def picture(message: Any, type_name: str, topic: str) -> tuple[np.ndarray, ScanGeometry | None]:
+def picture(
+    message: Any, type_name: str, topic: str, largest: tuple[int, int] | None = None
+) -> tuple[np.ndarray, ScanGeometry | None]:
     """The image of a message of one of SENSOR_TYPES, ``(height, width, channels)``, and the geometry of a scan.
 
     uint8 of 1 (grey) or 3 (red, green, blue) channels, or float32 of 1 (depth in m) or 4 (colour 0 to 1, and depth);
     no return is +inf.
 
+    Args:
+        largest: height and width of the largest compressed picture that is decoded; None: MAX_PIXELS count.
+
     Raises:
-        RecordingError: an encoding that is not supported, or data of another size than the message says.
+        RecordingError: an encoding that is not supported, data of another size than the message says, or a compressed
+            picture that is too large.
     """
     if type_name == SCAN_TYPE:
         return _scan(message, topic)
     if type_name == COMPRESSED_TYPE:
-        return _compressed(message, topic), None
+        return _compressed(message, topic, largest), None
     return _raw(message, topic), None
 
 
@@ -108,22 +117,36 @@ def _normalised(values: np.ndarray) -> np.ndarray:
     return image
 
 
-def _compressed(message: Any, topic: str) -> np.ndarray:
+def _compressed(message: Any, topic: str, largest: tuple[int, int] | None) -> np.ndarray:
     data = bytes(message.data)
     if not data.startswith((b"\xff\xd8", b"\x89PNG")):
         raise RecordingError(
             f"images of {topic} have the format {message.format!r}; supported in CompressedImage: jpeg, png"
         )
     try:
-        with Picture.open(io.BytesIO(data)) as opened:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Picture.DecompressionBombWarning)  # a lower bound counts here
+            opened = Picture.open(io.BytesIO(data), formats=("JPEG", "PNG"))  # reads the header alone
+        with opened:
+            _check_size(*opened.size, topic, largest)
             if opened.mode.startswith("I"):
                 return _normalised(np.asarray(opened).astype(np.uint16)[..., None])
             decoded = np.asarray(opened if opened.mode in ("L", "RGB") else opened.convert("RGB"))
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except RecordingError:
+        raise
+    except Exception as error:  # of damaged data the library raises errors of many kinds
         raise RecordingError(
             f"an image of {topic} ({len(data)} bytes of {message.format!r}) cannot be decoded: {error}"
         ) from None
     return decoded.reshape(*decoded.shape[:2], -1)
+
+
+def _check_size(width: int, height: int, topic: str, largest: tuple[int, int] | None) -> None:
+    """Refuse a picture by the size that it declares, before that is allocated."""
+    if largest is None and width * height > MAX_PIXELS:
+        raise RecordingError(f"an image of {topic} is {width} x {height}; expected at most {MAX_PIXELS} pixels")
+    if largest is not None and (height > largest[0] or width > largest[1]):
+        raise RecordingError(f"an image of {topic} is {width} x {height}; expected at most {largest[1]} x {largest[0]}")
 
 
 def _scan(message: Any, topic: str) -> tuple[np.ndarray, ScanGeometry]:

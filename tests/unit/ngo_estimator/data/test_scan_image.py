@@ -1,6 +1,7 @@
 """Laser scans of any geometry become the rays of one format: known rooms, directions, gaps and what is refused."""
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -97,6 +98,50 @@ def test_a_fine_scanner_may_lose_rays_that_others_stand_for() -> None:
     coarse = np.array([2.0, np.inf, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
     seen = scan_image(EIGHT, coarse, -math.pi, math.pi / 4, 0.0, 30.0).ravel()
     assert np.isinf(seen).tolist() == [False] * 7 + [True, False]  # no other ray looks there
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    rays=st.integers(2, 400),
+    step_deg=st.floats(0.1, 5.0),
+    begin=st.floats(-4.0, 4.0),
+    clockwise=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_the_nearest_return_stands_for_a_lost_ray(
+    rays: int, step_deg: float, begin: float, clockwise: bool, seed: int
+) -> None:
+    """Against a search among all rays, one by one; every range differs, and none is interpolated."""
+    rng = np.random.default_rng(seed)
+    step = math.radians(step_deg)
+    ranges = np.where(rng.random(rays) < 0.2, 1.5 ** np.arange(rays).clip(0, 60), np.inf).astype(np.float32)
+    seen = scan_image(EIGHT, ranges, begin, -step if clockwise else step, 0.0, math.inf).ravel()
+    for angle, found in zip(EIGHT.ray_angles_rad, seen, strict=True):
+        turn = (begin - angle if clockwise else angle - begin) + 0.5 * step
+        place = (turn % math.tau - 0.5 * step) / step
+        every = np.flatnonzero(np.isfinite(ranges))
+        away = np.abs(every - place)
+        closed = rays * step > math.tau - 0.5 * step
+        if closed:
+            away = np.minimum(np.minimum(away, np.abs(every + rays - place)), np.abs(every - rays - place))
+        near = every[away <= away.min(initial=math.inf) + 1e-6]
+        looked_at = closed or math.floor(place + 0.5) < rays
+        if not looked_at or away.min(initial=math.inf) > max(0.5, math.radians(22.5) / step):
+            assert np.isinf(found)
+        elif abs(away.min() - math.radians(22.5) / step) > 1e-6:
+            assert found in ranges[near]
+
+
+@pytest.mark.parametrize("rays", [2, 600_000])
+def test_no_increment_makes_a_scan_expensive(rays: int) -> None:
+    began = time.monotonic()
+    for increment in (1e-9, 1e-12, 5e-324, -1e-7):
+        with pytest.raises(ValueError, match="an increment from 1e-05 to below pi"):
+            scan_image(EIGHT, np.full(rays, np.inf), 0.0, increment, 0.0, 30.0)
+    for increment in (1e-5, -1e-5, 3.0):
+        scan_image(EIGHT, np.full(rays, np.inf), 0.0, increment, 0.0, 30.0)
+        scan_image(EIGHT, np.where(np.arange(rays) % 2, 1.0, np.inf), 0.0, increment, 0.0, 30.0)
+    assert time.monotonic() - began < 2.0
 
 
 def test_between_two_rays_one_surface_is_interpolated_and_an_edge_is_not() -> None:

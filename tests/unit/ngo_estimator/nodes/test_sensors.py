@@ -93,6 +93,15 @@ def test_compressed_images_are_read(image_format: ImageFormat) -> None:
     assert read.shape == image_format.shape and abs(read.astype(int) - 130).max() <= 2
 
 
+def test_a_compressed_image_larger_than_the_weights_take_is_not_decoded() -> None:
+    whole = compressed(np.zeros((4000, 4000), np.uint8), "png")
+    whole.data = whole.data[:100]  # its header alone: to decode it would fail in another way
+    with pytest.raises(ValueError, match=r"is 4000 x 4000; expected at most 8 x 3$"):
+        sensor_array(whole, GREY, "image/compressed")
+    halved = ImageFormat(3, 8, 1, "uint8", reduction=2)
+    assert sensor_array(compressed(np.zeros((7, 17), np.uint8), "png"), halved, "image").shape == GREY.shape
+
+
 @pytest.mark.parametrize(("first_deg", "step_deg", "rays"), [(-150, 1.25, 241), (0, 0.5, 720), (90, -1.0, 180)])
 def test_scans_of_any_geometry_are_resampled(first_deg: float, step_deg: float, rays: int) -> None:
     ranges = np.random.default_rng(1).uniform(1.0, 9.0, rays).astype(np.float32)

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from ngo_common.nodes.last_catch import answer_always, spin_once
 from ngo_common.settings import BadParameter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -26,11 +27,11 @@ class StartError(Exception):
 
 
 def spin(node: Node, ended: Callable[[], bool]) -> None:
-    """Call the node's callbacks until ``ended()``."""
+    """Call the node's callbacks until ``ended()``; an error in one is reported, and does not end the node."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not ended():
-        executor.spin_once(timeout_sec=_WAIT_S)
+        spin_once(node, executor, _WAIT_S)
 
 
 def run_node(
@@ -66,6 +67,7 @@ def run_node(
         with _argument_errors():
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = create()
+        answer_always(node, node.services)
         run(node, lambda: signalled)
         return 0
     except (BadParameter, StartError, InvalidParameterTypeException) as error:

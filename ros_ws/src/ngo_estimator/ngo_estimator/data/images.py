@@ -15,6 +15,8 @@ _KINDS = {
 }
 # Neighbouring rays whose ranges differ by a larger share than this end on different surfaces, between which is nothing.
 _EDGE_SHARE = 0.2
+# Rad; scanners have 50 times this. A finer one is no angle between rays, and float32 may not tell its rays apart.
+_LEAST_INCREMENT = 1e-5
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class ImageFormat:
     def shape(self) -> tuple[int, int, int]:
         """``(height, width, channels)``."""
         return self.height, self.width, self.channels
+
+    @property
+    def largest_picture(self) -> tuple[int, int]:
+        """Height and width of the largest picture that ``reduced`` makes one of this format."""
+        return (self.height + 1) * self.reduction - 1, (self.width + 1) * self.reduction - 1
 
     @property
     def is_scan(self) -> bool:
@@ -167,10 +174,10 @@ def scan_image(
     step = abs(angle_increment_rad)
     if ranges.ndim != 1 or len(ranges) < 2:
         raise ValueError(f"scan has ranges of shape {ranges.shape}; expected (rays,) with two at least")
-    if not (math.isfinite(angle_min_rad) and 0.0 < step < math.pi):
+    if not (math.isfinite(angle_min_rad) and _LEAST_INCREMENT <= step < math.pi):
         raise ValueError(
             f"scan has angle_min {angle_min_rad:g} and angle_increment {angle_increment_rad:g}; expected finite angles "
-            "(rad) and an increment other than 0, below pi"
+            f"(rad) and an increment from {_LEAST_INCREMENT:g} to below pi, of either sign"
         )
     with np.errstate(invalid="ignore"):
         measured = (ranges > 0.0) & (ranges >= range_min_m) & (ranges < math.inf)
@@ -197,9 +204,19 @@ def scan_image(
         together = np.abs(other - value) <= _EDGE_SHARE * np.minimum(value, other)
         result = np.where(together, value + np.abs(place - nearest) * (other - value), value)
     reach = 0.5 * abs(float(wanted[1] - wanted[0])) / step
-    looked_at = closed | (nearest < count)
-    for distance in range(1, int(reach + 0.5) + 1):
-        for ray in (nearest + side * distance, nearest - side * distance):
-            lost = np.isinf(result) & looked_at & (np.abs(place - ray) <= reach)
-            result = np.where(lost, at(ray), result)
+    lost = np.isinf(result) & (closed | (nearest < count))
+    result[lost] = _next_return(ranges, place[lost], reach, closed)
     return result.astype(np.float32).reshape(1, -1, 1)
+
+
+def _next_return(ranges: np.ndarray, place: np.ndarray, reach: float, closed: bool) -> np.ndarray:
+    """Range of the nearest ray with a return that is at most ``reach`` rays from each place, or else ``+inf``."""
+    seen = np.flatnonzero(np.isfinite(ranges))
+    if closed:
+        seen = np.concatenate((seen - len(ranges), seen, seen + len(ranges)))
+    if not len(seen):
+        return np.full(len(place), np.inf)
+    after = np.searchsorted(seen, place)
+    after, before = seen[np.minimum(after, len(seen) - 1)], seen[np.maximum(after - 1, 0)]
+    ray = np.where(np.abs(after - place) <= np.abs(before - place), after, before)
+    return np.where(np.abs(ray - place) <= reach, ranges[ray % len(ranges)], np.inf)

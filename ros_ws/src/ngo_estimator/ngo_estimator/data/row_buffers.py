@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
+
 
 class GrowingRows:
     """All rows that were appended; views that were handed out stay valid, and unchanged but for ``write``."""
@@ -24,6 +26,12 @@ class GrowingRows:
             self._buffer = np.concatenate((self._buffer, np.zeros_like(self._buffer)))
         self._buffer[self._used] = row
         self._used += 1
+
+    def restore(self, arrays: Arrays, name: str) -> None:
+        """Take all rows from the array ``name``, in place of those here; raises ``StateError``."""
+        rows = taken(arrays, name, self._buffer.dtype, -1, *self._buffer.shape[1:])
+        self._used = len(rows)
+        self._buffer = rows if len(rows) else self._buffer
 
 
 class SlidingRows:
@@ -67,6 +75,18 @@ class SlidingRows:
         """The rows of these numbers, an array of any shape."""
         self._check(int(numbers.min(initial=self._dropped)))
         return self._buffer[numbers - self._dropped]
+
+    def state(self) -> Arrays:
+        """The rows that are kept, and how many are not."""
+        return {"rows": self._buffer[: self._used], "dropped": np.array(self._dropped)}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take the rows of a ``state()``, in place of those here; raises ``StateError``."""
+        rows = taken(arrays, "rows", self._buffer.dtype, -1, *self._buffer.shape[1:])
+        most = len(self._buffer)
+        require(len(rows) <= most, f"{len(rows)} rows are given where {most} have room")
+        self._buffer[: len(rows)] = rows
+        self._used, self._dropped = len(rows), taken_integer(arrays, "dropped")
 
     def _check(self, number: int) -> None:
         if number < self._dropped:

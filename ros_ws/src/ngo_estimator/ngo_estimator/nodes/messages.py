@@ -22,6 +22,7 @@ from std_msgs.msg import ColorRGBA, Header
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
+from ngo_common.settings import LARGEST_POSE_M
 from ngo_estimator.geometry.planar_covariance import to_planar, to_spatial
 
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
@@ -157,8 +158,8 @@ def pose_message(
 def planar_estimate(message: PoseWithCovarianceStamped, frame: str) -> tuple[np.ndarray, np.ndarray]:
     """The pose ``(3,)`` and its covariance ``(3, 3)`` of a message.
 
-    Raises ``ValueError`` unless it is given in ``frame`` (or in none), is finite, has an orientation, and a covariance
-    that is one.
+    Raises ``ValueError`` unless it is given in ``frame`` (or in none), is finite and at most ``LARGEST_POSE_M`` away,
+    has an orientation, and a covariance that is one.
     """
     if message.header.frame_id not in ("", frame):
         raise ValueError(f"pose is in the frame '{message.header.frame_id}'; expected '{frame}'")
@@ -166,12 +167,14 @@ def planar_estimate(message: PoseWithCovarianceStamped, frame: str) -> tuple[np.
     covariance = to_planar(np.array(message.pose.covariance))
     if not np.isfinite([position.x, position.y, q.x, q.y, q.z, q.w, *covariance.ravel()]).all():
         raise ValueError("pose has values that are not finite")
-    norm = q.x**2 + q.y**2 + q.z**2 + q.w**2
+    if (away := max(abs(position.x), abs(position.y), np.abs(covariance).max() ** 0.5)) > LARGEST_POSE_M:
+        raise ValueError(f"pose has a position or a deviation of {away:g} m; expected at most {LARGEST_POSE_M:g}")
+    norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w  # a power would raise an error of its own when it overflows
     if not 0.5 < norm < 2.0:
         raise ValueError(f"pose has an orientation of length {norm**0.5:g}; expected 1")
     if np.abs(covariance - covariance.T).max() > 1e-6 or np.linalg.eigvalsh(covariance)[0] < -1e-9:
         raise ValueError("pose has a covariance of x, y and yaw that is not symmetric and positive")
-    yaw = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), norm - 2.0 * (q.y**2 + q.z**2))
+    yaw = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), norm - 2.0 * (q.y * q.y + q.z * q.z))
     return np.array([position.x, position.y, yaw]), covariance
 
 

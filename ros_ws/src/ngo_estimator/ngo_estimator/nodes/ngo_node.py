@@ -7,21 +7,22 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
-from ngo_msgs.srv import Reset, SaveTrajectory
+from ngo_msgs.srv import LoadState, Reset, SaveState, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecyclePublisher, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.parameters import LiveSettings
-from ngo_common.nodes.process import run_node
+from ngo_common.nodes.process import StartError, run_node
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
 from ngo_estimator.data.lidar_file import is_lidar
@@ -29,18 +30,23 @@ from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.settings import NgoNodeSettings
+from ngo_estimator.nodes.state_services import StateServices
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.trajectory.files import edges_of, write_trajectory
+from ngo_estimator.trajectory.save_path import path_inside
 
 if TYPE_CHECKING:
     from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.session import Session
 
 NAME = "ngo_node"
 _DEPTH = 100
+_SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
 _PENDING_S = 0.3
 _SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
+Result = TypeVar("Result")
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -121,6 +127,7 @@ class NgoNode(LifecycleNode):
         from ngo_estimator.online.map_origin import MapOrigin
         from ngo_estimator.online.online_trajectory import OnlineTrajectory
         from ngo_estimator.online.scan_trajectory import ScanTrajectory
+        from ngo_estimator.online.session import Session
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
         def load(folder: Path, world: str) -> OnlineTrajectory | ScanTrajectory:
@@ -143,15 +150,29 @@ class NgoNode(LifecycleNode):
         with checked_overrides():
             self._create_outputs(settings)
         self._files = built.enter_context(ThreadPoolExecutor(1))
+        state = StateServices(
+            settings.save_directory,
+            self._aside,
+            lambda: Session(settings.world, self._core, self._origin, self._smoothing),
+            self._take,
+        )
+        self._configured = True
+        built.callback(setattr, self, "_configured", False)
+        if settings.state:
+            try:
+                state.load_at_start(settings.state)
+            except ValueError as error:
+                raise StartError(f"state: {error}") from error
         for kind, name, callback, group in (
             # One of its own: while a file is written, the others go on.
             (SaveTrajectory, "~/save_trajectory", self._on_save, MutuallyExclusiveCallbackGroup()),
+            (SaveState, "~/save_state", state.on_save, MutuallyExclusiveCallbackGroup()),
+            (LoadState, "~/load_state", state.on_load, MutuallyExclusiveCallbackGroup()),
             (Reset, "~/reset", self._on_reset, None),
             (SetBool, "~/pause", self._on_pause, None),
         ):
-            built.callback(self.destroy_service, self.create_service(kind, name, callback, callback_group=group))
-        self._configured = True
-        built.callback(setattr, self, "_configured", False)
+            service = self.create_service(kind, name, callback, qos_profile=_SERVICES, callback_group=group)
+            built.callback(self.destroy_service, service)
 
     def _create_outputs(self, settings: NgoNodeSettings) -> None:
         self._status = NodeStatus(
@@ -198,6 +219,8 @@ class NgoNode(LifecycleNode):
         listening.callback(self.destroy_timer, self._pending)
         self._inputs = [steps]
         listening.callback(self._inputs.clear)
+        if self._latest is not None:  # what was loaded, or gone on with
+            self._whole.changed(loops=True)
         self._status.idle = ""
         listening.callback(setattr, self._status, "idle", "inactive")
         name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
@@ -296,16 +319,38 @@ class NgoNode(LifecycleNode):
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
         """Write the file in a thread, so that relative poses are processed meanwhile."""
-        path, trajectory = Path(request.path).expanduser().absolute(), self._trajectory()
+        trajectory, folder = self._trajectory(), Path(self._settings.save_directory)
+        response.success, response.message = await self._aside(lambda: _written(request.path, folder, trajectory))
+        return response
+
+    async def _aside(self, work: Callable[[], Result]) -> Result:
+        """The result of work that is done in a thread, or its error."""
         done, executor = Future(), self.executor
 
-        def write() -> None:
-            done.set_result(_written(path, trajectory))
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except Exception as error:
+                done.set_exception(error)
             executor.wake()
 
-        self._files.submit(write)
-        response.success, response.message = await done
-        return response
+        self._files.submit(run)
+        result: Result = await done
+        return result
+
+    def _take(self, session: "Session") -> None:
+        """Go on with a session that was loaded. Nothing is known of the robot's pose before the next relative pose."""
+        if not self._configured:
+            raise ValueError("the node was cleaned up meanwhile; nothing was loaded")
+        self._core, self._origin, self._smoothing = session.core, session.origin, session.smoothing
+        self._latest = update = session.core.newest()
+        pose = self._origin.poses(update.pose_xyyaw)
+        self._covariance = self._origin.covariance_of(pose, update.covariance)
+        self._last_correction_m = 0.0
+        if self._inputs:
+            self._pending.cancel()
+        self._whole.changed(loops=True)
+        self.get_logger().info(f"goes on from a saved state of {update.frames} poses")
 
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
         frames = 0 if self._latest is None else self._latest.frames
@@ -362,9 +407,10 @@ class NgoNode(LifecycleNode):
         return found
 
 
-def _written(path: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
-    """Write a file; returns whether it succeeded, and a message for the user."""
+def _written(name: str, folder: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
+    """Write a file in the folder; returns whether it succeeded, and a message for the user."""
     try:
+        path = path_inside(folder, name)
         if trajectory is None:
             raise ValueError("the trajectory is empty; nothing was written")
         edges = edges_of(trajectory) if path.suffix == ".g2o" else ()

@@ -221,7 +221,8 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
     _check_side_information(topics, local)
     console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
     core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
-    return local.world, topics, core, core.run(frames_of(recording, topics, core.rejected))
+    frames = frames_of(recording, topics, core.rejected, local.image_format.largest_picture)
+    return local.world, topics, core, core.run(frames)
 
 
 def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":

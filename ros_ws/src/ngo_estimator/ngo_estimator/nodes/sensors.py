@@ -41,7 +41,7 @@ def sensor_array(message: Any, image_format: ImageFormat, topic: str, scan_yaw_r
         expected = _ENCODINGS[image_format.channels, image_format.dtype]
         if message.encoding not in expected:
             raise ValueError(f"image has the encoding '{message.encoding}'; expected {' or '.join(expected)}")
-    image, scan = picture(message, _TYPE_NAMES[type(message)], topic)
+    image, scan = picture(message, _TYPE_NAMES[type(message)], topic, image_format.largest_picture)
     return observation(image_format, image, scan, scan_yaw_rad)
 
 

@@ -148,6 +148,12 @@ class NgoNodeSettings(EstimatorSettings):
     initial_pose_topic: str = topic(
         "initialpose", "Current pose of the robot in map_frame; the whole trajectory moves there."
     )
+    save_directory: str = setting(
+        "",
+        "Folder in which ~/save_trajectory and ~/save_state may write, and ~/load_state may read; empty: the working "
+        "directory of the node.",
+    )
+    state: str = setting("", "Folder of a saved state to go on from, relative to save_directory; empty: none.")
     path_topic: str = topic("ngo/path", "Corrected trajectory.")
     pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, after every relative pose.")
     trajectory_topic: str = topic(

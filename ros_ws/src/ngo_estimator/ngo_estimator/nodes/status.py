@@ -11,6 +11,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
+from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.messages import to_time
 
@@ -35,6 +36,7 @@ class NodeStatus:
         """Publish on ``topic`` every ``period_s``; ``details`` adds the node's own values, ``problems`` lines."""
         self._node = node
         self._details, self._problems = details, problems
+        self._name_watch = NameWatch(node)
         self._totals: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
         self._warned_at: dict[str, float] = {}
@@ -106,6 +108,8 @@ class NodeStatus:
             values[f"{what}, mean (ms)"] = f"{1e3 * sum(durations_s) / len(durations_s):.2f}"
             values[f"{what}, max (ms)"] = f"{1e3 * max(durations_s):.2f}"
         problems = self._problems()
+        if namesake := self._name_watch.look():
+            problems.append(namesake)
         if self._dropped_now:
             problems.append(f"{self._dropped_now} inputs dropped in {elapsed_s:.1f} s")
         level, message = DiagnosticStatus.OK, self.idle or "running"

@@ -1,14 +1,16 @@
 """The state of a trajectory that is corrected online: one log of steps, one graph that owns poses and covariance."""
 
+import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.step_log import StepLog, TakenStep
 
@@ -63,6 +65,9 @@ class Trajectory:
     loop_weights: np.ndarray
     loop_relative_xyyaw: np.ndarray
     loop_std: np.ndarray
+
+
+AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
 
 
 class PoseGraph(Protocol):
@@ -124,6 +129,12 @@ class PoseGraph(Protocol):
     def frame_poses(self, before: bool = False) -> np.ndarray:
         """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
 
+    def state(self) -> Arrays:
+        """All that later steps depend on."""
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
+
 
 class CorrectedTrajectory(ABC):
     """Takes steps into a log and a graph, and tells what each changed.
@@ -155,12 +166,68 @@ class CorrectedTrajectory(ABC):
     def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
         """Give the graph a step; returns whether it is time to optimise."""
 
+    @property
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """What must be the same where a ``state()`` is restored: networks and settings, as JSON has them."""
+
+    def state(self) -> Arrays:
+        """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step."""
+        require(self._log.steps > 0, "the trajectory is empty")
+        own = {"online": self._online.values, "optimized": np.array(self._optimized), "odom": self._odom}
+        arrays = own | under("log", self._log.state()) | under("graph", self._graph.state())
+        return {name: np.array(array, order="C") for name, array in arrays.items()}
+
+    def restored(self: AnyTrajectory, arrays: Arrays) -> AnyTrajectory:
+        """Another trajectory with these networks and settings, in a ``state()``; this one stays as it is.
+
+        It goes on as the one that was saved would have, to the last bit.
+
+        Raises:
+            StateError: the arrays do not fit these settings, or each other.
+        """
+        other = copy.copy(self)
+        other._log = StepLog()
+        other._begin()
+        try:
+            other._restore(arrays)
+        except StateError:
+            raise
+        except Exception as error:  # of arrays that no ``state()`` gave
+            raise StateError(f"the arrays do not belong together ({type(error).__name__}: {error})") from error
+        return other
+
+    def _restore(self, arrays: Arrays) -> None:
+        self._log.restore(part(arrays, "log"))
+        self._graph.restore(part(arrays, "graph"))
+        self._loaded = True
+        self._online.restore(arrays, "online")
+        self._optimized = bool(taken(arrays, "optimized", np.bool_))
+        self._odom = taken(arrays, "odom", np.float64, 3)
+        whole = self.trajectory()
+        require(whole is not None, "the trajectory is empty")
+        assert whole is not None
+        lengths = {len(whole.stamps_ns), len(whole.poses_xyyaw), len(whole.online_xyyaw)}
+        require(len(lengths) == 1, f"there are {sorted(lengths)} poses of the same frames")
+        newest = self.newest()
+        require(
+            all(bool(np.isfinite(of).all()) for of in (whole.poses_xyyaw, newest.pose_xyyaw, newest.covariance)),
+            "poses are not finite",
+        )
+
+    def newest(self) -> TrajectoryUpdate:
+        """What the newest step gave, as it is now; raises ``RuntimeError`` before the first step."""
+        if self._log.steps == 0:
+            raise RuntimeError("the trajectory is empty; expected a step before")
+        return self._result(restarted=False, gap=False)
+
     def reset(self) -> None:
         """Forget everything: the next step begins a new trajectory."""
         self._log.reset()
         self._begin()
 
     def _begin(self) -> None:
+        self._loaded = False  # and no step taken since
         self._online = GrowingRows((3,), np.float64)
         self._graph = self._new_graph()
         self._optimized = False
@@ -179,10 +246,17 @@ class CorrectedTrajectory(ABC):
 
         Raises:
             RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
-                that is a little late. The trajectory is as it was before.
+                that is a little late; after loading, the first step of another odometry. The trajectory is as it was
+                before.
         """
         step = self._checked(step)
+        if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
+            raise RejectedStep(
+                f"step to {step.stamp_ns} ns is of an odometry that began at {step.origin_stamp_ns} ns, or older than "
+                "the loaded trajectory; expected the odometry of that one to go on, or a reset"
+            )
         taken = self._log.take(step)
+        self._loaded = False
         if taken.restarted:
             self._begin()
         if taken.begins:

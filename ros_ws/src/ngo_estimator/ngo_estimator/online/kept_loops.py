@@ -8,12 +8,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ngo_estimator.data.state_arrays import Arrays, require, taken
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.pair_measurement import PairMeasurement
 
 UNWEIGHED = -1.0
 """Weight of a loop that no optimisation has seen."""
+
+_FIELDS: dict[str, tuple[type, tuple[int, ...]]] = {
+    "start": (np.int64, ()),
+    "end": (np.int64, ()),
+    "frame": (np.int64, ()),
+    "measured": (np.float64, (3,)),
+    "log_scale": (np.float64, (2,)),
+    "spread": (np.float64, (2,)),
+    "logit": (np.float64, ()),
+    "similarity": (np.float64, ()),
+    "valid": (np.bool_, ()),
+    "most_drift": (np.float64, (3,)),
+}
+"""Of the record, by type and shape of a loop's row."""
 
 _BELIEVED = 0.1
 """A loop with a smaller weight is forgotten when it leaves the window."""
@@ -116,6 +131,22 @@ class KeptLoops:
         believed = np.where(self.weight == UNWEIGHED, self.loops.logit[0].numpy() > 0.0, self.weight >= _BELIEVED)
         kept = self.best(np.flatnonzero(behind & believed), most)
         return self.where(np.concatenate((kept, np.flatnonzero(~behind))))
+
+    def state(self) -> Arrays:
+        """All of it, for ``from_state``."""
+        record = {name: getattr(self.loops, name)[0].numpy() for name in _FIELDS}
+        return {**record, "weight": self.weight, "overlap": self.overlap}
+
+    @classmethod
+    def from_state(cls, arrays: Arrays) -> KeptLoops:
+        """The loops of a ``state()``; raises ``StateError``."""
+        weight = taken(arrays, "weight", np.float64, -1)
+        overlap, count = taken(arrays, "overlap", np.bool_, len(weight)), len(weight)
+        record = {name: taken(arrays, name, dtype, count, *shape) for name, (dtype, shape) in _FIELDS.items()}
+        forward = (record["start"] >= 0) & (record["start"] <= record["end"]) & (record["frame"] >= -1)
+        require(bool(forward.all()), "a loop does not lead from an earlier node to a later one")
+        tensors = {name: torch.from_numpy(values).unsqueeze(0) for name, values in record.items()}
+        return cls(Loops(**tensors, embeddings=torch.zeros(1, 0, 0)), weight, overlap)  # type: ignore[arg-type]
 
     def for_optimizer(self, keys: np.ndarray, first: int, embeddings: np.ndarray) -> Loops:
         """The record in float32, numbered as the optimizer counts: key frames, and the nodes of the window behind them.

@@ -8,6 +8,17 @@ from typing import Any, overload
 import numpy as np
 from scipy.spatial import KDTree
 
+from ngo_estimator.data.state_arrays import (
+    Arrays,
+    flat,
+    part,
+    require,
+    split,
+    taken,
+    taken_indices,
+    taken_integer,
+    under,
+)
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 
 _NEAR_M, _NEAR_DEG = 1.0, 30.0
@@ -57,6 +68,44 @@ class KeyScanStore(Sequence[KeyScan]):
         self._kept.add(len(self._scans))
         self._scans.append(scan)
         self._points += len(scan.points)
+
+    def state(self) -> Arrays:
+        """All key scans, for ``restore``: points of the compact ones as single floats, all of the others."""
+        compact, whole = self._scans[: self._compact], self._scans[self._compact :]
+        arrays: Arrays = {
+            "stamps_ns": np.array([scan.stamp_ns for scan in self._scans], np.int64),
+            "sensors": np.array([scan.sensor_xyyaw for scan in self._scans]).reshape(-1, 3),
+            "max_ranges": np.array([scan.max_range for scan in self._scans], np.float64),
+            "kept": np.array(sorted(self._kept), np.int64),
+            "compact": np.array(self._compact),
+        }
+        for name, scans, dtype in (("old", compact, np.float32), ("new", whole, np.float64)):
+            for field in ("points", "normals"):
+                rows = [getattr(scan, field).astype(dtype, copy=False) for scan in scans]
+                arrays |= under(f"{name}.{field}", flat(rows, np.zeros((0, 2), dtype)))
+        for field in ("angles", "ranges"):
+            arrays |= under(f"new.{field}", flat([getattr(scan, field) for scan in whole], _NOTHING))
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        stamps_ns = taken(arrays, "stamps_ns", np.int64, -1)
+        count = len(stamps_ns)
+        own = taken(arrays, "sensors", np.float64, count, 3), taken(arrays, "max_ranges", np.float64, count)
+        self._compact = taken_integer(arrays, "compact")
+        points, normals = (
+            split(part(arrays, f"old.{field}"), np.float32, 2) + split(part(arrays, f"new.{field}"), np.float64, 2)
+            for field in ("points", "normals")
+        )
+        angles, ranges = (
+            [_NOTHING] * self._compact + split(part(arrays, f"new.{field}"), np.float64)
+            for field in ("angles", "ranges")
+        )
+        columns = stamps_ns.tolist(), points, normals, own[0], angles, ranges, own[1].tolist()
+        require({len(column) for column in columns} == {count}, f"there are not {count} key scans")
+        self._scans = [KeyScan(*row) for row in zip(*columns, strict=True)]
+        self._points = sum(map(len, points))
+        self._kept = set(taken_indices(arrays, "kept", count).tolist())
 
     def compact(self) -> None:
         """Drop the rays of all key scans so far, and keep points and normals as single floats, as messages do."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from ngo_estimator.data.state_arrays import Arrays, taken
 from ngo_estimator.geometry import se2
 
 
@@ -33,6 +34,16 @@ class MapOrigin:
         given, own = torch.tensor(map_from_base_xyyaw), torch.tensor(start_from_base_xyyaw)
         map_from_start = se2.compose(given, se2.inverse(own)).numpy()
         return cls(map_from_start, map_from_base_xyyaw, np.zeros((3, 3)) if covariance is None else covariance)
+
+    def state(self) -> Arrays:
+        """All of it, for ``from_state``."""
+        return dict(vars(self))
+
+    @classmethod
+    def from_state(cls, arrays: Arrays) -> "MapOrigin":
+        """The origin of a ``state()``; raises ``StateError``."""
+        motion, given = (taken(arrays, name, np.float64, 3) for name in ("map_from_start_xyyaw", "given_xyyaw"))
+        return cls(motion, given, taken(arrays, "covariance", np.float64, 3, 3))
 
     def poses(self, poses_xyyaw: np.ndarray) -> np.ndarray:
         """Poses ``(..., 3)`` of the trajectory, in ``map``."""

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
+from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.networks.place_encoder import PairHead
@@ -20,6 +21,7 @@ from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 from ngo_estimator.optimizer.registered_odometry import registered_steps
 
 _MOST_DRIFT = 4.0
@@ -30,6 +32,9 @@ _FRESH = 2
 
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
+
+_BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features")
+"""Names of the newest rows: three of each step, the others of each block; without a network there are no features."""
 
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
@@ -84,7 +89,8 @@ class MetaGraph:
         if optimizer.config.loops:
             assert pair_head is not None
             self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self.odometry)
-        self._result: OptimizedMetaPoses | None = None
+        self._end = np.zeros((3, 3))  # covariance of the last node that was optimised, in the map
+        self._information: FactorisedInformation | None = None  # of the last optimisation
         self._result_keys, self._result_first, self._result_last = np.zeros(0, np.int64), 0, 0
         self.loop_frames = np.zeros((0, 2), np.int64)
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
@@ -207,7 +213,7 @@ class MetaGraph:
             self._keys.add(self._loops.key_frame(node, relative, variance))
         else:
             nothing = np.zeros((self._block, 0), np.float32)
-            self._keys.add(KeyFrame(node, relative, variance, nothing, nothing, nothing))
+            self._keys.add(KeyFrame(node, relative, variance, nothing, nothing, np.zeros((self._block, 3))))
         self._first += 1
         if self._loops is not None:
             self._loops.leave(self._first)
@@ -246,7 +252,7 @@ class MetaGraph:
         The odometry alone would let a pose of long ago lie anywhere; the loops that were closed since say more.
         """
         limits = np.full((len(found), 3), np.inf)
-        if self._result is None or self._result.equations is None or self._result_last < self._first:
+        if self._information is None or self._result_last < self._first:
             return limits  # nothing was optimised, or all of what was lies behind the window by now
         last = int(len(self._result_keys) + self._result_last - self._result_first)
         since = self._std.slice(self._result_last).astype(np.float64)
@@ -258,7 +264,7 @@ class MetaGraph:
                 continue
             covariance = np.zeros((6, 6))
             which = slice(0, 6) if start else slice(3, 6)
-            covariance[which, which] = self._result.equations.covariance([start, last] if start else [last])
+            covariance[which, which] = self._information.covariance([start, last] if start else [last])
             x, y = self._nodes.values[self._result_last, :2] - self._nodes.values[found.start[k], :2]
             jacobian = np.hstack((np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]), -np.eye(3)))
             drift = np.diagonal(jacobian @ covariance @ jacobian.T)
@@ -332,7 +338,8 @@ class MetaGraph:
         self._before = self._nodes.values[self._active]
         self._nodes.values[self._active[1:]] = poses.numpy()
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
-        self._result, self._result_keys, self._result_first, self._result_last = result, keys, first, self.blocks
+        self._end, self._information = self._scale * result.end_covariance()[0].numpy(), result.equations
+        self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
 
     def abandon(self) -> None:
         """Leave undone what has begun."""
@@ -364,13 +371,102 @@ class MetaGraph:
         whole = self.blocks * self._block
         odometry = torch.from_numpy(self.odometry.values[whole:])
         poses = se2.compose(torch.from_numpy(self._nodes.values[-1]), se2.between(odometry[0], odometry)).numpy()
-        covariance = self.end_covariance()
+        covariance = self._end
         steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
         for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
             covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))
         return poses[-1], covariance
 
-    def end_covariance(self) -> np.ndarray:
-        """Covariance ``(3, 3)`` of the last node that was optimised, in the map."""
-        assert self._result is not None
-        return self._scale * self._result.end_covariance()[0].numpy()
+    def _buffers(self) -> dict[str, SlidingRows]:
+        rows = self._relative, self._log_std, self._motion, self._steps, self._std, self._optimized_std, self._features
+        return dict(zip(_BUFFERS, rows, strict=True))
+
+    def state(self) -> Arrays:
+        """All that later steps depend on, for ``restore``.
+
+        Of an optimisation in progress that is the number of its iterations: nothing that it began with has changed.
+        """
+        running, code = self._running, self._origin_code
+        done = -1 if running is None else self._optimizer.config.iterations - running.left
+        arrays = {
+            "odometry": self.odometry.values,
+            "pose": self._pose,
+            "covariance": self._covariance,
+            "nodes": self._nodes.values,
+            "first": np.array(self._first),
+            "kept": self._kept,
+            "gone": self._gone,
+            "active": self._active,
+            "before": self._before,
+            "end": self._end,
+            "result_keys": self._result_keys,
+            "result_ends": np.array((self._result_first, self._result_last)),
+            "loop_frames": self.loop_frames,
+            "loop_relative": self.loop_relative,
+            "loop_std": self.loop_std,
+            "loop_weights": self.loop_weights,
+            "origin_code": np.zeros(0, np.float32) if code is None else code,
+            "iterations": np.array(done),
+            **under("keys", self._keys.state()),
+        }
+        for name, rows in self._buffers().items():
+            arrays |= under(name, rows.state())
+        if self._information is not None:
+            arrays |= under("information", self._information.state())
+        return arrays if self._loops is None else arrays | under("loops", self._loops.state())
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
+        self.odometry.restore(arrays, "odometry")
+        self._nodes.restore(arrays, "nodes")
+        for name, rows in self._buffers().items():
+            rows.restore(part(arrays, name))
+        self._pose, self._covariance = (
+            taken(arrays, "pose", np.float64, 3),
+            taken(arrays, "covariance", np.float64, 3, 3),
+        )
+        self._first = taken_integer(arrays, "first")
+        nothing = (self._block, 0)
+        shapes = (nothing, nothing) if self._loops is None else self._loops.key_frame_shapes
+        self._keys.restore(part(arrays, "keys"), self.blocks + 1, *shapes)
+        self._kept, self._gone = (
+            taken(arrays, "kept", np.float64, -1, 3),
+            taken_indices(arrays, "gone", self.blocks + 1),
+        )
+        self._active = taken_indices(arrays, "active", self.blocks + 1)
+        self._before = taken(arrays, "before", np.float64, len(self._active), 3)
+        self._end = taken(arrays, "end", np.float64, 3, 3)
+        self._result_keys = taken_indices(arrays, "result_keys", self.blocks + 1)
+        self._result_first, self._result_last = taken(arrays, "result_ends", np.int64, 2).tolist()
+        self.loop_frames = taken(arrays, "loop_frames", np.int64, -1, 2)
+        for name, shape in (("loop_relative", (3,)), ("loop_std", (3,)), ("loop_weights", ())):
+            setattr(self, name, taken(arrays, name, np.float64, len(self.loop_frames), *shape))
+        code = taken(arrays, "origin_code", np.float32, -1)
+        self._origin_code = code if len(code) else None
+        information = part(arrays, "information")
+        self._information = FactorisedInformation.from_state(information) if information else None
+        if self._loops is not None:
+            self._loops.restore(part(arrays, "loops"))
+        self._check()
+        done = taken_integer(arrays, "iterations", -1)
+        require(done < self._optimizer.config.iterations, f"an optimisation has run {done} iterations already")
+        if done >= 0:
+            self.begin()
+            self.advance(done)
+
+    def _check(self) -> None:
+        """Raise ``StateError`` where the parts of a restored state do not belong together."""
+        frames, blocks, counted = len(self.odometry) - 1, self.blocks, self._buffers()
+        require(
+            frames // self._block == blocks
+            and {len(counted[name]) for name in _BUFFERS[:3]} == {frames}
+            and {len(counted[name]) for name in _BUFFERS[3:6]} == {blocks},
+            f"{frames} steps and {blocks} meta-poses do not belong together",
+        )
+        require(
+            0 <= self._result_first <= self._result_last <= blocks
+            and self._first == (self._keys.nodes[-1] + 1 if len(self._keys) else 0)
+            and len(self._kept) <= len(self._keys)
+            and bool((self.loop_frames >= 0).all() and (self.loop_frames <= frames).all()),
+            "nodes or key frames are named that are not there",
+        )

@@ -1,8 +1,14 @@
 """The online trajectory: relative poses in, the whole corrected trajectory out (no ROS here)."""
 
+import dataclasses
+import hashlib
+import json
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from safetensors.torch import save
 
 from ngo_estimator.checkpoint import CheckpointError, load_optimizer, load_place
 from ngo_estimator.data.relative_step import RelativeStep, check_step
@@ -95,6 +101,21 @@ class OnlineTrajectory(CorrectedTrajectory):
     def window_frames(self) -> int:
         """Steps that are optimised together."""
         return self._window
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """Settings, and a hash of the networks' configurations and weights."""
+        digest = hashlib.sha256()
+        for network in (self._optimizer, self._pair_head):
+            if network is not None:
+                digest.update(json.dumps(dataclasses.asdict(network.config), sort_keys=True).encode())
+                digest.update(save({name: tensor.contiguous() for name, tensor in network.state_dict().items()}))
+        return {
+            "weights_sha256": digest.hexdigest(),
+            "window_frames": self._window,
+            "key_frames": self._key_frames,
+            "iterations_per_step": self._iterations_per_step,
+        }
 
     def _new_graph(self) -> MetaGraph:
         return MetaGraph(self._optimizer, self._pair_head, self._window // self._block, self._key_frames)

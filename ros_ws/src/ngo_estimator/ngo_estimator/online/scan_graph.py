@@ -13,6 +13,7 @@ import torch
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded, propagate
@@ -309,6 +310,70 @@ class ScanGraph:
             transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.values, self._scans, strict=True)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
+
+    def _rows_of(self) -> dict[str, GrowingRows]:
+        return {
+            "odometry": self.odometry,
+            "frames": self._frames,
+            "nodes": self._nodes,
+            "steps": self._steps,
+            "step_covariance": self._step_covariance,
+            "published_covariance": self._published_covariance,
+        }
+
+    def state(self) -> Arrays:
+        """All that later steps depend on, for ``restore``.
+
+        Of an optimisation in progress that is the number of its iterations: nothing that it began with has changed.
+        """
+        return {
+            **{name: rows.values for name, rows in self._rows_of().items()},
+            **under("scans", self._scans.state()),
+            **under("finder", self._finder.state()),
+            "key_stamp_ns": np.array(self._key_stamp_ns, np.int64),
+            "since": self._since,
+            "end": self._end,
+            "waiting": np.array(self._waiting),
+            "before": self._before,
+            "loop_rows": self._loop_rows,
+            "loop_weights": self.loop_weights,
+            "iterations": np.array(-1 if self._running is None else self.config.iterations - self._left),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
+        for name, rows in self._rows_of().items():
+            rows.restore(arrays, name)
+        self._scans.restore(part(arrays, "scans"))
+        self._finder.restore(part(arrays, "finder"))
+        self._key_stamp_ns = taken_integer(arrays, "key_stamp_ns", -(2**63))
+        self._since, self._end = taken(arrays, "since", np.float64, 3, 3), taken(arrays, "end", np.float64, 3, 3)
+        self._before = taken(arrays, "before", np.float64, -1, 3)
+        self._loop_rows = taken(arrays, "loop_rows", np.int64, -1)
+        self.loop_weights = taken(arrays, "loop_weights", np.float64, len(self._loop_rows))
+        self._check()
+        done, waiting = taken_integer(arrays, "iterations", -1), taken_integer(arrays, "waiting")
+        require(done < self.config.iterations, f"an optimisation has run {done} iterations already")
+        if done >= 0:
+            self.begin()
+            self.advance(done)
+        self._waiting = waiting
+
+    def _check(self) -> None:
+        """Raise ``StateError`` where the parts of a restored state do not belong together."""
+        keys, frames, found = self.keys, self._frames.values, len(self._finder.loops)
+        steps = {len(rows) for rows in (self._steps, self._step_covariance, self._published_covariance)}
+        require(
+            keys > 0 and len(self._scans) == len(frames) == keys and steps == {keys - 1},
+            f"there are not {keys} key scans, and a step less",
+        )
+        ordered = frames[0] == 0 and (np.diff(frames) > 0).all() and frames[-1] < len(self.odometry)
+        require(
+            bool(ordered)
+            and 1 <= len(self._before) <= keys
+            and bool(((self._loop_rows >= 0) & (self._loop_rows < found)).all()),
+            "frames, nodes or loops are named that are not there",
+        )
 
     @property
     def loop_frames(self) -> np.ndarray:

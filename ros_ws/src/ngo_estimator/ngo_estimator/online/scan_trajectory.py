@@ -1,7 +1,8 @@
 """The online trajectory of a 2D lidar: relative poses and key scans in, the whole corrected trajectory out (no ROS)."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,11 @@ class ScanTrajectory(CorrectedTrajectory):
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
         return self._graph.walls(most)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The settings: there are no networks."""
+        return {"graph": asdict(self._config), "iterations_per_step": self._iterations_per_step}
 
     def _new_graph(self) -> ScanGraph:
         return ScanGraph(self._config)

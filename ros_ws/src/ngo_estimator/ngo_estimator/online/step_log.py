@@ -13,6 +13,7 @@ from ngo_estimator.data.relative_step import (
     RelativeStep,
 )
 from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import Arrays, require, taken_integer
 from ngo_estimator.geometry import se2
 
 
@@ -97,6 +98,28 @@ class StepLog:
         self.odometry.append(step.odom_xyyaw)
         self.odometry_std.append(np.sqrt(np.diagonal(covariance)))
         return TakenStep(relative, covariance, begins, restarted, gap)
+
+    def state(self) -> Arrays:
+        """All of it, for ``restore``."""
+        return {
+            "stamps_ns": self.stamps_ns.values,
+            "odometry": self.odometry.values,
+            "odometry_std": self.odometry_std.values,
+            "origin_stamp_ns": np.array(self._origin_stamp_ns, np.int64),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        self.stamps_ns.restore(arrays, "stamps_ns")
+        self.odometry.restore(arrays, "odometry")
+        self.odometry_std.restore(arrays, "odometry_std")
+        self._origin_stamp_ns = taken_integer(arrays, "origin_stamp_ns", -(2**63))
+        frames = len(self.stamps_ns)
+        require(
+            len(self.odometry) == frames and len(self.odometry_std) == max(0, frames - 1) and frames != 1,
+            f"{frames} frames do not have as many poses, and a step less",
+        )
+        require(bool((np.diff(self.stamps_ns.values) > 0).all()), "the stamps do not ascend")
 
     def _over_gap(self, step: RelativeStep, last_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Relative pose and covariance from the last frame that is known to the one of ``step``.

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import torch
 
+from ngo_estimator.data.state_arrays import Arrays, taken, taken_integer
 from ngo_estimator.geometry import se2
 
 
@@ -25,6 +26,21 @@ class SmoothedCorrection:
     def reset(self) -> None:
         """Forget the last value: the next one is taken as it is."""
         self._last: tuple[int, np.ndarray] | None = None
+
+    def state(self) -> Arrays:
+        """The last value, for ``restored``; nothing before the first one."""
+        if self._last is None:
+            return {}
+        stamp_ns, map_from_odom = self._last
+        return {"stamp_ns": np.array(stamp_ns, np.int64), "map_from_odom_xyyaw": map_from_odom}
+
+    def restored(self, arrays: Arrays) -> "SmoothedCorrection":
+        """Another one with this time constant, and the last value of a ``state()``; raises ``StateError``."""
+        other = SmoothedCorrection(self.time_constant_s)
+        if arrays:
+            last = taken(arrays, "map_from_odom_xyyaw", np.float64, 3)
+            other._last = taken_integer(arrays, "stamp_ns", -(2**63)), last
+        return other
 
     def update(self, stamp_ns: int, map_from_odom_xyyaw: np.ndarray, odom_from_base_xyyaw: np.ndarray) -> np.ndarray:
         """The smoothed ``map_from_odom`` ``(3,)`` at a stamp, with the robot's pose in odom."""

@@ -12,6 +12,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from ngo_estimator.data.state_arrays import Arrays, require, taken
 from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
 
 # Pivots stay on the diagonal. No relaxed supernodes: they fill columns that have little in common, and are many times
@@ -30,8 +31,9 @@ class GraphStructure:
         self.count = count
         unknown = count - 1
         pairs = nodes - 1
-        self._rank = _order_of_elimination(pairs[(pairs >= 0).all(1)], unknown)
-        ranks = self._rank[pairs]
+        self.rank = _order_of_elimination(pairs[(pairs >= 0).all(1)], unknown)
+        """Place of each node but node 0 in the order of elimination ``(count - 1,)``."""
+        ranks = self.rank[pairs]
         row, column = ranks[:, [0, 0, 1, 1]].ravel(), ranks[:, [0, 1, 0, 1]].ravel()
         known = (pairs[:, [0, 0, 1, 1]] < 0).ravel() | (pairs[:, [0, 1, 0, 1]] < 0).ravel()
         diagonal = np.arange(unknown)
@@ -53,11 +55,6 @@ class GraphStructure:
         starts = 9 * first[:-1, None] + 3 * height[:, None] * np.arange(3)
         self._indptr = np.append(starts.ravel(), 9 * len(blocks)).astype(np.int32)
         self._is_diagonal = block_column == block_row
-
-    def rows(self, nodes: np.ndarray) -> np.ndarray:
-        """Rows of the matrix ``(n, 3)`` that belong to nodes ``(n,)``, none of them node 0."""
-        rows: np.ndarray = 3 * self._rank[nodes - 1][:, None] + np.arange(3)
-        return rows
 
     def matrix(self, hessian: Tensor) -> csc_matrix:
         """The factors' ``(factors, 6, 6)`` summed, without node 0, in an order that leaves few entries to eliminate."""
@@ -82,32 +79,64 @@ def _order_of_elimination(pairs: np.ndarray, count: int) -> np.ndarray:
     return order.astype(np.int64)
 
 
-class NormalEquations:
+class FactorisedInformation:
+    """The factorised information matrix of the poses of one graph, node 0 excepted, which is known.
+
+    Args:
+        rank: place of each pose in the order of elimination ``(poses,)``.
+        matrix: ``(3 poses, 3 poses)``, in this order.
+    """
+
+    def __init__(self, rank: np.ndarray, matrix: csc_matrix) -> None:
+        self._rank, self._matrix = rank, matrix
+        self._factor = splu(matrix, permc_spec="NATURAL", **_SYMMETRIC)
+
+    def rows(self, nodes: np.ndarray) -> np.ndarray:
+        """Rows of the matrix ``(n, 3)`` that belong to nodes ``(n,)``, none of them node 0."""
+        rows: np.ndarray = 3 * self._rank[nodes - 1][:, None] + np.arange(3)
+        return rows
+
+    def covariance(self, nodes: Sequence[int]) -> np.ndarray:
+        """Joint covariance ``(3 n, 3 n)`` of the poses of ``n`` different nodes, node 0 excepted, in the map."""
+        wanted = self.rows(np.asarray(nodes)).ravel()
+        right = np.zeros((self._matrix.shape[0], len(wanted)))
+        right[wanted, np.arange(len(wanted))] = 1.0
+        covariance: np.ndarray = self._factor.solve(right)[wanted]
+        return 0.5 * (covariance + covariance.T)
+
+    def state(self) -> Arrays:
+        """The matrix, for ``from_state``."""
+        matrix = self._matrix
+        return {"rank": self._rank, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+
+    @classmethod
+    def from_state(cls, arrays: Arrays) -> "FactorisedInformation":
+        """The same again, to the last bit; raises ``StateError``."""
+        rank, data = taken(arrays, "rank", np.int64, -1), taken(arrays, "data", np.float64, -1)
+        size = 3 * len(rank)
+        indices, indptr = taken(arrays, "indices", np.int32, len(data)), taken(arrays, "indptr", np.int32, size + 1)
+        require(np.array_equal(np.sort(rank), np.arange(len(rank))), "the order of elimination is no permutation")
+        matrix = csc_matrix((data, indices, indptr), shape=(size, size))
+        matrix.check_format()
+        return FactorisedInformation(rank, matrix)
+
+
+class NormalEquations(FactorisedInformation):
     """The factorised normal equations of one graph, at the poses where its factors were linearised."""
 
     def __init__(self, factors: Sequence[Factors], structure: GraphStructure) -> None:
         """Sum the factors of a batch of one; raises ``RuntimeError`` where a pose has no factor at all."""
         nodes, hessian, gradient = (blocks[0] for blocks in normal_blocks(factors))
-        self._structure = structure
         self._right = torch.zeros(structure.count, 3, dtype=torch.float64)
         self._right.index_add_(0, nodes.flatten(), gradient.reshape(-1, 3))
-        matrix = structure.matrix(hessian)
-        self._factor = splu(matrix, permc_spec="NATURAL", **_SYMMETRIC)
+        super().__init__(structure.rank, structure.matrix(hessian))
 
     def step(self) -> Tensor:
         """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""
-        count = self._structure.count
-        rows = self._structure.rows(np.arange(1, count))
+        count = len(self._right)
+        rows = self.rows(np.arange(1, count))
         right = np.empty(rows.size)
         right[rows] = self._right[1:].numpy()
         step = np.zeros((count, 3))
         step[1:] = self._factor.solve(right)[rows]
         return torch.from_numpy(step).unsqueeze(0)
-
-    def covariance(self, nodes: Sequence[int]) -> np.ndarray:
-        """Joint covariance ``(3 n, 3 n)`` of the poses of ``n`` different nodes, node 0 excepted, in the map."""
-        wanted = self._structure.rows(np.asarray(nodes)).ravel()
-        right = np.zeros((3 * (self._structure.count - 1), len(wanted)))
-        right[wanted, np.arange(len(wanted))] = 1.0
-        covariance: np.ndarray = self._factor.solve(right)[wanted]
-        return 0.5 * (covariance + covariance.T)

@@ -14,13 +14,24 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import (
+    Arrays,
+    flat,
+    part,
+    require,
+    split,
+    taken,
+    taken_indices,
+    taken_integer,
+    under,
+)
 from ngo_estimator.geometry.branch_and_bound import PooledGrid, SearchConfig, pooled_grid, search
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.line_map import LineMap, line_map_of_points
 from ngo_estimator.geometry.planar_motion import between, turned_covariance, wrap
 from ngo_estimator.geometry.scan_matching import icp
 from ngo_estimator.optimizer.scan_loop_candidates import nearest_places
-from ngo_estimator.optimizer.walls_seen_through import PlacedScans, placed, range_profile, seen_through
+from ngo_estimator.optimizer.walls_seen_through import PROFILE_BINS, PlacedScans, placed, range_profile, seen_through
 
 _SUBMAP_VARIANCE = np.diag((0.01**2, 0.01**2, math.radians(0.15) ** 2))
 """Of the submap's own keys against each other, which registration in it can't see."""
@@ -34,6 +45,19 @@ neighbouring loops that agree.
 """
 
 _DISAGREEMENT, _AGREEING = EVIDENCE.index("disagreement"), EVIDENCE.index("agreeing")
+
+
+_LOOP_ROWS: dict[str, tuple[type, tuple[int, ...]]] = {
+    "pairs": (np.int64, (2,)),
+    "relative": (np.float64, (3,)),
+    "covariance": (np.float64, (3, 3)),
+    "evidence": (np.float64, (len(EVIDENCE),)),
+    "accepted": (np.bool_, ()),
+}
+"""Type and shape of a loop's row in each array of ``ScanLoops``."""
+
+_PLACED_ROWS = {"points": (2,), "normals": (2,), "sensors": (3,), "profiles": (PROFILE_BINS,)}
+"""The same of ``PlacedScans``, all float64."""
 
 
 @dataclass(frozen=True)
@@ -240,6 +264,55 @@ class ScanLoopFinder:
             self._profiles[key] = nothing
             self._forgotten.add(key)
 
+    def state(self) -> Arrays:
+        """All that later calls depend on, for ``restore``.
+
+        Submaps are among it: their scans lie where the poses had them when they were made, and may be gone since.
+        """
+        profiles = [profile for key, profile in enumerate(self._profiles) if key not in self._forgotten]
+        submaps = list(self._submaps.values())
+        arrays: Arrays = {
+            "keys": np.array(len(self._profiles)),
+            "profiles": np.array(profiles, np.float32).reshape(-1, PROFILE_BINS),
+            "middles": self._middles.values,
+            "forgotten": np.array(sorted(self._forgotten), np.int64),
+            "places": np.array([(place, submap.first) for place, submap in self._submaps.items()], np.int64).reshape(
+                -1, 2
+            ),
+            **under("loops", {name: getattr(self.loops, name) for name in _LOOP_ROWS}),
+            **under("submaps.poses", flat([submap.poses for submap in submaps], np.zeros((0, 3)))),
+        }
+        for name, shape in _PLACED_ROWS.items():
+            rows = [getattr(submap.scans, name) for submap in submaps]
+            arrays |= under(f"submaps.{name}", flat(rows, np.zeros((0, *shape))))
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        count = taken_integer(arrays, "keys")
+        loops = part(arrays, "loops")
+        pairs = taken(loops, "pairs", np.int64, -1, 2)
+        rows = {name: taken(loops, name, dtype, len(pairs), *shape) for name, (dtype, shape) in _LOOP_ROWS.items()}
+        require(bool(((pairs >= 0) & (pairs < count)).all()), f"a loop joins key scans that are not among the {count}")
+        self.loops = ScanLoops(**rows)
+        self._middles.restore(arrays, "middles")
+        require(len(self._middles) == count, f"there are not {count} middles of key scans")
+        forgotten = taken_indices(arrays, "forgotten", count)
+        self._forgotten = set(forgotten.tolist())
+        known = np.setdiff1d(np.arange(count), forgotten)
+        profiles = taken(arrays, "profiles", np.float32, len(known), PROFILE_BINS)
+        self._profiles = [np.zeros(PROFILE_BINS, np.float32)] * count
+        for key, profile in zip(known.tolist(), profiles, strict=True):
+            self._profiles[key] = profile
+        places = taken(arrays, "places", np.int64, -1, 2)
+        poses = split(part(arrays, "submaps.poses"), np.float64, 3)
+        placed = [split(part(arrays, f"submaps.{name}"), np.float64, *shape) for name, shape in _PLACED_ROWS.items()]
+        require({len(parts) for parts in (poses, *placed)} == {len(places)}, f"there are not {len(places)} submaps")
+        self._submaps = OrderedDict(
+            (place, self._submap_of(first, local, PlacedScans(*scans)))
+            for (place, first), local, *scans in zip(places.tolist(), poses, *placed, strict=True)
+        )
+
     def _candidates(self, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]) -> list[_Candidate]:
         config, key = self.config, len(poses) - 1
         path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))))
@@ -277,14 +350,17 @@ class ScanLoopFinder:
         first, after = max(0, place - half), min(len(scans), place - half + self.config.submap_keys)
         local = _between(poses[place], poses[first:after])
         together = placed(scans[first:after], self._profiles[first:after], local)
-        lines = line_map_of_points(together.points, together.normals)
-        near = _within(together.points, self.config.range_m)
-        grid = pooled_grid(self.config.search, near) if len(near) else None
-        submap = _Submap(first, local, together, lines, grid)
+        submap = self._submap_of(first, local, together)
         self._submaps[place] = submap
         if len(self._submaps) > self.config.most_submaps:
             self._submaps.popitem(last=False)
         return submap
+
+    def _submap_of(self, first: int, local: np.ndarray, together: PlacedScans) -> _Submap:
+        lines = line_map_of_points(together.points, together.normals)
+        near = _within(together.points, self.config.range_m)
+        grid = pooled_grid(self.config.search, near) if len(near) else None
+        return _Submap(first, local, together, lines, grid)
 
     def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: _Candidate) -> ScanLoops | None:
         """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""

@@ -13,7 +13,9 @@ from numba import njit
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
 
-_BINS = 360  # directions of a range profile
+PROFILE_BINS = 360
+"""Directions of a range profile."""
+
 _MARGIN_M, _MARGIN_SHARE = 0.3, 0.02  # a ray that goes on for that much behind a point went through it
 
 
@@ -34,11 +36,11 @@ class PlacedScans:
 
 def range_profile(scan: KeyScan) -> Array:
     """Least range ``(360,)`` within a degree of each direction from the sensor (m, 0 where no ray came back)."""
-    nearest = np.full(_BINS, np.inf)
+    nearest = np.full(PROFILE_BINS, np.inf)
     known = np.isfinite(scan.ranges)
-    bins = np.floor(scan.angles[known] * (_BINS / (2.0 * math.pi))).astype(np.int64)
+    bins = np.floor(scan.angles[known] * (PROFILE_BINS / (2.0 * math.pi))).astype(np.int64)
     for neighbour in (-1, 0, 1):
-        np.minimum.at(nearest, (bins + neighbour) % _BINS, scan.ranges[known])
+        np.minimum.at(nearest, (bins + neighbour) % PROFILE_BINS, scan.ranges[known])
     return np.where(np.isfinite(nearest), nearest, 0.0)
 
 

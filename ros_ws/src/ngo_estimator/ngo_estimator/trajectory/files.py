@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from ngo_estimator.trajectory.save_path import check_replaceable
+
 ENDINGS = (".tum", ".txt", ".kitti", ".g2o")
 TUM_ENDINGS = (".tum", ".txt")
 
@@ -91,7 +93,7 @@ def write_trajectory(
         The files written: ``path``, and for ``.kitti`` the one of the stamps.
 
     Raises:
-        ValueError: another ending, or no pose to write.
+        ValueError: another ending, no pose to write, or something at its place that is no regular file.
         OSError: a file cannot be written; those that were there before still are.
     """
     if path.suffix not in ENDINGS:
@@ -203,6 +205,8 @@ def _g2o_lines(poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges]) -> Iterator[
 def _write_together(contents: Mapping[Path, Iterator[str]]) -> list[Path]:
     """Write all files beside their places, and move them there only when each is on the disk."""
     written: dict[Path, str] = {}
+    for path in contents:
+        check_replaceable(path)
     try:
         for path, lines in contents.items():
             handle, written[path] = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

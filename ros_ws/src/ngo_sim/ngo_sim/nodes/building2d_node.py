@@ -20,6 +20,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.last_catch import spin_once
+from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import run_node
 from ngo_common.settings import BadParameter, SettingsType, usage
@@ -58,6 +60,7 @@ class Building2dNode(Node):
         except ValueError as error:  # what only the building can say
             raise BadParameter(str(error)) from None
         config = self.config
+        self._name_watch = NameWatch(self)
         self._consumers = Consumers(self, config.flow_control_topics, FlowControl(config.max_in_flight))
         qos = QoSProfile(depth=max(100, 2 * config.max_in_flight))
         self.outputs = Outputs(self, qos, config.record)
@@ -95,6 +98,7 @@ class Building2dNode(Node):
             if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
                 self._looked_s = now_s
                 self._consumers.look()
+                self._name_watch.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
                     self._scan.publisher.wait_for_all_acked(Duration(seconds=5))
@@ -104,7 +108,7 @@ class Building2dNode(Node):
             elif (idle_s := self._idle_s(now_s)) == 0.0:
                 self._publish(self._building.step(), now_s)
             self.outputs.flush_if_due()
-            executor.spin_once(timeout_sec=idle_s)
+            spin_once(self, executor, idle_s)
 
     def _ready_line(self) -> str:
         """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""

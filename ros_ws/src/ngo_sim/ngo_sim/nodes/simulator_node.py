@@ -19,6 +19,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
+from ngo_common.nodes.last_catch import spin_once
+from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
@@ -48,6 +50,7 @@ class SimulatorNode(Node):
         self.world_config: Any = world.values
         self._live.lock()
         world.lock()
+        self._name_watch = NameWatch(self)
         self._consumers = Consumers(self, self.config.flow_control_topics, FlowControl(self.config.max_in_flight))
         # Deep enough for late acknowledgements of a reliable reader: far more than the frames in flight.
         qos = QoSProfile(depth=max(100, 2 * self.config.max_in_flight))
@@ -115,6 +118,7 @@ class SimulatorNode(Node):
             if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
                 self._looked_s = now_s
                 self._consumers.look()
+                self._name_watch.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
                     self.image_publisher.wait_for_all_acked(Duration(seconds=5))
@@ -126,7 +130,7 @@ class SimulatorNode(Node):
             self.outputs.flush_if_due()
             if idle_s > 0.0 or now_s - listened_s >= _LISTEN_S:
                 listened_s = now_s
-                executor.spin_once(timeout_sec=idle_s)
+                spin_once(self, executor, idle_s)
 
     def _ready_line(self) -> str:
         """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""

@@ -1,0 +1,150 @@
+"""The file format of a saved state: one folder with the arrays in safetensors, and a description in JSON.
+
+``state.json`` names the file of the arrays and its hash, and is put in place last: until then an older state in the
+folder stays whole.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors
+from safetensors.numpy import load, save
+
+from ngo_estimator.data.state_arrays import Arrays, StateError
+
+FORMAT = 1
+DESCRIPTION = "state.json"
+_KEYS = {"format", "identity", "arrays", "arrays_sha256", "sha256"}
+
+
+def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> None:
+    """Write ``arrays`` of a trajectory with this ``identity``, all at once or not at all.
+
+    The folder is made where there is none; its parent must exist. A state in it is replaced.
+
+    Raises:
+        StateError: the folder holds other files, or cannot be written.
+    """
+    content = save(arrays)
+    digest = hashlib.sha256(content).hexdigest()
+    name = f"arrays-{digest[:16]}.safetensors"
+    description = {"format": FORMAT, "identity": dict(identity), "arrays": name, "arrays_sha256": digest}
+    try:
+        made = not folder.exists()
+        old = set() if made else _files_of_a_state(folder)
+        folder.mkdir(exist_ok=True)
+        try:
+            if name not in old:
+                _put(folder / name, content)
+            _put(folder / DESCRIPTION, _text(description).encode())
+        except OSError:
+            if name not in old:
+                (folder / name).unlink(missing_ok=True)
+            if made:
+                folder.rmdir()
+            raise
+        for leftover in old - {name, DESCRIPTION}:
+            (folder / leftover).unlink()
+        _sync(folder.parent)
+    except OSError as error:
+        raise StateError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
+
+
+def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
+    """The arrays in ``folder``, which were saved by a trajectory with this ``identity``.
+
+    Raises:
+        StateError: of one line, about what is missing, damaged, or other than here.
+    """
+    path = folder / DESCRIPTION
+    description = _description(path)
+    saved, here = description["identity"], json.loads(json.dumps(identity))
+    for key in {**here, **saved}:
+        if saved.get(key) != here.get(key):
+            raise StateError(f"{path}: was saved with {_difference(key, saved.get(key), here.get(key))}")
+    arrays = folder / Path(description["arrays"]).name
+    content = _read(arrays)
+    if hashlib.sha256(content).hexdigest() != description["arrays_sha256"]:
+        raise StateError(f"{arrays}: is damaged (its sha256 is not the one in {DESCRIPTION})")
+    try:
+        return load(content)
+    except safetensors.SafetensorError as error:
+        raise StateError(f"{arrays}: is no safetensors file ({error})") from error
+
+
+def _files_of_a_state(folder: Path) -> set[str]:
+    """Names of what is in the folder; raises ``StateError`` where something is no part of a state."""
+    if not folder.is_dir():
+        raise StateError(f"{folder}: is a file; expected a folder, or nothing")
+    names = {path.name for path in folder.iterdir()}
+    for name in sorted(names):
+        whole = name.removesuffix(".partial")
+        if whole != DESCRIPTION and not (whole.startswith("arrays-") and whole.endswith(".safetensors")):
+            raise StateError(f"{folder}: holds '{name}'; expected a saved state, an empty folder or none")
+    return names
+
+
+def _put(path: Path, content: bytes) -> None:
+    """Write a file, durably, and give it its name when it is whole."""
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def _sync(folder: Path) -> None:
+    """Make names in a folder durable."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _text(description: Mapping[str, Any]) -> str:
+    """The JSON of a description, with its own hash."""
+    digest = hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
+    return json.dumps({**description, "sha256": digest}, indent=2) + "\n"
+
+
+def _description(path: Path) -> dict[str, Any]:
+    content = _read(path)
+    try:
+        text = content.decode()
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise StateError(f"{path}: is damaged, or no JSON ({error})") from error
+    if not isinstance(values, dict) or "format" not in values:
+        raise StateError(f"{path}: is not the description of a saved state")
+    if values["format"] != FORMAT:
+        raise StateError(f"{path}: is of format {values['format']!r}; expected {FORMAT}")
+    if set(values) != _KEYS or _text({k: v for k, v in values.items() if k != "sha256"}) != text:
+        raise StateError(f"{path}: is damaged (it is not what its sha256 says)")
+    return values
+
+
+def _difference(key: str, saved: Any, here: Any) -> str:
+    """The first difference of two values, which may be nested."""
+    if isinstance(saved, dict) and isinstance(here, dict):
+        for inner in sorted({*saved, *here}):
+            if saved.get(inner) != here.get(inner):
+                return _difference(f"{key}.{inner}", saved.get(inner), here.get(inner))
+    return f"{key} {json.dumps(saved)}; here it is {json.dumps(here)}"
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise StateError(f"{path}: cannot be read ({error.strerror})") from error
