@@ -39,17 +39,18 @@ class LocalisationConfig:
     """When a pose is claimed, and when it is lost again. Lengths are given in places, the matcher's ``place_m``.
 
     The map is looked at after every ``look_places`` or ``look_deg`` of motion, and the last ``window`` looks count. A
-    claim needs the support of ``least_support`` looks over ``least_way_places`` of way, and another pose at most
-    ``most_rival`` of that support. A pose is lost where another one could be claimed, where ``least_support`` of belief
+    claim needs the support of ``least_support`` looks, and of ``least_share`` of the window, over ``least_way_places``
+    of way, and another pose at most ``most_rival`` of that support. A pose is lost where another one could be claimed, where ``least_support`` of belief
     gathers in the window and nothing agrees, or where the deviation of the position passes ``lost_places``.
     """
 
     look_places: float = 0.4
     look_deg: float = 10.0
     window: int = 24
-    least_support: float = 4.0
+    least_support: float = 7.0
+    least_share: float = 0.7
     least_way_places: float = 3.0
-    most_rival: float = 0.5
+    most_rival: float = 0.35
     lost_places: float = 2.0
 
     def __post_init__(self) -> None:
@@ -58,10 +59,15 @@ class LocalisationConfig:
             raise ValueError(
                 f"look_places, look_deg, least_support, lost_places are {positive}; expected positive numbers"
             )
-        if self.window < 2 or not 0.0 <= self.most_rival < 1.0 or not 0.0 <= self.least_way_places < math.inf:
+        if self.window < 2 or not 0.0 <= self.least_way_places < math.inf:
             raise ValueError(
-                f"window, most_rival, least_way_places are {self.window}, {self.most_rival}, {self.least_way_places}; "
-                "expected at least 2, a share from 0 to below 1, and a length from 0 on"
+                f"window, least_way_places are {self.window}, {self.least_way_places}; expected at least 2, and a "
+                "length from 0 on"
+            )
+        if not (0.0 <= self.most_rival < 1.0 and 0.0 <= self.least_share <= 1.0):
+            raise ValueError(
+                f"most_rival, least_share are {self.most_rival}, {self.least_share}; expected shares of one, the first "
+                "below one"
             )
 
 
@@ -161,7 +167,7 @@ class Localiser:
         config, way_m = self.config, self._window.way_m[mode.looks]
         rival = max((other.support for other in others), default=0.0)
         return (
-            mode.support >= config.least_support
+            mode.support >= max(config.least_support, config.least_share * len(self._window))
             and rival <= config.most_rival * mode.support
             and float(way_m[0] - way_m[-1]) >= config.least_way_places * self._matcher.place_m
             and mode.looks[-1] >= len(self._window) - _NEW_LOOKS

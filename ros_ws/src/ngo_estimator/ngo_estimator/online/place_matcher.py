@@ -6,8 +6,6 @@ ranges are registered.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,6 +14,7 @@ from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.data.row_buffers import SlidingRows
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.online.sightings import Sightings
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
@@ -34,27 +33,6 @@ _LOOKED_AT = 256  # most similar frames of the map, among which places are told 
 _NEAR = 64  # frames around the expected pose whose ranges are compared
 _APART_RAD = 0.5  # two frames that are turned so much from each other are two candidates
 _FLOOR_M, _FLOOR_RAD = 1e-3, 1e-4  # of a sighting's deviations: the map is no better
-
-
-@dataclass(frozen=True)
-class PlaceMap:
-    """The frames of a map.
-
-    ``poses`` ``(n, 3)`` in the map, ``codes`` ``(n, code_length)``, and ``runs`` ``(n,)``: frames of the same number
-    stand in their order and followed each other without a gap.
-    """
-
-    poses: np.ndarray
-    codes: np.ndarray
-    runs: np.ndarray
-
-    def __post_init__(self) -> None:
-        count = len(self.poses)
-        if count == 0 or self.poses.shape != (count, 3) or len(self.codes) != count or self.runs.shape != (count,):
-            raise ValueError(
-                f"poses, codes, runs of a map have the shapes {self.poses.shape}, {self.codes.shape}, "
-                f"{self.runs.shape}; expected (n, 3), (n, code_length), (n,) with at least one frame"
-            )
 
 
 class PlaceMatcher:

@@ -1,0 +1,211 @@
+"""Make the table of relocalisation: kidnapped starts in mapped mazes, by one command.
+
+    python -m training.relocalisation
+
+In each maze one drive makes a map, by the whole online system. Robots start at frames of another drive, with other
+starts, noise and driver, and know nothing but the map. Mazes are those that nothing was trained or chosen on; aliased
+ones repeat one module with one texture. Writes ``training/results/relocalisation.json``. Run it again to continue
+after a stop.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+import ngo_estimator
+import training
+from ngo_estimator.geometry import se2
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from training.common import runs
+from training.common.command_line import run_command
+from training.common.curves import write_at_once
+from training.data.kidnapped_drives import Features, kidnapped_drives
+from training.data.worlds import WORLDS, World
+from training.scoring.kidnapped import KnownMap, MapErrors, scored, starts
+from training.scoring.online_estimate import run_online
+from training.scoring.relocalisation_rows import ROWS, Networks, row_of
+from training.scoring.statistics import mean_interval
+
+Numbers = dict[str, dict[str, Any]]
+"""``{mean, ci95}`` by the name of a number."""
+
+_MADE_BY = (
+    (ngo_estimator, "online/localisation.py"),
+    (ngo_estimator, "online/evidence.py"),
+    (ngo_estimator, "online/place_matcher.py"),
+    (training, "baselines/particle_filter.py"),
+    (training, "scoring/kidnapped.py"),
+    (training, "scoring/relocalisation_rows.py"),
+)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the table."""
+
+    tables: tuple[Literal["maze2d", "maze3d", "maze2d_aliased", "maze3d_aliased"], ...] = (
+        "maze2d",
+        "maze3d",
+        "maze2d_aliased",
+        "maze3d_aliased",
+    )
+    """Tables to measure."""
+    split: Literal["validation", "test"] = "test"
+    """Mazes to measure in. Thresholds are chosen on validation; the test split is for the final table alone."""
+    mazes: int = 10
+    """Mazes of each table."""
+    starts: int = 50
+    """Starts in mapped parts of each maze; up to a fifth as many more are taken in parts without a map."""
+    aliased_starts: int = 20
+    """The same in each aliased maze."""
+    rows: tuple[Literal["ours", "nearest_code", "particle_filter", "oracle_place"], ...] = ROWS
+    """Rows to measure."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/*.safetensors."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets relocalisation.json."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of drives, maps and what was measured."""
+
+    def __post_init__(self) -> None:
+        if min(self.mazes, self.starts, self.aliased_starts) < 2:
+            raise ValueError(
+                f"mazes, starts, aliased_starts are {self.mazes}, {self.starts}, {self.aliased_starts}; expected at "
+                "least 2 of each"
+            )
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Measure, write the JSON, and return its content."""
+    record = runs.record("relocalisation", arguments)
+    found = {table: measured(arguments, table) for table in arguments.tables}
+    result = {
+        "command": record["command"],
+        "revision": record["revision"],
+        "split": arguments.split,
+        "mazes": arguments.mazes,
+        "starts": arguments.starts,
+        "aliased_starts": arguments.aliased_starts,
+        "tables": {table: numbers["mapped"] for table, numbers in found.items()},
+        "unmapped": {table: numbers["unmapped"] for table, numbers in found.items()},
+        "maps": {table: numbers["maps"] for table, numbers in found.items()},
+    }
+    write_at_once(arguments.out / "relocalisation.json", json.dumps(result, indent=2) + "\n")
+    for table, rows in result["tables"].items():
+        for row, numbers in rows.items():
+            line = ", ".join(f"{name} {number['mean']:.4g}" for name, number in numbers.items())
+            print(f"{table:15} {row:16} {line}")
+    return result
+
+
+def measured(arguments: Arguments, table: str) -> dict[str, Any]:
+    """All rows of a table: of starts in mapped parts, of other starts, and the errors of the maps themselves."""
+    world, aliased = WORLDS[table.removesuffix("_aliased")], table.endswith("_aliased")
+    drives = kidnapped_drives(world, arguments.split, aliased, arguments.mazes, arguments.weights, arguments.runs)
+    networks = Networks.load(world, arguments.weights)
+    folder = arguments.runs / world.name / "relocalisation" / f"{arguments.split}_{'aliased_' * aliased}results"
+    folder.mkdir(parents=True, exist_ok=True)
+    mazes: list[dict[str, Any]] = []
+    for maze in tqdm(range(arguments.mazes), desc=table, unit="maze"):
+        mapped, second = ({name: np.array(x[maze]) for name, x in drives[key].items()} for key in ("map", "second"))
+        made = _map(world, arguments.weights, mapped, folder / f"map_{maze}.npz", networks.identity)
+        count = arguments.aliased_starts if aliased else arguments.starts
+        drive = _Maze(networks, made, mapped, second)
+        mazes.append({"map": made.numbers, **_rows(arguments.rows, drive, count, folder, maze)})
+    return {
+        **{kind: {row: _summary([m[row][kind] for m in mazes]) for row in arguments.rows} for kind in _KINDS},
+        "maps": _summary([[maze["map"]] for maze in mazes]),
+    }
+
+
+_KINDS = ("mapped", "unmapped")
+
+
+@dataclass(frozen=True)
+class _Map:
+    poses: np.ndarray
+    numbers: dict[str, float]
+
+
+def _map(world: World, weights: Path, drive: Features, cache: Path, identity: str) -> _Map:
+    """The corrected poses ``(frames, 3)`` of a drive, and their errors, as the online system leaves them."""
+    if cache.exists():
+        with np.load(cache) as file:
+            if str(file["identity"]) == identity:
+                return _Map(file["poses"], json.loads(str(file["numbers"])))
+    trajectory = run_online(OnlineTrajectory.load(weights / world.name, world=world.name), drive)
+    truth = torch.from_numpy(drive["poses"])
+    truth = se2.between(truth[:1], truth).numpy()
+    numbers = {
+        "position_rmse_m": _rms(np.linalg.norm((trajectory.poses_xyyaw - truth)[:, :2], axis=1)),
+        "heading_rmse_deg": _heading_rmse(trajectory.poses_xyyaw, truth),
+        "online_heading_rmse_deg": _heading_rmse(trajectory.online_xyyaw, truth),
+    }
+    poses = trajectory.poses_xyyaw.copy()
+    np.savez(cache, identity=np.array(identity), poses=poses, numbers=np.array(json.dumps(numbers)))
+    return _Map(poses, numbers)
+
+
+@dataclass(frozen=True)
+class _Maze:
+    networks: Networks
+    made: _Map
+    mapped: Features
+    second: Features
+
+
+def _rows(
+    rows: Sequence[str], maze: _Maze, count: int, folder: Path, number: int
+) -> dict[str, dict[str, list[dict[str, float]]]]:
+    """Numbers of every start of a maze, by row and kind; what was measured before is read."""
+    code = hashlib.sha256(b"".join((Path(package.__path__[0]) / path).read_bytes() for package, path in _MADE_BY))
+    networks, second = maze.networks, maze.second
+    identity = f"{code.hexdigest()} {networks.identity} {count}"
+    codes = np.concatenate((maze.mapped["origin_code"], maze.mapped["codes"])).astype(np.float32)
+    known = KnownMap(maze.made.poses, maze.mapped["poses"], codes, networks.pair_head.config.offset_scale_m)
+    result: dict[str, dict[str, list[dict[str, float]]]] = {}
+    errors: MapErrors | None = None
+    for row in rows:
+        cache = folder / f"{row}_{number}.json"
+        stored = json.loads(cache.read_text()) if cache.exists() else {}
+        if stored.get("identity") != identity:
+            errors = errors or MapErrors(known, second["poses"])
+            claims = row_of(row, networks, known, second)
+            kinds = zip(_KINDS, starts(errors, len(second["poses"]), count), strict=True)
+            numbers = {kind: [scored(errors, start, claims(start)) for start in some] for kind, some in kinds}
+            stored = {"identity": identity, "numbers": numbers}
+            write_at_once(cache, json.dumps(stored))
+        result[row] = stored["numbers"]
+    return result
+
+
+def _summary(mazes: list[list[dict[str, float]]]) -> Numbers:
+    """Means over the mazes' means, with intervals by resampling mazes; a number that no two mazes have is left out."""
+    result: Numbers = {}
+    for name in dict.fromkeys(name for maze in mazes for start in maze for name in start):
+        columns = [np.array([start[name] for start in maze]) for maze in mazes if maze]
+        means = np.array([np.nanmean(column) for column in columns if np.isfinite(column).any()])
+        if len(means) >= 2:
+            result[{"frames": "frames_to_success"}.get(name, name)] = mean_interval(means).as_json()
+    return result | {"starts": {"mean": float(sum(map(len, mazes))), "ci95": [float(sum(map(len, mazes)))] * 2}}
+
+
+def _heading_rmse(poses: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.degrees(_rms((poses[:, 2] - truth[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)
