@@ -35,9 +35,9 @@ class ParticleFilterConfig:
 
     least: int = 500
     most: int = 20_000
-    hit_m: float = 0.1
+    hit_m: float = 0.2
     random: float = 0.2
-    beams: int = 20
+    beams: int = 10
     noise: float = 0.05
     step_m: float = 0.2
     step_deg: float = 10.0

@@ -89,7 +89,7 @@ def scored(errors: MapErrors, start: int, claims: list[np.ndarray | None]) -> di
     found = [(k, *errors.of(start + 1 + k, pose)) for k, pose in enumerate(claims) if pose is not None]
     right = [metres <= MOST_M and degrees <= MOST_DEG for _, metres, degrees in found]
     success = bool(found) and right[0] and found[0][0] < IN_TIME
-    nothing = {name: math.nan for name in ("frames", "heading_rmse_deg", "wrong_later", "lost")}
+    nothing = dict.fromkeys(("frames", "heading_rmse_deg", "wrong_later", "lost"), math.nan)
     result = {"success": float(success), "false_claims": float(bool(found) and not right[0]), **nothing}
     if success:
         headings = np.array([degrees for _, _, degrees in found])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.online.evidence import Hypotheses, HypothesisWindow, fused, strongest_modes
 from ngo_estimator.online.localisation import Localisation, LocalisationConfig, Localiser
@@ -137,7 +138,9 @@ def test_without_sightings_the_odometry_carries_the_pose_until_it_says_nothing_a
     at.blind = True
     found = list(drive(localiser, at, 20))
     assert all(one.pose_xyyaw is not None for one in found) and off(found[-1], at)[0] < 0.2
-    deviations = [np.sqrt(np.linalg.eigvalsh(one.covariance[:2, :2])[-1]) for one in found if one.covariance is not None]
+    deviations = [
+        np.sqrt(np.linalg.eigvalsh(one.covariance[:2, :2])[-1]) for one in found if one.covariance is not None
+    ]
     assert (np.diff(deviations) > 0.0).all()
     found = list(drive(localiser, at, 3000))
     assert [one.lost for one in found].count(True) == 1 and found[-1].pose_xyyaw is None

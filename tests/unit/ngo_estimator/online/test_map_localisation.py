@@ -51,8 +51,8 @@ def test_a_robot_that_starts_within_a_mapped_maze_finds_its_pose() -> None:
     begin = steps[first].odom_xyyaw
     found: list[LocalisedStep] = []
     for step in steps[first + 1 :]:
-        step = dataclasses.replace(step, odom_xyyaw=between(begin, step.odom_xyyaw), origin_stamp_ns=5)
-        found.append(localisation.update(step))
+        own = dataclasses.replace(step, odom_xyyaw=between(begin, step.odom_xyyaw), origin_stamp_ns=5)
+        found.append(localisation.update(own))
     assert found[0].found.pose_xyyaw is None and found[0].map_from_odom_xyyaw is None
     assert any(one.found.claimed for one in found[:50]) and not any(one.found.lost for one in found)
     expected = ORIGIN.poses(whole.poses_xyyaw[-1])

@@ -40,8 +40,9 @@ class LocalisationConfig:
 
     The map is looked at after every ``look_places`` or ``look_deg`` of motion, and the last ``window`` looks count. A
     claim needs the support of ``least_support`` looks, and of ``least_share`` of the window, over ``least_way_places``
-    of way, and another pose at most ``most_rival`` of that support. A pose is lost where another one could be claimed, where ``least_support`` of belief
-    gathers in the window and nothing agrees, or where the deviation of the position passes ``lost_places``.
+    of way, and another pose at most ``most_rival`` of that support. A pose is lost where another one could be claimed,
+    where ``least_support`` of strong belief gathers in the window and nothing agrees, or where the deviation of the
+    position passes ``lost_places``.
     """
 
     look_places: float = 0.4
