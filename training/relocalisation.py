@@ -38,14 +38,8 @@ from training.scoring.statistics import mean_interval
 Numbers = dict[str, dict[str, Any]]
 """``{mean, ci95}`` by the name of a number."""
 
-_MADE_BY = (
-    (ngo_estimator, "online/localisation.py"),
-    (ngo_estimator, "online/evidence.py"),
-    (ngo_estimator, "online/place_matcher.py"),
-    (training, "baselines/particle_filter.py"),
-    (training, "scoring/kidnapped.py"),
-    (training, "scoring/relocalisation_rows.py"),
-)
+_OURS = ("online/localisation.py", "online/evidence.py", "online/place_matcher.py")
+_BASELINES = ("baselines/particle_filter.py", "scoring/relocalisation_rows.py")
 
 
 @dataclass(frozen=True)
@@ -167,15 +161,13 @@ def _rows(
     rows: Sequence[str], maze: _Maze, count: int, folder: Path, number: int
 ) -> dict[str, dict[str, list[dict[str, float]]]]:
     """Numbers of every start of a maze, by row and kind; what was measured before is read."""
-    code = hashlib.sha256(b"".join((Path(package.__path__[0]) / path).read_bytes() for package, path in _MADE_BY))
     networks, second = maze.networks, maze.second
-    identity = f"{code.hexdigest()} {networks.identity} {count}"
     codes = np.concatenate((maze.mapped["origin_code"], maze.mapped["codes"])).astype(np.float32)
     known = KnownMap(maze.made.poses, maze.mapped["poses"], codes, networks.pair_head.config.offset_scale_m)
     result: dict[str, dict[str, list[dict[str, float]]]] = {}
     errors: MapErrors | None = None
     for row in rows:
-        cache = folder / f"{row}_{number}.json"
+        cache, identity = folder / f"{row}_{number}.json", f"{_code(row)} {networks.identity} {count}"
         stored = json.loads(cache.read_text()) if cache.exists() else {}
         if stored.get("identity") != identity:
             errors = errors or MapErrors(known, second["poses"])
@@ -186,6 +178,14 @@ def _rows(
             write_at_once(cache, json.dumps(stored))
         result[row] = stored["numbers"]
     return result
+
+
+def _code(row: str) -> str:
+    """A hash of the modules that a row's numbers come from."""
+    ours, common = Path(ngo_estimator.__path__[0]), Path(training.__path__[0])
+    files = [ours / path for path in _OURS] if row == "ours" else [common / path for path in _BASELINES]
+    content = b"".join(path.read_bytes() for path in (*files, common / "scoring" / "kidnapped.py"))
+    return hashlib.sha256(content).hexdigest()
 
 
 def _summary(mazes: list[list[dict[str, float]]]) -> Numbers:

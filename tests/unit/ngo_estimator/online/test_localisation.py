@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.online.evidence import Hypotheses, HypothesisWindow, fused, strongest_modes
 from ngo_estimator.online.localisation import Localisation, LocalisationConfig, Localiser

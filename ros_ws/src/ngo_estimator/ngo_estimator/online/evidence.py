@@ -109,7 +109,8 @@ def strongest_modes(hypotheses: Hypotheses, place_m: float) -> tuple[Mode, ...]:
     agree = _agree(distance, turn, variance[:, None] + variance[None], place_m)
     by_look = _by_look(agree * hypotheses.belief, hypotheses.look)
     total = by_look.sum(-1)
-    left, found = np.ones(len(at), bool), []
+    left = np.ones(len(at), bool)
+    found: list[Mode] = []
     while len(found) < _MODES and left.any():
         best = int(np.where(left, total, -1.0).argmax())
         looks = np.unique(hypotheses.look[agree[best]])

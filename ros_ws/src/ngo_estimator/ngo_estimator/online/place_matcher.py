@@ -98,7 +98,8 @@ class PlaceMatcher:
         poses = self._poses[best]
         apart = torch.cdist(poses[:, :2], poses[:, :2]) > 0.5 * self.place_m
         apart |= se2.wrap(poses[:, None, 2] - poses[None, :, 2]).abs() > _APART_RAD
-        left, chosen = torch.ones(len(best), dtype=torch.bool), []
+        left = torch.ones(len(best), dtype=torch.bool)
+        chosen: list[int] = []
         while len(chosen) < self._candidates and bool(left.any()):
             first = int(left.int().argmax())
             chosen.append(first)
