@@ -5,6 +5,7 @@ its results. ``tests.golden.make_drives`` makes the stored files anew.
 """
 
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.saved_state import read_state, write_state
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive, corrected, estimates, largest_difference, position_rmse
 
 # Processors round differently: with AVX-512, AVX2 and neither, poses differ by up to 4 um and 1 urad. The rest is for
@@ -39,6 +41,24 @@ def test_shipped_weights_correct_a_stored_drive_as_before(world: str) -> None:
     distance_m, angle_rad = largest_difference(trajectory.poses_xyyaw, drive.poses)
     assert distance_m < TOLERANCE_M and angle_rad < TOLERANCE_RAD
     np.testing.assert_allclose(update.covariance, drive.covariance, rtol=0.05, atol=0.02 * drive.covariance.max())
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_session_with_shipped_weights_goes_on_from_its_files_to_the_last_bit(world: str, tmp_path: Path) -> None:
+    """They register odometry (2D), smooth it and look for overlaps (3D)."""
+    _, steps = golden(world)
+    half, original = len(steps) // 2 + 1, OnlineTrajectory.load(WEIGHTS / world, 200, world, 8, 1)
+    for step in steps[:half]:
+        original.update(step)
+    write_state(tmp_path / "state", original.identity, original.state())
+    other = OnlineTrajectory.load(WEIGHTS / world, 200, world, 8, 1)
+    loaded = other.restored(read_state(tmp_path / "state", other.identity))
+    for core in (original, loaded):
+        corrected(steps[half:], core)
+    ours, theirs = original.state(), loaded.state()
+    assert ours.keys() == theirs.keys()
+    for name, array in ours.items():
+        np.testing.assert_array_equal(theirs[name], array, err_msg=name)
 
 
 @pytest.mark.parametrize("changed", ["local network", "place encoder", "optimizer"])

@@ -155,7 +155,7 @@ def test_what_cannot_be_loaded_or_saved_is_one_line_and_changes_nothing(
     refused = {
         ("damaged", 0): "is damaged",
         ("nothing", 0): "No such file",
-        ("../office", 0): "expected a path in",
+        ("../office", 0): "expected a folder in",
         ("office", LoadState.Request.RELOCALISE): "which this version does not have; expected CONTINUE",
         ("office", 7): "mode is 7; expected 0 (CONTINUE) or 1 (RELOCALISE)",
     }
@@ -165,7 +165,11 @@ def test_what_cannot_be_loaded_or_saved_is_one_line_and_changes_nothing(
     before = (folder / "office" / "state.json").read_bytes()
     (folder / "thesis").mkdir()
     (folder / "thesis" / "main.tex").write_text("years of work")
-    for path, reason in (("/tmp/elsewhere", "expected a path in"), ("thesis", "expected a saved state"), ("a/b", "No")):
+    for path, reason in (
+        ("/tmp/elsewhere", "expected a folder in"),
+        ("thesis", "expected a saved state"),
+        ("a/b", "No"),
+    ):
         answer = loaded.probe.call(SaveState, "ngo_node/save_state", SaveState.Request(path=path))
         assert not answer.success and reason in answer.message and "\n" not in answer.message, answer
     assert (folder / "office" / "state.json").read_bytes() == before

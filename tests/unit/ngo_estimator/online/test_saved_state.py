@@ -1,10 +1,13 @@
 """A saved state: going on from it equals never having stopped, and a damaged one is refused in one line."""
 
+import contextlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -260,6 +263,46 @@ def test_a_state_is_replaced_by_a_whole_one_or_not_at_all(
     monkeypatch.undo()
     write_state(folder, core.identity, core.state())
     assert_same(core, core.restored(read_state(folder, core.identity)))
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_killed_at_any_moment_it_leaves_a_whole_state(
+    saved: tuple[Path, OnlineTrajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, core = saved
+    old = core.state()
+    core.update(make_steps(41)[40])
+    new = core.state()
+
+    class Killed(BaseException):
+        """Which nothing cleans up after."""
+
+    def stopping(call: Callable[..., Any]) -> Callable[..., Any]:
+        def stop(*arguments: Any, **more: Any) -> Any:
+            calls.append(call)
+            if len(calls) == moment:
+                raise Killed
+            return call(*arguments, **more)
+
+        return stop
+
+    def is_state(arrays: Arrays) -> bool:
+        return all(np.array_equal(found[name], array) for name, array in arrays.items())
+
+    outcomes = []
+    for moment in range(1, 100):
+        write_state(folder, core.identity, old)
+        calls: list[Any] = []
+        with monkeypatch.context() as patched, contextlib.suppress(Killed):
+            for owner, name in ((os, "fsync"), (os, "replace"), (Path, "unlink"), (Path, "mkdir"), (Path, "open")):
+                patched.setattr(owner, name, stopping(getattr(owner, name)))
+            write_state(folder, core.identity, new)
+        found = read_state(folder, core.identity)
+        assert is_state(old) or is_state(new)
+        outcomes.append(is_state(new))
+        if len(calls) < moment:
+            break
+    assert outcomes == sorted(outcomes) and len(outcomes) > 8 and not outcomes[0] and outcomes[-1]
     assert len(list(folder.iterdir())) == 2
 
 

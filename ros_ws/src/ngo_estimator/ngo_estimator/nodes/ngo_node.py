@@ -38,7 +38,7 @@ from ngo_estimator.trajectory.files import edges_of, write_trajectory
 from ngo_estimator.trajectory.save_path import path_inside
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory, Trajectory, TrajectoryUpdate
     from ngo_estimator.online.map_localisation import LocalisedStep, MapLocalisation
     from ngo_estimator.online.session import Session
 
@@ -142,7 +142,7 @@ class NgoNode(LifecycleNode):
                 folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
             )
 
-        self._core = load_core(load, settings)
+        self._core: CorrectedTrajectory = load_core(load, settings)
         self._origin_of = MapOrigin
         self._smoothing = SmoothedCorrection(settings.tf_smoothing_s)
         self._paused = False

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from ngo_msgs.srv import LoadState, SaveState
 
-from ngo_estimator.trajectory.save_path import place_inside
+from ngo_estimator.trajectory.save_path import folder_inside
 
 if TYPE_CHECKING:
     from ngo_estimator.online.session import Session
@@ -35,7 +35,7 @@ class StateServices:
         try:
             session = self._session()
             arrays, frames = session.state(), session.core.newest().frames
-            path = place_inside(self._folder, request.path)
+            path = folder_inside(self._folder, request.path)
             await self._aside(lambda: session.write(path, arrays))
             response.success, response.message = True, f"wrote {frames} poses to {path}"
         except ValueError as error:
@@ -46,7 +46,7 @@ class StateServices:
         """Load a state; the present trajectory goes on until it is whole."""
         try:
             _check_mode(request.mode)
-            path, session = place_inside(self._folder, request.path), self._session()
+            path, session = folder_inside(self._folder, request.path), self._session()
             loaded = await self._aside(lambda: session.loaded(path))
             self._take(loaded)
             response.success, response.message = True, f"loaded {loaded.core.newest().frames} poses from {path}"

@@ -48,7 +48,7 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
                 folder.rmdir()
             raise
         for leftover in old - {name, DESCRIPTION}:
-            (folder / leftover).unlink()
+            (folder / leftover).unlink(missing_ok=True)
         _sync(folder.parent)
     except OSError as error:
         raise StateError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error

@@ -10,20 +10,24 @@ def path_inside(folder: Path, path: str) -> Path:
     Raises:
         ValueError: it lies outside of ``folder``, has ``..`` in it, or is there and no regular file.
     """
-    found = place_inside(folder, path)
+    found = _inside(folder, path, "file")
     check_replaceable(found)
     return found
 
 
-def place_inside(folder: Path, path: str) -> Path:
-    """The same for what may be a folder; raises ``ValueError`` where it lies outside, or has ``..`` in it."""
+def folder_inside(folder: Path, path: str) -> Path:
+    """The folder that ``path`` names, in the same way; raises ``ValueError`` if it lies outside or has ``..`` in it."""
+    return _inside(folder, path, "folder")
+
+
+def _inside(folder: Path, path: str, kind: str) -> Path:
     try:
         given, inside = Path(path).expanduser(), folder.expanduser().resolve()
         found = (inside / given).resolve()
     except (OSError, RuntimeError, ValueError) as error:  # an unknown user, links in a circle, a NUL
         raise ValueError(f"path is {path!r}, which is none ({' '.join(str(error).split())})") from None
     if ".." in given.parts or not found.is_relative_to(inside):
-        raise ValueError(f"path is {path!r}; expected a path in {inside} (parameter 'save_directory'), without '..'")
+        raise ValueError(f"path is {path!r}; expected a {kind} in {inside} (parameter 'save_directory'), without '..'")
     return found
 
 
