@@ -4,8 +4,8 @@
 
 In each maze one drive makes a map, by the whole online system. Robots start at frames of another drive, with other
 starts, noise and driver, and know nothing but the map. Mazes are those that nothing was trained or chosen on; aliased
-ones repeat one module with one texture. Writes ``training/results/relocalisation.json``. Run it again to continue
-after a stop.
+ones repeat one module with one texture. Writes ``training/results/relocalisation.json`` and
+``docs/results_relocalisation.md``. Run it again to continue after a stop.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from training.common.command_line import run_command
 from training.common.curves import write_at_once
 from training.data.kidnapped_drives import Features, kidnapped_drives
 from training.data.worlds import WORLDS, World
+from training.report import relocalisation_page
 from training.scoring.kidnapped import KnownMap, MapErrors, scored, starts
 from training.scoring.online_estimate import run_online
 from training.scoring.relocalisation_rows import ROWS, Networks, row_of
@@ -67,6 +68,8 @@ class Arguments:
     """Folder with WORLD/*.safetensors."""
     out: Path = runs.ROOT / "training" / "results"
     """Folder that gets relocalisation.json."""
+    docs: Path = runs.ROOT / "docs"
+    """Folder that gets results_relocalisation.md."""
     runs: Path = runs.ROOT / "runs"
     """Folder of drives, maps and what was measured."""
 
@@ -94,6 +97,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "maps": {table: numbers["maps"] for table, numbers in found.items()},
     }
     write_at_once(arguments.out / "relocalisation.json", json.dumps(result, indent=2) + "\n")
+    write_at_once(arguments.docs / "results_relocalisation.md", relocalisation_page.page(result))
     for table, rows in result["tables"].items():
         for row, numbers in rows.items():
             line = ", ".join(f"{name} {number['mean']:.4g}" for name, number in numbers.items())
