@@ -30,8 +30,11 @@ from training.common.command_line import run_command
 from training.common.curves import write_at_once
 from training.data.kidnapped_drives import Features, kidnapped_drives
 from training.data.worlds import WORLDS, World
+from training.recordings.lidar_logs import log_identity, logs_below, read_drive
 from training.report import relocalisation_page
+from training.scoring import kidnapped_logs
 from training.scoring.kidnapped import KnownMap, MapErrors, scored, starts
+from training.scoring.kidnapped_logs import log_starts, summary_of
 from training.scoring.online_estimate import run_online
 from training.scoring.relocalisation_rows import ROWS, Networks, row_of
 from training.scoring.statistics import mean_interval
@@ -64,6 +67,10 @@ class Arguments:
     """The same in each aliased maze."""
     rows: tuple[Literal["ours", "nearest_code", "particle_filter", "oracle_place"], ...] = ROWS
     """Rows to measure."""
+    logs: Path | None = None
+    """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: left out."""
+    log_starts: int = 20
+    """Starts in each log."""
     weights: Path = runs.WEIGHTS
     """Folder with WORLD/*.safetensors."""
     out: Path = runs.ROOT / "training" / "results"
@@ -95,6 +102,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "tables": {table: numbers["mapped"] for table, numbers in found.items()},
         "unmapped": {table: numbers["unmapped"] for table, numbers in found.items()},
         "maps": {table: numbers["maps"] for table, numbers in found.items()},
+        "logs": _logs(arguments),
     }
     write_at_once(arguments.out / "relocalisation.json", json.dumps(result, indent=2) + "\n")
     write_at_once(arguments.docs / "results_relocalisation.md", relocalisation_page.page(result))
@@ -190,6 +198,30 @@ def _code(row: str) -> str:
     files = [ours / path for path in _OURS] if row == "ours" else [common / path for path in _BASELINES]
     content = b"".join(path.read_bytes() for path in (*files, common / "scoring" / "kidnapped.py"))
     return hashlib.sha256(content).hexdigest()
+
+
+def _logs(arguments: Arguments) -> dict[str, Any]:
+    """Numbers of each log, or in words why there are none."""
+    if arguments.logs is None:
+        return {"skipped": "no folder is given (--logs)"}
+    result: dict[str, Any] = {}
+    for name, path in logs_below(arguments.logs).items():
+        cache = arguments.runs / "scan" / "relocalisation" / f"{name}.json"
+        identity = f"{log_identity(path)} {_log_code()} {arguments.log_starts}"
+        stored = json.loads(cache.read_text()) if cache.exists() else {}
+        if stored.get("identity") != identity:
+            found = list(log_starts(read_drive(path), arguments.weights / "scan", arguments.log_starts))
+            stored = {"identity": identity, "numbers": summary_of(found)}
+            cache.parent.mkdir(parents=True, exist_ok=True)
+            write_at_once(cache, json.dumps(stored))
+        result[name] = stored["numbers"]
+    return result or {"skipped": "the folder has none"}
+
+
+def _log_code() -> str:
+    """A hash of the package that numbers of logs come from."""
+    files = [*sorted(Path(ngo_estimator.__path__[0]).rglob("*.py")), Path(kidnapped_logs.__file__)]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
 def _summary(mazes: list[list[dict[str, float]]]) -> Numbers:

@@ -27,7 +27,7 @@ ROWS = ("ours", "nearest_code", "particle_filter", "oracle_place")
 LEAST_SIMILARITY = {"maze2d": 0.99, "maze3d": 0.99}
 """Similarity of the nearest code from which on its pose is claimed, as chosen on validation mazes."""
 
-PARTICLE_FILTERS = {"maze2d": ParticleFilterConfig(), "maze3d": ParticleFilterConfig()}
+PARTICLE_FILTERS = {"maze2d": ParticleFilterConfig(), "maze3d": ParticleFilterConfig(hit_m=0.5)}
 """Settings of the particle filter, as chosen on validation mazes."""
 
 _TURN_M = 0.5  # of a place: what a turn of one radian counts where the nearest frame is chosen
