@@ -36,7 +36,7 @@ from training.scoring import kidnapped_logs
 from training.scoring.kidnapped import KnownMap, MapErrors, scored, starts
 from training.scoring.kidnapped_logs import log_starts, summary_of
 from training.scoring.online_estimate import run_online
-from training.scoring.relocalisation_rows import ROWS, Networks, row_of
+from training.scoring.relocalisation_rows import ROWS, Networks, RowName, row_of
 from training.scoring.statistics import mean_interval
 
 Numbers = dict[str, dict[str, Any]]
@@ -65,7 +65,7 @@ class Arguments:
     """Starts in mapped parts of each maze; up to a fifth as many more are taken in parts without a map."""
     aliased_starts: int = 20
     """The same in each aliased maze."""
-    rows: tuple[Literal["ours", "nearest_code", "particle_filter", "oracle_place"], ...] = ROWS
+    rows: tuple[RowName, ...] = ROWS
     """Rows to measure."""
     logs: Path | None = None
     """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: left out."""
@@ -149,8 +149,8 @@ def _map(world: World, weights: Path, drive: Features, cache: Path, identity: st
             if str(file["identity"]) == identity:
                 return _Map(file["poses"], json.loads(str(file["numbers"])))
     trajectory = run_online(OnlineTrajectory.load(weights / world.name, world=world.name), drive)
-    truth = torch.from_numpy(drive["poses"])
-    truth = se2.between(truth[:1], truth).numpy()
+    in_maze = torch.from_numpy(drive["poses"])
+    truth = se2.between(in_maze[:1], in_maze).numpy()
     numbers = {
         "position_rmse_m": _rms(np.linalg.norm((trajectory.poses_xyyaw - truth)[:, :2], axis=1)),
         "heading_rmse_deg": _heading_rmse(trajectory.poses_xyyaw, truth),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,7 +23,9 @@ from training.data.worlds import World
 from training.scoring.kidnapped import FRAMES, Features, KnownMap, Row
 from training.scoring.online_estimate import steps_of
 
-ROWS = ("ours", "nearest_code", "particle_filter", "oracle_place")
+RowName = Literal["ours", "nearest_code", "particle_filter", "oracle_place"]
+
+ROWS: tuple[RowName, ...] = ("ours", "nearest_code", "particle_filter", "oracle_place")
 
 LEAST_SIMILARITY = {"maze2d": 0.99, "maze3d": 0.99}
 """Similarity of the nearest code from which on its pose is claimed, as chosen on validation mazes."""
