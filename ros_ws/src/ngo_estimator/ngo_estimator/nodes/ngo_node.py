@@ -29,6 +29,7 @@ from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.localisation_report import localisation_details, localisation_problems
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.state_services import StateServices
 from ngo_estimator.nodes.status import NodeStatus
@@ -297,7 +298,7 @@ class NgoNode(LifecycleNode):
             self._smoothing.reset()
             self.get_logger().info("localised: several frames agree on the pose in the map")
         if found.lost:
-            self.get_logger().warning("not localised: what is seen contradicts the pose in the map")
+            self.get_logger().warning("not localised: the pose in the map is lost")
         self._covariance = np.zeros((3, 3)) if found.covariance is None else found.covariance
         if found.pose_xyyaw is None or found.covariance is None or step.map_from_odom_xyyaw is None:
             return
@@ -439,7 +440,7 @@ class NgoNode(LifecycleNode):
             "paths published": str(self._whole.paths),
         }
         if self._localisation is not None:
-            return values | _localisation_details(self._found)
+            return values | localisation_details(self._found)
         if self._latest is None:
             return values
         update = self._latest
@@ -461,23 +462,11 @@ class NgoNode(LifecycleNode):
         if self._fault:
             found.append(f"internal fault, the trajectory goes on by odometry: {self._fault}")
             self._fault = ""
-        if self._localisation is not None and (self._found is None or self._found.found.pose_xyyaw is None):
-            found.append(f"not localised: {_hypotheses(self._found) or 'no hypothesis yet'}")
+        if self._localisation is not None:
+            found += localisation_problems(self._found)
         if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:
             found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
         return found
-
-
-def _hypotheses(step: "LocalisedStep | None") -> str:
-    """Where the robot may be, the best supported first."""
-    modes = () if step is None else step.found.hypotheses
-    poses = [(*mode.pose_xyyaw.tolist(), mode.support) for mode in modes]
-    return "; ".join(f"x {x:.2f} m, y {y:.2f} m, yaw {yaw:.2f} rad, support {n:.1f}" for x, y, yaw, n in poses)
-
-
-def _localisation_details(step: "LocalisedStep | None") -> dict[str, str]:
-    known = step is not None and step.found.pose_xyyaw is not None
-    return {"localisation": "localised" if known else "not localised", "hypotheses": _hypotheses(step)}
 
 
 def _written(name: str, folder: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
