@@ -13,7 +13,7 @@ from training.scoring import relocalisation_rows
 
 
 def test_the_table_is_made_by_one_command_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kidnapped_drives, "STEPS", 150)
+    monkeypatch.setattr(kidnapped_drives, "STEPS", 450)
     arguments = relocalisation.Arguments(
         tables=("maze2d",), split="validation", mazes=2, starts=2, out=tmp_path, docs=tmp_path, runs=tmp_path
     )
