@@ -13,16 +13,20 @@ if TYPE_CHECKING:
 
 
 class Drives(NamedTuple):
-    """Trajectories: the seed of each one's maze and that of its episode, the mazes' size, and the driver's name."""
+    """Trajectories: the seed of each one's maze and that of its episode, the mazes' size, and the driver's name.
+
+    ``steps`` of each; None: the world's number.
+    """
 
     mazes: list[int]
     seeds: list[int]
     size: MazeSize
     driver: str
+    steps: int | None = None
 
     def episodes(self, world: World, group: slice) -> Iterator[Episode]:
-        """Episodes of a group of mazes of one size, with the world's number of steps."""
-        frames = world.episode_frames + 1
+        """Episodes of a group of mazes of one size."""
+        frames = (self.steps or world.episode_frames) + 1
         return episodes_in(world, self.mazes[group], self.seeds[group], frames, self.size, self.driver)
 
 

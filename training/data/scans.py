@@ -79,7 +79,7 @@ ROWS = (4, 7)
 """Range of the rows of a table's mazes, both ends included."""
 
 
-def drawn_config(rng: np.random.Generator, size: Mapping[str, int]) -> Maze2DConfig:
+def drawn_config(rng: np.random.Generator, size: Mapping[str, Any]) -> Maze2DConfig:
     """Corridors 0.8 to 2.5 m wide, and a robot in proportion that drives slowly or fast."""
     block_m = float(np.exp(rng.uniform(math.log(0.8), math.log(2.5))))
     usual = Maze2DConfig()
@@ -102,7 +102,7 @@ class ScannedMaze(gymnasium.Env[Any, Any]):
     """
 
     def __init__(
-        self, image: ImageFormat, size: Mapping[str, int] | None = None, changes: Mapping[str, Any] | None = None
+        self, image: ImageFormat, size: Mapping[str, Any] | None = None, changes: Mapping[str, Any] | None = None
     ) -> None:
         self._image, self._size, self._changes = image, size or {}, changes or {}
         self.scanner: Scanner

@@ -34,10 +34,11 @@ _STRETCHES = 2  # of so many seeds in the second half of a split
 
 @dataclass(frozen=True)
 class MazeSize:
-    """The mazes of a table of results; what is None is drawn as in training."""
+    """The mazes of a table of results; what is None is drawn as in training. Aliased ones repeat one module."""
 
     rows: int | None = None
     extra_openings: int | None = None
+    aliased: bool = False
 
 
 DRAWN = MazeSize()
@@ -112,9 +113,11 @@ class World(Domain):
     def validation_stores(self) -> tuple[str, ...]:
         return tuple(f"validation_{table}" for table in self.unseen_tables)
 
-    def make(self, rows: int | None = None, extra_openings: int | None = None) -> gymnasium.Env[Any, Any]:
+    def make(
+        self, rows: int | None = None, extra_openings: int | None = None, aliased: bool = False
+    ) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of this size, by default the simulator's own."""
-        changes: dict[str, Any] = {}
+        changes: dict[str, Any] = {"aliased": aliased}
         if rows is not None:
             changes.update(rows=rows, cols=rows)
         if extra_openings is not None:
@@ -149,6 +152,10 @@ class World(Domain):
         first = len(seeds) * list(_SPLIT_SEEDS).index(split)
         return TRAIN_SEEDS[first : first + len(seeds)]
 
+    def split_end(self, split: str) -> range:
+        """The last 100 seeds of the ``validation`` or ``test`` split, which no table of trajectories takes."""
+        return _SPLIT_SEEDS[split][-_TABLE_SEEDS // 2 :]
+
     def table_driver(self, table: str) -> str:
         """The name of the driver of a table's trajectories."""
         return self.tables[table].driver or self.driver
@@ -160,6 +167,7 @@ class World(Domain):
         return self.make(
             rows if size.rows is None else size.rows,
             openings if size.extra_openings is None else size.extra_openings,
+            size.aliased,
         )
 
 

@@ -307,7 +307,7 @@ def test_mistakes_of_the_caller_are_refused() -> None:
     for action in (3, -1, 0.5):
         with pytest.raises(ValueError, match=f"action is {action}; it must be 0 "):
             env.step(action)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"options has \['pose'\]; it may have 'maze' and 'pose_xyyaw'"):
+    with pytest.raises(ValueError, match=r"options has \['pose'\]; it may have 'maze', 'maze_seed' and 'pose_xyyaw'"):
         env.reset(options={"pose": (1, 1, 0)})
     with pytest.raises(ValueError, match=r"options\['maze'\] has \(5, 13\) blocks"):
         env.reset(options={"maze": CORRIDOR})
@@ -320,3 +320,22 @@ def test_mistakes_of_the_caller_are_refused() -> None:
 
 if __name__ == "__main__":  # run by test_a_seed_gives_the_same_bytes_whatever_came_before
     print(digest(3, Maze2D()))
+
+
+def test_a_maze_seed_takes_maze_and_colours_of_another_seed_and_nothing_else() -> None:
+    env, other = Maze2D(Maze2DConfig(rows=4, cols=4)), Maze2D(Maze2DConfig(rows=4, cols=4))
+    env.reset(seed=3)
+    _, own = env.reset(seed=5)
+    other.reset(seed=3)
+    walls, colors = other.maze.walls, other.colors
+    _, info = env.reset(seed=5, options={"maze_seed": 3})
+    assert (env.maze.walls == walls).all() and (env.colors == colors).all()
+    assert (info["pose_xyyaw"] == own["pose_xyyaw"]).all()
+
+
+def test_an_aliased_maze_has_one_colour() -> None:
+    env = Maze2D(Maze2DConfig(rows=4, cols=6, aliased=True))
+    env.reset(seed=1)
+    assert env.maze.walls.shape == (9, 13) and (env.colors == env.colors[0, 0]).all()
+    with pytest.raises(ValueError, match="an aliased maze has multiples of 2"):
+        Maze2DConfig(rows=5, aliased=True)

@@ -628,3 +628,8 @@ def test_gymnasium_finds_nothing_to_complain_about() -> None:
             env = Maze3D(render_mode=mode)
             check_env(env, skip_render_check=True)
             env.close()
+
+
+def test_an_aliased_maze_has_one_texture() -> None:
+    text = Maze3D(Maze3DConfig(rows=4, cols=4, extra_openings=0, aliased=True))._build_world(3, 3).text
+    assert len(set(re.findall(r'texturemiddle="(\w+)"', text))) == 1

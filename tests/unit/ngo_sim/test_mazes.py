@@ -8,7 +8,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from ngo_sim.mazes import Maze, draw_maze, kruskal_maze, prim_maze
+from ngo_sim.mazes import Maze, check_aliased, draw_maze, kruskal_maze, prim_maze, repeated_maze
 
 ALGORITHMS = [prim_maze, kruskal_maze]
 MakeMaze = Callable[..., Maze]
@@ -210,3 +210,20 @@ def test_mazes_do_not_load_matplotlib() -> None:
     code = "import sys, ngo_sim.mazes; sys.exit('matplotlib' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+
+
+def test_a_repeated_maze_is_connected_and_looks_the_same_from_module_to_module() -> None:
+    for seed in range(20):
+        maze = repeated_maze(6, 8, np.random.default_rng(seed))
+        assert nx.is_connected(maze.graph)
+        # Each module stands on 4 x 4 blocks, those at the border without openings to the outside.
+        modules = maze.walls[:-1, :-1].reshape(3, 4, 4, 4).swapaxes(1, 2)
+        inner = modules[1:, 1:]
+        assert (inner == inner[0, 0]).all()
+
+
+@pytest.mark.parametrize("size", [(5, 6, 0), (6, 7, 0), (6, 6, 1)])
+def test_an_aliased_maze_of_another_size_is_refused(size: tuple[int, int, int]) -> None:
+    with pytest.raises(ValueError, match="an aliased maze has multiples of 2, 2 and no extra openings"):
+        check_aliased(True, *size)
+    check_aliased(False, *size)

@@ -10,10 +10,11 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 import pymunk
+from gymnasium.utils.seeding import np_random
 
 from ngo_common.settings import Settings, setting
 from ngo_sim.drivers import Action
-from ngo_sim.mazes import Maze, check_maze_size, prim_maze
+from ngo_sim.mazes import Maze, check_aliased, check_maze_size, prim_maze, repeated_maze
 from ngo_sim.raycast import cast_rays
 
 _THRUST: dict[int, float] = {Action.FORWARD: 1.0, Action.TURN_LEFT: 0.0, Action.TURN_RIGHT: 0.0}
@@ -35,6 +36,9 @@ class Maze2DConfig(Settings):
         0,
         "Walls opened on top of the spanning tree, each one a cycle.",
         allowed="an integer from 0 to (rows - 1) (cols - 1)",
+    )
+    aliased: bool = setting(
+        False, "Whether one module of 2 x 2 cells repeats, with walls that look alike; without extra openings then."
     )
     block_m: float = setting(1.0, "Side of a block and width of a corridor, m.", minimum=0.01, maximum=100.0)
     actuation_noise: float = setting(
@@ -58,6 +62,7 @@ class Maze2DConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_maze_size(self.rows, self.cols, self.extra_openings)
+        check_aliased(self.aliased, self.rows, self.cols, self.extra_openings)
         _check_number("thrust_m", self.thrust_m, 0.0, self.block_m)
         _check_number("radius_m", self.radius_m, 0.001 * self.block_m, 0.45 * self.block_m)
 
@@ -73,7 +78,8 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
 
     reset(seed=s) makes maze, colours, start and noise functions of s and the config, to the byte; without a
     seed they follow from what was drawn before. Options of reset: "maze" (a Maze of the config's size) and
-    "pose_xyyaw" (3,) replace what is drawn.
+    "pose_xyyaw" (3,) replace what is drawn, "maze_seed" takes maze and colours of another seed; start and noise remain
+    those of s.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -112,18 +118,19 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         """Draw a maze, colours and a start, standing still; see the class for the options."""
         super().reset(seed=seed)
         options = options or {}
-        if unknown := sorted(set(options) - {"maze", "pose_xyyaw"}):
-            raise ValueError(f"options has {unknown}; it may have 'maze' and 'pose_xyyaw'")
+        if unknown := sorted(set(options) - {"maze", "maze_seed", "pose_xyyaw"}):
+            raise ValueError(f"options has {unknown}; it may have 'maze', 'maze_seed' and 'pose_xyyaw'")
         config, rng = self.config, self.np_random
         # Everything is drawn even where an option replaces it, so that an option changes nothing else.
-        drawn = prim_maze(config.rows, config.cols, rng, config.extra_openings, config.block_m)
+        drawn, self.colors = self._drawn(rng)
+        if "maze_seed" in options:
+            drawn, self.colors = self._drawn(np_random(int(options["maze_seed"]))[0])
         self.maze = options.get("maze", drawn)
         if self.maze.walls.shape != drawn.walls.shape or self.maze.block_m != drawn.block_m:
             raise ValueError(
                 f"options['maze'] has {self.maze.walls.shape} blocks of {self.maze.block_m} m; "
                 f"the config asks for {drawn.walls.shape} blocks of {drawn.block_m} m"
             )
-        self.colors = rng.random((*drawn.walls.shape, 3), dtype=np.float32)
         start_cell = 2 * rng.integers((config.rows, config.cols)) + 1
         start = (*self.maze.block_center(start_cell), rng.uniform(-math.pi, math.pi))
         self._place_body(*self._checked_pose(options.get("pose_xyyaw", start)))
@@ -170,6 +177,15 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         picture[disc] = (30, 30, 30)
         picture[disc & (ahead >= 0) & (abs(aside) <= 0.3 * self.config.radius_m)] = (255, 220, 0)
         return picture[::-1].copy()
+
+    def _drawn(self, rng: np.random.Generator) -> tuple[Maze, npt.NDArray[np.float32]]:
+        """A maze, and the colours (height, width, 3) of its blocks."""
+        config = self.config
+        if config.aliased:
+            maze = repeated_maze(config.rows, config.cols, rng, config.block_m)
+            return maze, np.tile(rng.random(3, dtype=np.float32), (*maze.walls.shape, 1))
+        maze = prim_maze(config.rows, config.cols, rng, config.extra_openings, config.block_m)
+        return maze, rng.random((*maze.walls.shape, 3), dtype=np.float32)
 
     def _move_body(self, space: pymunk.Space, velocity_x: float, velocity_y: float) -> tuple[float, float]:
         """Let period_s pass at this velocity (m a step); return the velocity that collisions leave of it."""

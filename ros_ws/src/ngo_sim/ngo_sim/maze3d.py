@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import gymnasium
@@ -26,7 +26,7 @@ from ngo_sim.doom_map import (
     wall_faces,
 )
 from ngo_sim.drivers import Action
-from ngo_sim.mazes import Maze, check_maze_size, kruskal_maze
+from ngo_sim.mazes import Maze, check_aliased, check_maze_size, kruskal_maze, repeated_maze
 
 TICS_PER_S = 35
 """Doom's fixed rate of simulation."""
@@ -40,7 +40,7 @@ _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TU
 
 
 # A Doom map brings its own walls, looks and things.
-_OF_MAZES = ("rows", "cols", "extra_openings", "block_m", "light_level", "textures", "decorations")
+_OF_MAZES = ("rows", "cols", "extra_openings", "aliased", "block_m", "light_level", "textures", "decorations")
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,9 @@ class Maze3DConfig(Settings):
         2,
         "Walls opened on top of the spanning tree, each one a cycle.",
         allowed="an integer from 0 to (rows - 1) (cols - 1)",
+    )
+    aliased: bool = setting(
+        False, "Whether one module of 2 x 2 cells repeats, with walls that look alike; without extra openings then."
     )
     # Doom's coordinates end at 32767 units, its player is a square of 1 m.
     block_m: float = setting(
@@ -91,6 +94,7 @@ class Maze3DConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_maze_size(self.rows, self.cols, self.extra_openings)
+        check_aliased(self.aliased, self.rows, self.cols, self.extra_openings)
         if (self.width, self.height) not in RESOLUTIONS:
             allowed = ", ".join(f"{width} x {height}" for width, height in RESOLUTIONS)
             raise ValueError(f"width x height is {self.width} x {self.height}; it must be one of {allowed}")
@@ -257,12 +261,17 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
         config = self.config
         maze_rng, rng = _generator(maze_seed, stream=0), _generator(maze_seed, stream=1)
-        maze = kruskal_maze(config.rows, config.cols, maze_rng, config.extra_openings, config.block_m)
+        if config.aliased:
+            maze = repeated_maze(config.rows, config.cols, maze_rng, config.block_m)
+        else:
+            maze = kruskal_maze(config.rows, config.cols, maze_rng, config.extra_openings, config.block_m)
         face_count = len(wall_faces(maze.walls))
         style = random_style(face_count, rng, config.light_level)
         if config.textures != "all":
             # Drawn beside the other, after which the start is the same.
             style = random_style(face_count, _generator(maze_seed, stream=5), config.light_level, config.textures)
+        if config.aliased:
+            style = replace(style, wall_textures=style.wall_textures[:1] * face_count)
         decorations = random_decorations(maze, config.decorations, _generator(maze_seed, stream=6))
         rng = rng if seed == maze_seed else _generator(seed, stream=4)
         start_x, start_y = maze.block_center(rng.choice(maze.free_blocks()))

@@ -164,6 +164,33 @@ def kruskal_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings:
     return _build(rows, cols, tree, rng, extra_openings, block_m)
 
 
+MODULE_CELLS = 2
+"""Cells along a side of the module that ``repeated_maze`` repeats."""
+
+
+def check_aliased(aliased: bool, rows: int, cols: int, extra_openings: int) -> None:
+    """Raise a ValueError where no aliased maze has this size."""
+    if aliased and (rows % MODULE_CELLS or cols % MODULE_CELLS or extra_openings):
+        raise ValueError(
+            f"rows, cols, extra_openings are {rows}, {cols}, {extra_openings}; an aliased maze has multiples of "
+            f"{MODULE_CELLS}, {MODULE_CELLS} and no extra openings"
+        )
+
+
+def repeated_maze(rows: int, cols: int, rng: np.random.Generator, block_m: float = 1.0) -> Maze:
+    """An aliased maze: one random module of 2 x 2 cells over and over, joined by the same openings everywhere.
+
+    Only the maze's border tells two modules apart. Raises ValueError where rows or cols are no multiples of a module.
+    """
+    check_maze_size(rows, cols, 0)
+    check_aliased(True, rows, cols, 0)
+    module = prim_maze(MODULE_CELLS, MODULE_CELLS, rng).walls[:-1, :-1].copy()
+    module[2 * rng.integers(MODULE_CELLS) + 1, 0] = module[0, 2 * rng.integers(MODULE_CELLS) + 1] = False
+    walls = np.pad(np.tile(module, (rows // MODULE_CELLS, cols // MODULE_CELLS)), ((0, 1), (0, 1)))
+    walls[[0, -1]] = walls[:, [0, -1]] = True
+    return Maze(walls=walls, block_m=block_m)
+
+
 def draw_maze(axes: Axes, maze: Maze, colors: npt.ArrayLike | None = None) -> None:
     """Draw the maze on matplotlib axes as one image, in metres, y up.
 

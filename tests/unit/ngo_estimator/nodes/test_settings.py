@@ -60,3 +60,11 @@ def test_any_world_may_be_named_together_with_its_weights() -> None:
     for world, weights in (("our_robot", ""), ("../maze2d", "/weights"), ("", "/weights")):
         with pytest.raises(BadParameter, match=f"'world' is '{world}'; allowed: maze2d, maze3d or scan, or the name"):
             LocalNodeSettings(world=world, weights=weights)
+
+
+def test_a_localization_needs_a_map() -> None:
+    assert NgoNodeSettings(mode="localization", state="office").mode == "localization"
+    with pytest.raises(BadParameter, match="parameter 'state' is ''; allowed: the folder of a saved state"):
+        NgoNodeSettings(mode="localization")
+    with pytest.raises(BadParameter, match="allowed: mapping or localization"):
+        NgoNodeSettings(mode="localisation")

@@ -12,20 +12,23 @@ def propagate(
     relative_xyyaw: np.ndarray,
     relative_covariance: np.ndarray,
 ) -> np.ndarray:
-    """Covariance ``(3, 3)`` of a pose after one more step, to first order.
+    """Covariance ``(..., 3, 3)`` of poses after one more step, to first order.
 
     Args:
-        covariance: ``(3, 3)`` of the pose before the step, in the frame that the pose is given in.
-        pose_xyyaw: ``(3,)`` the pose after the step.
-        relative_xyyaw: ``(3,)`` the step, seen from the pose before it.
-        relative_covariance: ``(3, 3)`` of the step, in the frame of the pose before it.
+        covariance: ``(..., 3, 3)`` of the poses before the step, in the frame that the poses are given in.
+        pose_xyyaw: ``(..., 3)`` the poses after the step.
+        relative_xyyaw: ``(..., 3)`` the step, seen from the pose before it.
+        relative_covariance: ``(..., 3, 3)`` of the step, in the frame of the pose before it.
     """
-    yaw_before = pose_xyyaw[2] - relative_xyyaw[2]
+    yaw_before = pose_xyyaw[..., 2] - relative_xyyaw[..., 2]
     cos, sin = np.cos(yaw_before), np.sin(yaw_before)
-    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    shift_x, shift_y = rotation[:2, :2] @ relative_xyyaw[:2]
-    lever = np.array([[1.0, 0.0, -shift_y], [0.0, 1.0, shift_x], [0.0, 0.0, 1.0]])
-    return np.asarray(lever @ covariance @ lever.T + rotation @ relative_covariance @ rotation.T)
+    rotation, lever = np.zeros((2, *np.shape(yaw_before), 3, 3))
+    rotation[..., 0, 0] = rotation[..., 1, 1] = cos
+    rotation[..., 0, 1], rotation[..., 1, 0], rotation[..., 2, 2] = -sin, sin, 1.0
+    lever[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    lever[..., 0, 2] = -(sin * relative_xyyaw[..., 0] + cos * relative_xyyaw[..., 1])
+    lever[..., 1, 2] = cos * relative_xyyaw[..., 0] - sin * relative_xyyaw[..., 1]
+    return np.asarray(lever @ covariance @ lever.mT + rotation @ relative_covariance @ rotation.mT)
 
 
 def bounded(covariance: np.ndarray) -> np.ndarray:

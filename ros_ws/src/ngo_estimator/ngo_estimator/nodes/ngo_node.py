@@ -29,6 +29,7 @@ from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.localisation_report import localisation_details, localisation_problems
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.state_services import StateServices
 from ngo_estimator.nodes.status import NodeStatus
@@ -39,6 +40,7 @@ from ngo_estimator.trajectory.save_path import path_inside
 
 if TYPE_CHECKING:
     from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory, Trajectory, TrajectoryUpdate
+    from ngo_estimator.online.map_localisation import LocalisedStep, MapLocalisation
     from ngo_estimator.online.session import Session
 
 NAME = "ngo_node"
@@ -52,6 +54,9 @@ _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.
 
 class NgoNode(LifecycleNode):
     """Subscribes relative poses; publishes the corrected trajectory in several forms, and map -> odom.
+
+    With ``mode`` localization the trajectory is the one that was saved and stays so: it is the map in which the robot's
+    pose is looked for.
 
     A managed node: configured it has its networks, its topics and its services, active it takes relative poses.
     """
@@ -229,6 +234,8 @@ class NgoNode(LifecycleNode):
     def _begin_anew(self) -> None:
         """Reset the state that belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
+        self._localisation: MapLocalisation | None = None
+        self._found: LocalisedStep | None = None
         self._covariance = np.zeros((3, 3))
         self._last_correction_m = 0.0
         self._origin = self._origin_of.of_first_pose(np.array(self._settings.initial_pose))
@@ -238,18 +245,24 @@ class NgoNode(LifecycleNode):
         try:
             step = messages.relative_step(message)
             with self._status.timed("time an update"):
-                update = self._core.update(step, optimize=not self._paused)
+                if self._localisation is not None:
+                    found = self._localisation.update(step)
+                else:
+                    update = self._core.update(step, optimize=not self._paused)
         except ValueError as error:
             self._status.dropped("relative pose", error)
             return
         except Exception:
             # A fault of ours, not of the message: a robot is better off with a new map than without the node.
-            self.get_logger().error(f"internal error, the map starts anew:\n{traceback.format_exc()}")
-            self._core.reset()
-            self._begin_anew()
+            forgotten = "the map starts anew" if self._localisation is None else "the pose is looked for anew"
+            self.get_logger().error(f"internal error, {forgotten}:\n{traceback.format_exc()}")
+            self._forget()
             self._status.dropped("relative pose", "internal error", warn=False)
             return
         self._status.received(step.stamp_ns)
+        if self._localisation is not None:
+            self._on_found(found, step.tf_odom_xyyaw)
+            return
         if update.restarted:
             self._begin_anew()
             self._restarts += 1
@@ -273,6 +286,26 @@ class NgoNode(LifecycleNode):
         else:
             self._pending.cancel()
 
+    def _on_found(self, step: "LocalisedStep", odom_xyyaw: np.ndarray) -> None:
+        """Publish the pose in the saved map, where it is known."""
+        found, self._found = step.found, step
+        self._gaps += step.gap
+        self._new_gaps += step.gap
+        self._restarts += step.restarted
+        if step.restarted:
+            self.get_logger().info("the relative poses have a new origin: the pose in the map is looked for anew")
+        if found.claimed:
+            self._smoothing.reset()
+            self.get_logger().info("localised: several frames agree on the pose in the map")
+        if found.lost:
+            self.get_logger().warning("not localised: the pose in the map is lost")
+        self._covariance = np.zeros((3, 3)) if found.covariance is None else found.covariance
+        if found.pose_xyyaw is None or found.covariance is None or step.map_from_odom_xyyaw is None:
+            return
+        map_frame = self._settings.framed(self._settings.map_frame)
+        self._send_transform(found.stamp_ns, step.map_from_odom_xyyaw, odom_xyyaw)
+        self._pose.publish(messages.pose_message(found.stamp_ns, map_frame, found.pose_xyyaw, found.covariance))
+
     def _finish(self) -> None:
         """End the optimisation that has begun."""
         self._pending.cancel()
@@ -289,10 +322,12 @@ class NgoNode(LifecycleNode):
         self._pose.publish(messages.pose_message(update.stamp_ns, map_frame, pose, self._covariance))
 
     def _publish_transform(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
-        settings, stamp_ns = self._settings, update.stamp_ns
+        self._send_transform(update.stamp_ns, self._origin.poses(update.map_from_odom_xyyaw), odom_xyyaw)
+
+    def _send_transform(self, stamp_ns: int, newest: np.ndarray, odom_xyyaw: np.ndarray) -> None:
+        settings = self._settings
         if settings.publish_tf:
             map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
-            newest = self._origin.poses(update.map_from_odom_xyyaw)
             map_from_odom = self._smoothing.update(stamp_ns, newest, odom_xyyaw)
             ahead_ns = round(1e9 * settings.tf_ahead_s)
             self._tf.publish(messages.transform_message(stamp_ns + ahead_ns, map_frame, odom_frame, map_from_odom))
@@ -308,11 +343,17 @@ class NgoNode(LifecycleNode):
         except ValueError as error:
             self._status.dropped("initial pose", error)
             return
+        x, y, yaw = given[0].tolist()
+        there = f"the robot is at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad"
+        if self._localisation is not None:
+            self._localisation.tell(*given)
+            self._smoothing.reset()
+            self.get_logger().info(f"{there}, as it was told")
+            return
         own = np.zeros(3) if self._latest is None else self._latest.pose_xyyaw
         self._origin = self._origin_of.of_pose(own, *given)
         self._smoothing.reset()
-        x, y, yaw = given[0].tolist()
-        self.get_logger().info(f"the robot is at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad: the map moves with it")
+        self.get_logger().info(f"{there}: the map moves with it")
         if self._latest is not None:
             self._whole.changed(loops=True)
 
@@ -348,6 +389,10 @@ class NgoNode(LifecycleNode):
         pose = self._origin.poses(update.pose_xyyaw)
         self._covariance = self._origin.covariance_of(pose, update.covariance)
         self._last_correction_m = 0.0
+        self._found = None
+        if self._settings.mode == "localization":
+            self._localisation = session.core.localisation(session.origin)
+            self._smoothing.reset()
         if self._inputs:
             self._pending.cancel()
         self._whole.changed(loops=True)
@@ -355,12 +400,25 @@ class NgoNode(LifecycleNode):
 
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
         frames = 0 if self._latest is None else self._latest.frames
-        self._core.reset()
-        self._begin_anew()
-        response.success, response.message = True, f"forgot {frames} poses"
+        in_map = self._localisation is not None
+        self._forget()
+        response.success, response.message = True, "forgot the pose in the map" if in_map else f"forgot {frames} poses"
         return response
 
+    def _forget(self) -> None:
+        """Begin a new trajectory; in a saved map, which stays, look for the pose anew."""
+        if self._localisation is None:
+            self._core.reset()
+            self._begin_anew()
+            return
+        self._localisation.reset()
+        self._found = None
+        self._smoothing.reset()
+
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._localisation is not None:
+            response.message = "mode is localization, where nothing is corrected that could pause"
+            return response
         self._paused = request.data
         response.success = True
         response.message = "paused: poses follow the odometry" if self._paused else "corrections go on"
@@ -382,6 +440,8 @@ class NgoNode(LifecycleNode):
             "restarts": str(self._restarts),
             "paths published": str(self._whole.paths),
         }
+        if self._localisation is not None:
+            return values | localisation_details(self._found)
         if self._latest is None:
             return values
         update = self._latest
@@ -403,6 +463,8 @@ class NgoNode(LifecycleNode):
         if self._fault:
             found.append(f"internal fault, the trajectory goes on by odometry: {self._fault}")
             self._fault = ""
+        if self._localisation is not None:
+            found += localisation_problems(self._found)
         if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:
             found.append(f"lost: the standard deviation of the position is {std_m:.3g} m")
         return found

@@ -160,6 +160,12 @@ class NgoNodeSettings(EstimatorSettings):
         "directory of the node.",
     )
     state: str = setting("", "Folder of a saved state to go on from, relative to save_directory; empty: none.")
+    mode: str = setting(
+        "mapping",
+        "mapping: the map grows with every relative pose. localization: the map in state stays as it is, and the "
+        "robot's pose is looked for in it.",
+        choices=("mapping", "localization"),
+    )
     path_topic: str = topic("ngo/path", "Corrected trajectory.")
     pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, after every relative pose.")
     trajectory_topic: str = topic(
@@ -200,6 +206,8 @@ class NgoNodeSettings(EstimatorSettings):
         super().__post_init__()
         if self.map_frame == self.odom_frame:
             raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
+        if self.mode == "localization" and not self.state:
+            raise BadParameter("parameter 'state' is ''; allowed: the folder of a saved state, with mode localization")
         if self.relative_pose_depth < self.window_frames:
             raise BadParameter(
                 f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; "

@@ -12,6 +12,8 @@ from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
 from ngo_estimator.geometry import se2
+from ngo_estimator.online.map_localisation import MapLocalisation
+from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.step_log import StepLog, TakenStep
 
 
@@ -149,6 +151,10 @@ class CorrectedTrajectory(ABC):
         self._iterations_per_step = iterations_per_step
         self._log = StepLog()
         self.reset()
+
+    @abstractmethod
+    def localisation(self, origin: MapOrigin) -> MapLocalisation:
+        """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says; raises ``ValueError``."""
 
     @abstractmethod
     def _new_graph(self) -> PoseGraph:

@@ -19,6 +19,7 @@ from ngo_estimator.networks.pose_aggregation import block_variances, in_block_po
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
+from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
@@ -380,6 +381,12 @@ class MetaGraph:
         tail = se2.compose(nodes[-1:], se2.between(starts[-1], odometry[whole + 1 :]))
         poses: np.ndarray = torch.cat((nodes[:1], corrected, tail)).numpy()
         return poses
+
+    def places(self) -> PlaceMap:
+        """The frames whose place codes are kept; raises ``ValueError`` where none are."""
+        if self._loops is None:
+            raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
+        return self._loops.places(self._first * self._block, self._keys, self.frame_poses())
 
     def _newest(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``.

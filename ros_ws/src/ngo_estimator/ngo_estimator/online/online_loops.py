@@ -18,6 +18,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
+from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere
 from ngo_estimator.optimizer.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
@@ -250,6 +251,18 @@ class OnlineLoops:
         embeddings = self._embeddings.slice(first, first + self._block).copy()
         poses = _seen_from(odometry[first], odometry[at + 1])
         return KeyFrame(node, relative, variance, embeddings, self._codes.at(at), poses)
+
+    def places(self, first: int, keys: KeyFrames, poses: np.ndarray) -> PlaceMap:
+        """The frames whose codes are kept: those from step number ``first`` on, and those of the key frames.
+
+        Args:
+            poses: of all frames in the map ``(frames, 3)``.
+        """
+        kept = [keys.frame(index) for index in range(len(keys))]
+        around = [np.arange(-MARGIN, self._block + MARGIN) + key.node * self._block for key in kept]
+        numbers = np.concatenate((*(np.maximum(at, 0) for at in around), np.arange(first, len(self._codes))))
+        codes = np.concatenate((*(key.codes for key in kept), self._codes.slice(first)))
+        return PlaceMap.of_steps(numbers, codes, poses)
 
     def leave(self, first: int) -> None:
         """Forget loops that nobody believes, when the window begins at node ``first`` and they lie before it."""

@@ -14,7 +14,11 @@ from ngo_estimator.checkpoint import CheckpointError, load_optimizer, load_place
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.online.localisation import Localiser
+from ngo_estimator.online.map_localisation import MapLocalisation
+from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.meta_graph import MetaGraph
+from ngo_estimator.online.place_matcher import PlaceMatcher
 from ngo_estimator.online.step_log import TakenStep
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 
@@ -132,3 +136,16 @@ class OnlineTrajectory(CorrectedTrajectory):
         code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
         variance = np.clip(np.diagonal(taken.covariance), *_VARIANCES)
         return self._graph.append(taken.relative, variance, step.motion_feature, code)
+
+    def localisation(self, origin: MapOrigin) -> MapLocalisation:
+        """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says.
+
+        Raises:
+            ValueError: there are no place codes.
+        """
+        places = self._graph.places()
+        if self._pair_head is None:
+            raise ValueError("the optimizer has no pair head; expected one with loops")
+        places = dataclasses.replace(places, poses=origin.poses(places.poses))
+        matcher = PlaceMatcher(self._pair_head, places, self._optimizer.config.search)
+        return MapLocalisation(Localiser(matcher), self._checked)

@@ -19,6 +19,8 @@ from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded, propagate
 from ngo_estimator.geometry.planar_motion import transformed
 from ngo_estimator.online.key_scan_store import KeyScanStore
+from ngo_estimator.online.map_origin import MapOrigin
+from ngo_estimator.online.scan_matcher import ScanMatcher
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
@@ -195,6 +197,10 @@ class ScanGraph:
         if self._scans.kept > most + most // 10:
             newest = self.config.loops.submap_keys
             self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.values, newest))
+
+    def matcher(self, origin: MapOrigin) -> ScanMatcher:
+        """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
+        return ScanMatcher(self._scans[:], origin.poses(self._nodes.values.copy()), self._finder)
 
     def measurements(self) -> tuple[RelativePoses, RelativePoses]:
         """The steps from each node to the next, and the accepted loops."""

@@ -10,6 +10,9 @@ from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.online.localisation import Localiser
+from ngo_estimator.online.map_localisation import MapLocalisation
+from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
 from ngo_estimator.online.step_log import TakenStep
 
@@ -60,3 +63,11 @@ class ScanTrajectory(CorrectedTrajectory):
 
     def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
         return self._graph.append(taken.relative, bounded(taken.covariance), step.key)
+
+    def localisation(self, origin: MapOrigin) -> MapLocalisation:
+        """Localisation in the key scans as they are, which lie in ``map`` as ``origin`` says.
+
+        Raises:
+            ValueError: no key scan has a point.
+        """
+        return MapLocalisation(Localiser(self._graph.matcher(origin)), self._checked)

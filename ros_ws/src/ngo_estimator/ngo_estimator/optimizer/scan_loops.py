@@ -28,7 +28,7 @@ from ngo_estimator.data.state_arrays import (
 from ngo_estimator.geometry.branch_and_bound import PooledGrid, SearchConfig, pooled_grid, search
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.line_map import LineMap, line_map_of_points
-from ngo_estimator.geometry.planar_motion import between, turned_covariance, wrap
+from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance, wrap
 from ngo_estimator.geometry.scan_matching import icp
 from ngo_estimator.optimizer.scan_loop_candidates import nearest_places
 from ngo_estimator.optimizer.walls_seen_through import PROFILE_BINS, PlacedScans, placed, range_profile, seen_through
@@ -201,6 +201,18 @@ class _Submap:
 
 
 @dataclass(frozen=True)
+class _Fit:
+    """How scans lie in a submap: ``pose`` ``(3,)``, ``covariance`` ``(3, 3)``, and evidence as in ``EVIDENCE``."""
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    response: float
+    second_peak: float
+    on_lines: float
+    through: float
+
+
+@dataclass(frozen=True)
 class _Candidate:
     """A place, and where in it the last key is searched: ``centre`` plus and minus ``window``, both ``(3,)``. The last
     key is ``likely`` that near to its pose in the graph."""
@@ -362,17 +374,50 @@ class ScanLoopFinder:
         grid = pooled_grid(self.config.search, near) if len(near) else None
         return _Submap(first, local, together, lines, grid)
 
-    def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: _Candidate) -> ScanLoops | None:
-        """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""
-        config, key = self.config, len(scans) - 1
-        submap = self._submap(scans, poses, candidate.place)
-        first = max(0, key + 1 - config.source_keys)
-        local = _between(poses[key], poses[first:])
-        source = placed(scans[first:], self._profiles[first:], local)
-        chosen = _spread(_within(source.points, config.range_m), config.search.resolution_m, config.search_points)
+    def of_fixed_map(self, scans: Sequence[KeyScan]) -> "ScanLoopFinder":
+        """A finder that knows these key scans, and has no loops: where the map stays as it is, others are ``seen``."""
+        other = ScanLoopFinder(self.config)
+        other._profiles = [*self._profiles, *map(range_profile, scans[len(self._profiles) :])]
+        other._forgotten = set(self._forgotten)
+        return other
+
+    def source(self, scans: Sequence[KeyScan], odometry: np.ndarray) -> PlacedScans:
+        """The newest of some scans at poses ``(scans, 3)``, in the frame of the last: what is searched together."""
+        newest = scans[-self.config.source_keys :]
+        local = _between(odometry[-1], odometry[-len(newest) :])
+        return placed(newest, [range_profile(scan) for scan in newest], local)
+
+    def search_points(self, source: PlacedScans) -> np.ndarray:
+        """Some points ``(n, 2)`` of a source, by which it is searched."""
+        config = self.config
+        return _spread(_within(source.points, config.range_m), config.search.resolution_m, config.search_points)
+
+    def seen(
+        self, scans: Sequence[KeyScan], poses: np.ndarray, source: PlacedScans, expected: np.ndarray, window: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Pose ``(3,)`` of a source in a map of key scans, and its covariance ``(3, 3)``; None where a test fails.
+
+        The tests are those of a loop, but for neighbours and the graph's pose.
+
+        Args:
+            scans, poses: all key scans of ``of_fixed_map``, and their poses in the map ``(keys, 3)``.
+            expected, window: where to search, and how far to each side ``(3,)`` (m, m, rad).
+        """
+        known = np.array([k for k in range(len(poses)) if k not in self._forgotten], np.int64)
+        place = int(known[np.linalg.norm(poses[known, :2] - expected[:2], axis=1).argmin()])
+        submap = self._submap(scans, poses, place)
+        fit = self._fit(submap, source, between(poses[place], expected), window)
+        if fit is None or fit.through > self.config.most_seen_through:
+            return None
+        turned = turned_covariance(poses[place, 2], fit.covariance + _SUBMAP_VARIANCE)
+        return compose(poses[place], fit.pose), turned
+
+    def _fit(self, submap: _Submap, source: PlacedScans, centre: np.ndarray, window: np.ndarray) -> _Fit | None:
+        """A source searched in a submap; None where it does not lie on the submap's lines, or elsewhere as well."""
+        config, chosen = self.config, self.search_points(source)
         if submap.grid is None or len(chosen) == 0:
             return None
-        match = search(config.search, submap.grid, chosen, candidate.centre, candidate.window)
+        match = search(config.search, submap.grid, chosen, centre, window)
         if match is None or match.response < config.least_response:
             return None
         second_peak = match.second / match.response
@@ -382,20 +427,32 @@ class ScanLoopFinder:
         if registered.share < config.least_on_lines:
             return None
         through = seen_through(submap.scans, source, registered.pose)
-        off = registered.pose - between(poses[candidate.place], poses[key])
+        return _Fit(registered.pose, registered.covariance, match.response, second_peak, registered.share, through)
+
+    def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: _Candidate) -> ScanLoops | None:
+        """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""
+        config, key = self.config, len(scans) - 1
+        submap = self._submap(scans, poses, candidate.place)
+        first = max(0, key + 1 - config.source_keys)
+        local = _between(poses[key], poses[first:])
+        source = placed(scans[first:], self._profiles[first:], local)
+        fit = self._fit(submap, source, candidate.centre, candidate.window)
+        if fit is None:
+            return None
+        off = fit.pose - between(poses[candidate.place], poses[key])
         off[2] = wrap(off[2])
         disagreement = float(np.linalg.norm(3.0 * off / candidate.likely))
-        if through > config.most_seen_through or disagreement > config.most_disagreement:
+        if fit.through > config.most_seen_through or disagreement > config.most_disagreement:
             return None
         # From the nearest of the submap's keys: its pose in the submap is the least uncertain.
-        nearest = int(np.argmin(np.linalg.norm(submap.poses[:, :2] - registered.pose[:2], axis=1)))
+        nearest = int(np.argmin(np.linalg.norm(submap.poses[:, :2] - fit.pose[:2], axis=1)))
         earlier = submap.poses[nearest]
-        covariance = turned_covariance(-earlier[2], registered.covariance) + _SUBMAP_VARIANCE
+        covariance = turned_covariance(-earlier[2], fit.covariance) + _SUBMAP_VARIANCE
         return ScanLoops(
             np.array(((submap.first + nearest, key),)),
-            between(earlier, registered.pose)[None],
+            between(earlier, fit.pose)[None],
             covariance[None],
-            np.array(((match.response, second_peak, registered.share, through, disagreement, 0.0),)),
+            np.array(((fit.response, fit.second_peak, fit.on_lines, fit.through, disagreement, 0.0),)),
             np.zeros(1, bool),
         )
 

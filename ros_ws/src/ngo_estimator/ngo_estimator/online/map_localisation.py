@@ -1,0 +1,60 @@
+"""A log of steps and a localiser: the robot's pose in a saved map, step by step (no ROS here)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.online.localisation import Localisation, Localiser
+from ngo_estimator.online.step_log import StepLog
+
+
+@dataclass(frozen=True)
+class LocalisedStep:
+    """What a step told.
+
+    ``found`` is what is known of the pose after it, ``map_from_odom_xyyaw`` (3,) goes with a pose that is known, None
+    otherwise. ``restarted``: the odometry began anew, ``gap``: steps before this one were lost.
+    """
+
+    found: Localisation
+    map_from_odom_xyyaw: np.ndarray | None
+    restarted: bool
+    gap: bool
+
+
+class MapLocalisation:
+    """Takes the steps of a robot in a map that stays as it is.
+
+    An odometry that begins anew says nothing about where the robot went meanwhile: its pose is then not known.
+    """
+
+    def __init__(self, localiser: Localiser, checked: Callable[[RelativeStep], RelativeStep]) -> None:
+        self._localiser, self._checked = localiser, checked
+        self._log = StepLog()
+
+    def reset(self) -> None:
+        """Forget the pose."""
+        self._log.reset()
+        self._localiser.reset()
+
+    def tell(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
+        """Take the pose ``(3,)`` in the map, and its covariance ``(3, 3)``, from somebody who knows them."""
+        self._localiser.tell(pose_xyyaw, bounded(covariance))
+
+    def update(self, step: RelativeStep) -> LocalisedStep:
+        """Take the next step; raises ``RejectedStep`` for one that cannot be used. Everything is then as before."""
+        step = self._checked(step)
+        taken = self._log.take(step)
+        if taken.restarted:
+            self._localiser.reset()
+        found = self._localiser.update(step, taken.relative.astype(np.float64), bounded(taken.covariance))
+        map_from_odom = None
+        if found.pose_xyyaw is not None:
+            odom = torch.from_numpy(step.tf_odom_xyyaw)
+            map_from_odom = se2.compose(torch.from_numpy(found.pose_xyyaw), se2.inverse(odom)).numpy()
+        return LocalisedStep(found, map_from_odom, taken.restarted, taken.gap)

@@ -1,0 +1,83 @@
+"""Sightings by a lidar: a key scan searched in the key scans of a map, as the search for loops verifies one.
+
+Where nothing is known, the newest scans are searched in the whole map, by branch and bound. A pose that fits is
+verified in a submap of its place, with the tests of a loop.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry.branch_and_bound import pooled_grid, search
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.online.sightings import Sightings
+from ngo_estimator.optimizer.scan_loops import ScanLoopFinder
+from ngo_estimator.optimizer.walls_seen_through import PlacedScans
+
+_MARGIN_M = 2.0  # around the key scans of the map, where the robot may be
+_AROUND = np.array((1.0, 1.0, math.radians(15.0)))  # of a pose that is verified
+
+
+class ScanMatcher:
+    """Compares key scans with those of a map.
+
+    Args:
+        scans, poses: of the map's key scans, poses ``(keys, 3)``; scans without points say nothing.
+        finder: knows these scans, and has the tests of a loop.
+    """
+
+    place_m = 1.0
+
+    def __init__(self, scans: Sequence[KeyScan], poses: np.ndarray, finder: ScanLoopFinder) -> None:
+        points = [transformed(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)]
+        if sum(map(len, points)) == 0:
+            raise ValueError("no key scan of the map has a point; expected a map with walls")
+        self._scans, self._poses, self._finder = scans, poses, finder.of_fixed_map(scans)
+        self._search = finder.config.search
+        self._grid = pooled_grid(self._search, np.concatenate(points))
+        low, high = poses[:, :2].min(0) - _MARGIN_M, poses[:, :2].max(0) + _MARGIN_M
+        self._centre = np.array((*(0.5 * (low + high)), 0.0))
+        self._window = np.array((*(0.5 * (high - low)), math.pi))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all scans but those of the map."""
+        self._recent: list[KeyScan] = []
+        self._odometry: list[np.ndarray] = []
+
+    def append(self, step: RelativeStep, odometry: np.ndarray) -> bool:
+        """Take the next frame and its pose ``(3,)`` by odometry; only key scans are compared with the map."""
+        if step.key is None:
+            return False
+        keep = self._finder.config.source_keys
+        self._recent = [*self._recent, step.key.scan][-keep:]
+        self._odometry = [*self._odometry, odometry][-keep:]
+        return len(self._recent) == keep
+
+    def everywhere(self) -> Sightings:
+        """Hypotheses of the newest frame's pose, wherever it may be: the best one, and the best well apart from it."""
+        source = self._source()
+        points = self._finder.search_points(source)
+        match = None if len(points) == 0 else search(self._search, self._grid, points, self._centre, self._window)
+        if match is None:
+            return Sightings.none()
+        others = () if match.second_pose is None else (match.second_pose,)
+        return self._verified(source, (match.pose, *others))
+
+    def around(self, expected: np.ndarray) -> Sightings:
+        """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
+        return self._verified(self._source(), (expected,))
+
+    def _source(self) -> PlacedScans:
+        return self._finder.source(self._recent, np.stack(self._odometry))
+
+    def _verified(self, source: PlacedScans, poses: Sequence[np.ndarray]) -> Sightings:
+        seen = [self._finder.seen(self._scans, self._poses, source, pose, _AROUND) for pose in poses]
+        found = [one for one in seen if one is not None]
+        if not found:
+            return Sightings.none()
+        at, covariance = (np.stack(column) for column in zip(*found, strict=True))
+        return Sightings(at, covariance, np.ones(len(found)))

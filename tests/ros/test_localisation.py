@@ -1,0 +1,131 @@
+"""mode:=localization: a node that is switched on within a saved map finds its pose there, and says so until it has."""
+
+import dataclasses
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from ngo_msgs.msg import RelativePose
+from ngo_msgs.srv import Reset, SaveState
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.nodes.messages import pose_message, relative_pose_message
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from tests.golden.drives import WEIGHTS, GoldenDrive, estimates
+
+from .processes import NodeProcess, Probe
+from .relative_poses import Optimizer
+
+pytestmark = pytest.mark.processes
+
+START = 110
+"""Frame at which the robot is switched on again."""
+
+
+@dataclasses.dataclass
+class Again:
+    """A node in localization mode, and the steps of a robot from ``START`` on, whose odometry begins there."""
+
+    process: NodeProcess
+    probe: Probe
+    optimizer: Optimizer
+    steps: list[RelativePose]
+    transforms: list[TFMessage]
+    expected: np.ndarray
+    odom: np.ndarray
+
+
+class Node(Optimizer):
+    """A node that may not know its pose: it is connected where it has a subscription."""
+
+    def connect(self) -> None:
+        self.probe.spin_until(lambda: self.publisher.get_subscription_count() == 1, "ngo_node's subscription")
+
+
+@pytest.fixture(scope="module")
+def again(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Again]:
+    drive = GoldenDrive.load("maze2d")
+    steps = estimates(drive, LocalOdometry.load(WEIGHTS / "maze2d"))
+    folder, weights = tmp_path_factory.mktemp("states"), WEIGHTS / "maze2d"
+    parameters: dict[str, Any] = {"world": "maze2d", "save_directory": str(folder), "diagnostics_period_s": 0.2}
+    with Probe() as probe:
+        with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+            optimizer = Node(process, weights, probe)
+            mapped = optimizer.pose_after(*(relative_pose_message(step, "base_link") for step in steps))
+            response = probe.call(SaveState, "ngo_node/save_state", SaveState.Request(path="maze"))
+            assert response.success, response.message
+            process.send(signal.SIGINT)
+            assert process.wait() == 0
+        begin = steps[START - 1]
+        later = [
+            dataclasses.replace(
+                step, odom_xyyaw=between(begin.odom_xyyaw, step.odom_xyyaw), origin_stamp_ns=begin.stamp_ns
+            )
+            for step in steps[START:]
+        ]
+        messages = [relative_pose_message(step, "base_link") for step in later]
+        transforms = probe.collect(TFMessage, "tf")
+        with NodeProcess(
+            "ngo_estimator", "ngo_node", {**parameters, "mode": "localization", "state": "maze"}
+        ) as process:
+            node = Node(process, weights, probe)
+            yield Again(process, probe, node, messages, transforms, _planar(mapped), later[-1].odom_xyyaw)
+            process.send(signal.SIGINT)
+            assert process.wait() == 0, process.log
+            assert "Traceback" not in process.log, process.log
+
+
+def _planar(message: PoseWithCovarianceStamped) -> np.ndarray:
+    pose = message.pose.pose
+    return np.array((pose.position.x, pose.position.y, 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)))
+
+
+def test_a_robot_says_that_it_is_not_localised_until_its_pose_is_known_and_right(again: Again) -> None:
+    node = again.optimizer
+    node.publish(*again.steps[:3])
+    assert "no hypothesis" not in node.wait_for_problem("not localised: ", "support")
+    assert node.wait_for_value("localisation", bool) == "not localised"
+    assert node.count("received") == 3 and not again.transforms and not node.poses
+    node.publish(*again.steps[3:])
+    last = node.wait_for_stamp(_stamp_ns(again.steps[-1]))
+    assert _planar(last) == pytest.approx(again.expected, abs=0.03)
+    again.process.wait_for_log("localised: several frames agree")
+    again.probe.spin_until(lambda: len(again.transforms) == len(node.poses), "a transform for each pose")
+    (transform,) = again.transforms[-1].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
+    rotation, translation = transform.transform.rotation, transform.transform.translation
+    map_from_odom = np.array((translation.x, translation.y, 2.0 * np.arctan2(rotation.z, rotation.w)))
+    assert compose(map_from_odom, again.odom) == pytest.approx(again.expected, abs=0.03)
+    assert node.wait_for_value("localisation", lambda value: value == "localised")
+
+
+def test_a_reset_forgets_the_pose_and_initialpose_gives_it(again: Again) -> None:
+    node, probe = again.optimizer, again.probe
+    assert probe.call(Reset, "ngo_node/reset", Reset.Request()).message == "forgot the pose in the map"
+    publisher = probe.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
+    probe.spin_until(lambda: publisher.get_subscription_count() == 1, "ngo_node's subscription of initialpose")
+    node.poses.clear()
+    node.publish(*again.steps[:2])
+    node.wait_for_problem("not localised")
+    assert not node.poses
+    given = np.array((1.0, 2.0, 0.5))
+    publisher.publish(pose_message(1, "map", given, np.diag((0.1, 0.1, 0.05))))
+    again.process.wait_for_log("the robot is at x 1.000 m, y 2.000 m, yaw 0.500 rad, as it was told")
+    node.publish(again.steps[2])
+    assert np.hypot(*(_planar(node.wait_for_stamp(_stamp_ns(again.steps[2]))) - given)[:2]) < 0.5
+
+
+def test_a_localization_without_a_map_is_one_line_and_exit_code_2() -> None:
+    with NodeProcess("ngo_estimator", "ngo_node", {"mode": "localization"}) as process:
+        assert process.wait() == 2, process.log
+        assert len(process.lines) == 1 and "parameter 'state' is ''" in process.lines[0], process.log
+
+
+def _stamp_ns(message: RelativePose) -> int:
+    """The stamp of the frame that a relative pose ends at, in ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec * 10**9 + stamp.nanosec)

@@ -1,0 +1,82 @@
+"""The page of the table of relocalisation, docs/results_relocalisation.md."""
+
+from typing import Any
+
+_TITLES = {
+    "ours": "ours (`mode:=localization`)",
+    "nearest_code": "`nearest_code`: the pose of the most similar place code, from a similarity of 0.99 on",
+    "particle_filter": "`particle_filter`: AMCL's model on the map's ranges, starting anywhere in free space",
+    "oracle_place": "`oracle_place`: the truly nearest frame of the map is given, and measured",
+}
+_COLUMNS = {
+    "success": ("Success (%)", 100.0),
+    "false_claims": ("False claims (%)", 100.0),
+    "frames_to_success": ("Frames to success", 1.0),
+    "heading_rmse_deg": ("Heading RMSE after (deg)", 1.0),
+}
+_WORLDS = {
+    "maze2d": "2D mazes",
+    "maze3d": "3D mazes",
+    "maze2d_aliased": "Aliased 2D mazes",
+    "maze3d_aliased": "Aliased 3D mazes",
+}
+
+
+def page(result: dict[str, Any]) -> str:
+    """The page of a JSON's content."""
+    parts = [_INTRODUCTION.format(**result)]
+    for table, rows in result["tables"].items():
+        parts.append(f"## {_WORLDS[table]}\n\n{_map_line(result['maps'][table])}\n\n{_table(rows)}")
+        if lines := _table({row: numbers for row, numbers in result["unmapped"][table].items() if len(numbers) > 1}):
+            parts.append(f"Starts in parts that the map does not show, where silence is right:\n\n{lines}")
+    return "\n\n".join(parts) + "\n"
+
+
+_INTRODUCTION = """# Relocalisation: kidnapped starts in a saved map
+
+Written by `{command}` at revision {revision}, mazes of the {split} split. [Localise in a saved
+map](how-to/localise_in_a_saved_map.md) says how to use it.
+
+{mazes} mazes that nothing was trained or chosen on. One drive of 2000 frames in each makes the map, by the whole online
+system. A robot starts at {starts} frames of another drive ({aliased_starts} in aliased mazes) with another start, other
+noise and another driver. It knows the map and nothing else. Aliased mazes repeat one module of 2 x 2 cells with one
+texture.
+
+- **Success**: the first pose that is claimed is right (0.5 m, 5 deg), within 50 frames.
+- **False claim**: the first pose that is claimed is wrong, however late.
+- **Heading RMSE after**: of all claimed poses from a success on, up to frame 60.
+- A pose is compared with the frames of the map that are truly within one place (0.5 m in 2D, 1 m in 3D) of the robot,
+  and with the truth as seen from the map's first frame; the smallest error counts. A map has errors of its own. Where
+  it is bent, two of its frames do not agree on where the robot is.
+- A start counts as mapped where 90 % of its first 50 frames lie within two places of a frame of the map.
+
+Brackets hold 95 % intervals by resampling mazes."""
+
+
+def _map_line(maps: dict[str, Any]) -> str:
+    position, heading = maps["position_rmse_m"]["mean"], maps["heading_rmse_deg"]["mean"]
+    online = maps["online_heading_rmse_deg"]["mean"]
+    return (
+        f"Errors of the maps themselves, aligned at the first pose: position RMSE {position:.3g} m, heading RMSE "
+        f"{heading:.3g} deg, {online:.3g} deg while they were made (SLAM)."
+    )
+
+
+def _table(rows: dict[str, Any]) -> str:
+    if not rows:
+        return ""
+    lines = [
+        "| Row | Starts | " + " | ".join(title for title, _ in _COLUMNS.values()) + " |",
+        "|---|" + "---|" * (len(_COLUMNS) + 1),
+    ]
+    for row, numbers in rows.items():
+        cells = [_cell(numbers.get(name), factor) for name, (_, factor) in _COLUMNS.items()]
+        lines.append(f"| {_TITLES[row]} | {numbers['starts']['mean']:.0f} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(number: dict[str, Any] | None, factor: float) -> str:
+    if number is None:
+        return ""
+    low, high = number["ci95"]
+    return f"{factor * number['mean']:.3g} [{factor * low:.3g}, {factor * high:.3g}]"
