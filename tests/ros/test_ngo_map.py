@@ -128,16 +128,16 @@ class Mapper:
 
 
 @contextmanager
-def running(namespace: str = "") -> Iterator[Mapper]:
+def running(namespace: str = "", **parameters: Any) -> Iterator[Mapper]:
     arguments = ("-r", f"__ns:={namespace}") if namespace else ()
-    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_map", LIDAR, arguments) as process:
+    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_map", LIDAR | parameters, arguments) as process:
         process.wait_for_log("ready: ")
         yield Mapper(process, probe, namespace)
 
 
 @pytest.fixture(scope="module")
-def mapper() -> Iterator[Mapper]:
-    with running() as mapper:
+def mapper(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapper]:
+    with running(save_directory=str(tmp_path_factory.getbasetemp())) as mapper:
         mapper.drive(1, 30, poses(30))
         mapper.wait_for_map(expected(30, poses(30)))
         yield mapper
@@ -198,7 +198,9 @@ def test_nav2_reads_the_files_of_save_map(mapper: Mapper, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("request_", "complaint"),
     [
-        ({"map_url": "/nowhere/room"}, "there is no folder '/nowhere'"),
+        ({"map_url": "nowhere/room"}, "there is no folder '"),
+        ({"map_url": "/nowhere/room"}, "path is '/nowhere/room.pgm'; expected a file in"),
+        ({"map_url": "../room"}, "path is '../room.pgm'; expected a file in"),
         ({"map_url": "room", "map_mode": "fancy"}, "map mode is 'fancy'; expected trinary, scale or raw"),
         ({"map_url": "room", "image_format": "gif"}, "image format is 'gif'; expected pgm or png"),
         ({"map_url": "room", "free_thresh": 0.9}, "thresholds of free and occupied are 0.9 and 0.65; expected"),

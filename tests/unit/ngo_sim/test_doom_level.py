@@ -9,10 +9,12 @@ import pytest
 from vizdoom import GameVariable
 
 from ngo_sim.doom_level import load_level
+from ngo_sim.doom_map import map_lumps
 from ngo_sim.doom_wad import write_lumps
 from ngo_sim.drivers import Action
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from tests.unit.ngo_sim.test_doom_map_check import TEXT
 
 HOME = Maze3DConfig(wad="my_way_home.wad", map="map01")
 
@@ -150,8 +152,7 @@ def test_a_driver_that_needs_a_plan_is_refused(home: Maze3D, driver: str) -> Non
 
 
 def test_a_file_takes_what_it_lacks_from_the_part_of_freedoom_that_its_map_is_of(tmp_path: Path) -> None:
-    lumps = [(name, b"") for name in ("E1M1", "TEXTMAP", "ENDMAP", "MAP01", "TEXTMAP", "ENDMAP")]
-    write_lumps(tmp_path / "both.wad", lumps)
+    write_lumps(tmp_path / "both.wad", map_lumps([("E1M1", TEXT), ("MAP01", TEXT)]))
     assert load_level(str(tmp_path / "both.wad"), "e1m1").game_wad.name == "freedoom1.wad"
     level = load_level(str(tmp_path / "both.wad"), "map01")
     assert (level.game_wad.name, level.name) == ("freedoom2.wad", "MAP01")

@@ -26,6 +26,7 @@ from ngo_estimator.nodes.settings import MapNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import weights_folder
 from ngo_estimator.trajectory.files import seconds
+from ngo_estimator.trajectory.save_path import path_inside
 
 NAME = "ngo_map"
 _SUMMARY = "Publishes a map from the ranges in relative poses, at their corrected poses."
@@ -151,8 +152,10 @@ class NgoMap(Node):
             raise ValueError("map_url is empty; expected the path of the files, without an ending")
         if self._trajectory is not None and self._due:  # a file holds all that is known by now
             self._draw(self._trajectory, math.inf)
+        folder = Path(self._settings.save_directory)
+        *_, described = (path_inside(folder, request.map_url + ending) for ending in (".pgm", ".png", ".yaml"))
         return write_map(
-            Path(request.map_url).expanduser().absolute(),
+            described.with_name(described.name.removesuffix(".yaml")),
             self._map.cells(),
             request.image_format,
             request.map_mode or "trinary",
