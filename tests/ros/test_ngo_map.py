@@ -259,17 +259,20 @@ def test_the_map_of_a_maze_shows_its_walls() -> None:
     maze = Maze2D()
     _, start = maze.reset(seed=2000)
     estimators = {"world": "maze2d", "image_reliability": "reliable", "image_depth": 100}
+    away_from_others = ("-r", "__ns:=/maze")
     with (
         Probe() as probe,
-        NodeProcess("ngo_estimator", "ngo_map", {"world": "maze2d", "map_update_interval": 0.1}) as mapper,
-        NodeProcess("ngo_estimator", "ngo_node", {"world": "maze2d"}) as ngo,
-        NodeProcess("ngo_estimator", "local_node", estimators) as local,
+        NodeProcess(
+            "ngo_estimator", "ngo_map", {"world": "maze2d", "map_update_interval": 0.1}, away_from_others
+        ) as mapper,
+        NodeProcess("ngo_estimator", "ngo_node", {"world": "maze2d"}, away_from_others) as ngo,
+        NodeProcess("ngo_estimator", "local_node", estimators, away_from_others) as local,
     ):
         for process in (mapper, ngo, local):
             process.wait_for_log("ready: ")
-        maps = probe.collect(OccupancyGrid, "map", LATCHED)
+        maps = probe.collect(OccupancyGrid, "/maze/map", LATCHED)
         simulator = {"seed": 2000, "frames": 100, "rate": 0.0, "wait_for_flow_control": True}
-        with NodeProcess("ngo_sim", "maze2d", {**simulator, "wait_for_subscribers": 1}):
+        with NodeProcess("ngo_sim", "maze2d", {**simulator, "wait_for_subscribers": 1}, away_from_others):
             # Of the 100 frames, from 1.0 s to 10.9 s; the last may show nothing new.
             late_ns = 10_000_000_000
             probe.spin_until(lambda: maps and to_ns(maps[-1].header.stamp) >= late_ns, "the map of the frames")
