@@ -46,7 +46,7 @@ def test_shipped_settings_correct_a_stored_drive_as_before() -> None:
     [
         {"odometry": {"odometry": {"key_distance_m": 0.33}}},
         {"odometry": {"points": {"spacing_m": 0.044}}},
-        {"graph": {"loops": {"least_response": 0.605}}},
+        {"graph": {"loops": {"least_response": 0.495}}},
         {"graph": {"loops": {"submap_keys": 13}}},
     ],
     ids=["key scans", "points", "loops", "submaps"],
