@@ -282,7 +282,7 @@ class CorrectedTrajectory(ABC):
         """
         step = self._checked(step)
         if not self.may_join(step):
-            raise RejectedStep(f"step to {step.stamp_ns} ns cannot begin another odometry; expected one with a key scan")
+            raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
         relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
         return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
 

@@ -1,21 +1,13 @@
 """A loaded trajectory that goes on from another start: the robot is found in its map, and the map grows from there."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory, TrajectoryUpdate
+from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.map_localisation import LocalisedStep
 from ngo_estimator.online.map_origin import MapOrigin
-
-
-@dataclass(frozen=True)
-class JoiningStep:
-    """What a step told: what is known of the pose in ``map``, and what joining changed, None before that."""
-
-    localised: LocalisedStep
-    joined: TrajectoryUpdate | None
 
 
 class Joining:
@@ -41,7 +33,7 @@ class Joining:
         """Take the pose ``(3,)`` in ``map``, and its covariance ``(3, 3)``, from somebody who knows them."""
         self._localisation.tell(pose_xyyaw, covariance)
 
-    def update(self, step: RelativeStep) -> JoiningStep:
+    def update(self, step: RelativeStep) -> LocalisedStep:
         """Take the next step; where it says where the robot is, the trajectory goes on from there.
 
         Raises:
@@ -51,5 +43,6 @@ class Joining:
         localised = self._localisation.update(step)
         found = localised.found
         if found.pose_xyyaw is None or found.covariance is None or not self._core.may_join(step):
-            return JoiningStep(localised, None)
-        return JoiningStep(localised, self._core.join(step, *self._origin.own(found.pose_xyyaw, found.covariance)))
+            return localised
+        own = self._origin.own(found.pose_xyyaw, found.covariance)
+        return replace(localised, joined=self._core.join(step, *own))

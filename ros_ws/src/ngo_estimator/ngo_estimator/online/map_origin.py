@@ -54,7 +54,7 @@ class MapOrigin:
         return np.asarray(se2.compose(origin, torch.tensor(poses_xyyaw)).numpy())
 
     def own(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A pose ``(3,)`` in ``map`` and its covariance ``(3, 3)`` against the map there, as the trajectory has them."""
+        """A pose ``(3,)`` in ``map``, and its covariance ``(3, 3)`` along its axes, as the trajectory has both."""
         origin = torch.from_numpy(self.map_from_start_xyyaw)
         own = se2.compose(se2.inverse(origin), torch.tensor(pose_xyyaw)).numpy()
         return own, turned_covariance(-float(origin[2]), covariance)
