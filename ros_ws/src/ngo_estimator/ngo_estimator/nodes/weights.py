@@ -44,7 +44,7 @@ def load_trajectory(settings: NgoNodeSettings) -> "CorrectedTrajectory":
     from ngo_estimator.online.online_trajectory import OnlineTrajectory
     from ngo_estimator.online.scan_trajectory import ScanTrajectory
 
-    def load(folder: Path, world: str) -> CorrectedTrajectory:
+    def load(folder: Path, world: str) -> "CorrectedTrajectory":
         if is_lidar(folder):
             warm_up()
             return ScanTrajectory.load(folder, world, settings.iterations_per_step)
