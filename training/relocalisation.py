@@ -57,7 +57,7 @@ class Arguments:
         "maze2d_aliased",
         "maze3d_aliased",
     )
-    """Tables to measure; the others stay as the JSON has them. None: the logs alone."""
+    """Tables to measure; none: those in the JSON stay as they are, for the logs alone."""
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Thresholds are chosen on validation; the test split is for the final table alone."""
     mazes: int = 10
@@ -96,16 +96,11 @@ def main(arguments: Arguments) -> dict[str, Any]:
     made = {"command": record["command"], "revision": record["revision"]}
     if arguments.tables:
         found = {table: measured(arguments, table) for table in arguments.tables}
-        settings = {name: getattr(arguments, name) for name in ("split", "mazes", "starts", "aliased_starts")}
-        old = result if all(result.get(name) == value for name, value in settings.items()) else {}
         kinds = {"tables": "mapped", "unmapped": "unmapped", "maps": "maps"}
         result = {
             **made,
-            **settings,
-            **{
-                name: {**old.get(name, {}), **{table: numbers[kind] for table, numbers in found.items()}}
-                for name, kind in kinds.items()
-            },
+            **{name: getattr(arguments, name) for name in ("split", "mazes", "starts", "aliased_starts")},
+            **{name: {table: numbers[kind] for table, numbers in found.items()} for name, kind in kinds.items()},
             "logs": result["logs"],
         }
     if arguments.logs is not None:

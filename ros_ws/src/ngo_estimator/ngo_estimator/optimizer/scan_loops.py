@@ -339,8 +339,9 @@ class ScanLoopFinder:
         seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)
         around = np.array((config.match_m, config.match_m, math.pi))
         chosen = [_Candidate(p, np.zeros(3), around, windows[p]) for p in seen if p not in self._forgotten]
+        views = _views(poses, self._middles.values)
         near = nearest_places(
-            _views(poses, self._middles.values), poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys, most=config.most_per_key
+            views, poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys, most=config.most_per_key
         )
         taken = [candidate.place for candidate in chosen]
         wider = windows * (config.search_factor, config.search_factor, 1.0)
