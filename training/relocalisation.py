@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 import ngo_estimator
 import training
+from ngo_common.files import written_whole
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training.common import runs
@@ -158,7 +159,8 @@ def _map(world: World, weights: Path, drive: Features, cache: Path, identity: st
         "online_heading_rmse_deg": _heading_rmse(trajectory.online_xyyaw, truth),
     }
     poses = trajectory.poses_xyyaw.copy()
-    np.savez(cache, identity=np.array(identity), poses=poses, numbers=np.array(json.dumps(numbers)))
+    with written_whole(cache) as file:
+        np.savez(file, identity=np.array(identity), poses=poses, numbers=np.array(json.dumps(numbers)))
     return _Map(poses, numbers)
 
 

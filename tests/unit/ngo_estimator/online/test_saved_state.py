@@ -250,7 +250,7 @@ def test_a_state_is_replaced_by_a_whole_one_or_not_at_all(
             if len(calls) == 1 + 2 * failing:
                 raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(saved_state.os, "fsync", fsync)
+        monkeypatch.setattr(os, "fsync", fsync)
         with pytest.raises(StateError, match=r"state: cannot be written \(No space left on device\)"):
             write_state(folder, core.identity, core.state())
         calls.clear()
