@@ -188,7 +188,11 @@ def _rows(
             errors = errors or MapErrors(known, second["poses"])
             claims = row_of(row, networks, known, second)
             kinds = zip(_KINDS, starts(errors, len(second["poses"]), count), strict=True)
-            numbers = {kind: [scored(errors, start, claims(start)) for start in some] for kind, some in kinds}
+            described = f"{row}, maze {number}"
+            numbers = {
+                kind: [scored(errors, start, claims(start)) for start in tqdm(some, desc=described, unit="start")]
+                for kind, some in kinds
+            }
             stored = {"identity": identity, "numbers": numbers}
             write_at_once(cache, json.dumps(stored))
         result[row] = stored["numbers"]
@@ -211,7 +215,9 @@ def _logs(arguments: Arguments, folder: Path) -> dict[str, Any]:
         identity = f"{log_identity(path)} {_log_code()} {arguments.log_starts}"
         stored = json.loads(cache.read_text()) if cache.exists() else {}
         if stored.get("identity") != identity:
-            found = list(log_starts(read_drive(path), arguments.weights / "scan", arguments.log_starts))
+            drive = read_drive(path)
+            starts_of_log = log_starts(drive, arguments.weights / "scan", arguments.log_starts)
+            found = list(tqdm(starts_of_log, desc=name, total=arguments.log_starts, unit="start"))
             stored = {"identity": identity, "numbers": summary_of(found)}
             cache.parent.mkdir(parents=True, exist_ok=True)
             write_at_once(cache, json.dumps(stored))
