@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from tqdm import tqdm
 
 from benchmarks.drives import CACHE, drive_of, stamp_ns
 from benchmarks.pinned import in_process, two_cores
@@ -61,7 +62,7 @@ def measure(arguments: Arguments, frames: int) -> dict[str, Any]:
     true = np.concatenate((np.zeros((1, 3)), drive.truth[:frames]))
     bent = true * np.array([1.02, 1.02, 1.0]) + np.array([0.1, 0.1, 0.01])
     growing_s = 0.0
-    for number, step in enumerate(drive.steps(), 1):
+    for number, step in enumerate(tqdm(drive.steps(), desc="map", total=frames, unit="step"), 1):
         scan_map.take(step, source.scans(step))
         if number % 100 == 0 or number == frames:
             begin = time.perf_counter()

@@ -23,6 +23,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 import tyro
+from tqdm import tqdm
 
 from benchmarks.pinned import in_process, two_cores
 from ngo_estimator.checkpoint import load_optimizer, load_place
@@ -93,7 +94,7 @@ def trajectory(world: str, frames: int) -> CorrectedTrajectory:
     if world == "scan":
         config = ScanGraphConfig()
         scans = ScanTrajectory(replace(config, loops=replace(config.loops, every=1000, most_per_key=0)))
-        for step in steps(frames, 0, 0, keys=True):
+        for step in tqdm(steps(frames, 0, 0, keys=True), desc=world, total=frames, unit="step"):
             scans.update(step, optimize=False)
         return scans
     optimizer, head = load_optimizer(WEIGHTS / world)[0], load_place(WEIGHTS / world)[0].pair_head
@@ -101,7 +102,8 @@ def trajectory(world: str, frames: int) -> CorrectedTrajectory:
     optimizer.config = replace(optimizer.config, search=search)
     core, code = OnlineTrajectory(optimizer, head), head.config.code_length
     motion = optimizer.config.aggregation.motion_feature_size
-    for k, step in enumerate(steps(frames, motion, code, keys=False), start=1):
+    driven = tqdm(steps(frames, motion, code, keys=False), desc=world, total=frames, unit="step")
+    for k, step in enumerate(driven, start=1):
         core.update(step, optimize=k == frames)
     return core
 

@@ -1,6 +1,7 @@
 """Make the table of relocalisation: kidnapped starts in mapped mazes, by one command.
 
     python -m training.relocalisation
+    python -m training.relocalisation --tables --logs FOLDER    # real logs alone
 
 In each maze one drive makes a map, by the whole online system. Robots start at frames of another drive, with other
 starts, noise and driver, and know nothing but the map. Mazes are those that nothing was trained or chosen on; aliased
@@ -23,6 +24,7 @@ from tqdm import tqdm
 
 import ngo_estimator
 import training
+from ngo_common.files import written_whole
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training.common import runs
@@ -56,7 +58,7 @@ class Arguments:
         "maze2d_aliased",
         "maze3d_aliased",
     )
-    """Tables to measure."""
+    """Tables to measure; none: those in the JSON stay as they are, for the logs alone."""
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Thresholds are chosen on validation; the test split is for the final table alone."""
     mazes: int = 10
@@ -68,7 +70,7 @@ class Arguments:
     rows: tuple[RowName, ...] = ROWS
     """Rows to measure."""
     logs: Path | None = None
-    """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: left out."""
+    """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: they stay as the JSON has them."""
     log_starts: int = 20
     """Starts in each log."""
     weights: Path = runs.WEIGHTS
@@ -90,21 +92,21 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write the JSON, and return its content."""
-    record = runs.record("relocalisation", arguments)
-    found = {table: measured(arguments, table) for table in arguments.tables}
-    result = {
-        "command": record["command"],
-        "revision": record["revision"],
-        "split": arguments.split,
-        "mazes": arguments.mazes,
-        "starts": arguments.starts,
-        "aliased_starts": arguments.aliased_starts,
-        "tables": {table: numbers["mapped"] for table, numbers in found.items()},
-        "unmapped": {table: numbers["unmapped"] for table, numbers in found.items()},
-        "maps": {table: numbers["maps"] for table, numbers in found.items()},
-        "logs": _logs(arguments),
-    }
-    write_at_once(arguments.out / "relocalisation.json", json.dumps(result, indent=2) + "\n")
+    record, path = runs.record("relocalisation", arguments), arguments.out / "relocalisation.json"
+    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}, "logs": {}}
+    made = {"command": record["command"], "revision": record["revision"]}
+    if arguments.tables:
+        found = {table: measured(arguments, table) for table in arguments.tables}
+        kinds = {"tables": "mapped", "unmapped": "unmapped", "maps": "maps"}
+        result = {
+            **made,
+            **{name: getattr(arguments, name) for name in ("split", "mazes", "starts", "aliased_starts")},
+            **{name: {table: numbers[kind] for table, numbers in found.items()} for name, kind in kinds.items()},
+            "logs": result["logs"],
+        }
+    if arguments.logs is not None:
+        result["logs"] = {**made, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
+    write_at_once(path, json.dumps(result, indent=2) + "\n")
     write_at_once(arguments.docs / "results_relocalisation.md", relocalisation_page.page(result))
     for table, rows in result["tables"].items():
         for row, numbers in rows.items():
@@ -157,7 +159,8 @@ def _map(world: World, weights: Path, drive: Features, cache: Path, identity: st
         "online_heading_rmse_deg": _heading_rmse(trajectory.online_xyyaw, truth),
     }
     poses = trajectory.poses_xyyaw.copy()
-    np.savez(cache, identity=np.array(identity), poses=poses, numbers=np.array(json.dumps(numbers)))
+    with written_whole(cache) as file:
+        np.savez(file, identity=np.array(identity), poses=poses, numbers=np.array(json.dumps(numbers)))
     return _Map(poses, numbers)
 
 
@@ -185,7 +188,11 @@ def _rows(
             errors = errors or MapErrors(known, second["poses"])
             claims = row_of(row, networks, known, second)
             kinds = zip(_KINDS, starts(errors, len(second["poses"]), count), strict=True)
-            numbers = {kind: [scored(errors, start, claims(start)) for start in some] for kind, some in kinds}
+            described = f"{row}, maze {number}"
+            numbers = {
+                kind: [scored(errors, start, claims(start)) for start in tqdm(some, desc=described, unit="start")]
+                for kind, some in kinds
+            }
             stored = {"identity": identity, "numbers": numbers}
             write_at_once(cache, json.dumps(stored))
         result[row] = stored["numbers"]
@@ -200,22 +207,22 @@ def _code(row: str) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _logs(arguments: Arguments) -> dict[str, Any]:
-    """Numbers of each log, or in words why there are none."""
-    if arguments.logs is None:
-        return {"skipped": "no folder is given (--logs)"}
+def _logs(arguments: Arguments, folder: Path) -> dict[str, Any]:
+    """Numbers of each log in the folder."""
     result: dict[str, Any] = {}
-    for name, path in logs_below(arguments.logs).items():
+    for name, path in tqdm(logs_below(folder).items(), desc="logs", unit="log"):
         cache = arguments.runs / "scan" / "relocalisation" / f"{name}.json"
         identity = f"{log_identity(path)} {_log_code()} {arguments.log_starts}"
         stored = json.loads(cache.read_text()) if cache.exists() else {}
         if stored.get("identity") != identity:
-            found = list(log_starts(read_drive(path), arguments.weights / "scan", arguments.log_starts))
+            drive = read_drive(path)
+            starts_of_log = log_starts(drive, arguments.weights / "scan", arguments.log_starts)
+            found = list(tqdm(starts_of_log, desc=name, total=arguments.log_starts, unit="start"))
             stored = {"identity": identity, "numbers": summary_of(found)}
             cache.parent.mkdir(parents=True, exist_ok=True)
             write_at_once(cache, json.dumps(stored))
         result[name] = stored["numbers"]
-    return result or {"skipped": "the folder has none"}
+    return result
 
 
 def _log_code() -> str:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from tqdm import tqdm
 
+from ngo_common.files import written_whole
 from ngo_sim.policy_network import SHIPPED, PolicyConfig
 from training.common import runs
 from training.common.curves import write_at_once
@@ -146,9 +146,8 @@ class Progress(BaseCallback):
             "policy": self.model.policy.state_dict(),
             "optimizer": self.model.policy.optimizer.state_dict(),
         }
-        partial_file = self.folder / f"{CHECKPOINT}.partial"
-        torch.save(state, partial_file)
-        os.replace(partial_file, self.folder / CHECKPOINT)
+        with written_whole(self.folder / CHECKPOINT) as file:
+            torch.save(state, file)
 
     @property
     def wall_s(self) -> float:

@@ -1,15 +1,19 @@
-"""mode:=localization: a node that is switched on within a saved map finds its pose there, and says so until it has."""
+"""A node that is switched on within a saved map finds its pose there, and says so until it has.
+
+With mode:=localization the map stays as it is, with state_mode:=relocalise it grows from there.
+"""
 
 import dataclasses
 import signal
 from collections.abc import Iterator
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from ngo_msgs.msg import RelativePose
-from ngo_msgs.srv import Reset, SaveState
+from ngo_msgs.msg import RelativePose, Trajectory
+from ngo_msgs.srv import LoadState, Reset, SaveState
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.geometry.planar_motion import between, compose
@@ -27,16 +31,24 @@ START = 110
 
 
 @dataclasses.dataclass
-class Again:
-    """A node in localization mode, and the steps of a robot from ``START`` on, whose odometry begins there."""
+class Mapped:
+    """A saved session, and the steps of a robot from ``START`` on, whose odometry begins there."""
+
+    parameters: dict[str, Any]
+    frames: int
+    steps: list[RelativePose]
+    expected: np.ndarray
+    odom: np.ndarray
+
+
+@dataclasses.dataclass
+class Again(Mapped):
+    """The same, and a node in localization mode."""
 
     process: NodeProcess
     probe: Probe
     optimizer: Optimizer
-    steps: list[RelativePose]
     transforms: list[TFMessage]
-    expected: np.ndarray
-    odom: np.ndarray
 
 
 class Node(Optimizer):
@@ -47,33 +59,35 @@ class Node(Optimizer):
 
 
 @pytest.fixture(scope="module")
-def again(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Again]:
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
     drive = GoldenDrive.load("maze2d")
     steps = estimates(drive, LocalOdometry.load(WEIGHTS / "maze2d"))
-    folder, weights = tmp_path_factory.mktemp("states"), WEIGHTS / "maze2d"
+    folder = tmp_path_factory.mktemp("states")
     parameters: dict[str, Any] = {"world": "maze2d", "save_directory": str(folder), "diagnostics_period_s": 0.2}
+    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+        optimizer = Node(process, WEIGHTS / "maze2d", probe)
+        last = optimizer.pose_after(*(relative_pose_message(step, "base_link") for step in steps))
+        response = probe.call(SaveState, "ngo_node/save_state", SaveState.Request(path="maze"))
+        assert response.success, response.message
+        process.send(signal.SIGINT)
+        assert process.wait() == 0
+    begin = steps[START - 1]
+    later = [
+        dataclasses.replace(step, odom_xyyaw=between(begin.odom_xyyaw, step.odom_xyyaw), origin_stamp_ns=begin.stamp_ns)
+        for step in steps[START:]
+    ]
+    messages = [relative_pose_message(step, "base_link") for step in later]
+    return Mapped(parameters, len(steps) + 1, messages, _planar(last), later[-1].odom_xyyaw)
+
+
+@pytest.fixture(scope="module")
+def again(mapped: Mapped) -> Iterator[Again]:
+    parameters = {**mapped.parameters, "mode": "localization", "state": "maze"}
     with Probe() as probe:
-        with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
-            optimizer = Node(process, weights, probe)
-            mapped = optimizer.pose_after(*(relative_pose_message(step, "base_link") for step in steps))
-            response = probe.call(SaveState, "ngo_node/save_state", SaveState.Request(path="maze"))
-            assert response.success, response.message
-            process.send(signal.SIGINT)
-            assert process.wait() == 0
-        begin = steps[START - 1]
-        later = [
-            dataclasses.replace(
-                step, odom_xyyaw=between(begin.odom_xyyaw, step.odom_xyyaw), origin_stamp_ns=begin.stamp_ns
-            )
-            for step in steps[START:]
-        ]
-        messages = [relative_pose_message(step, "base_link") for step in later]
         transforms = probe.collect(TFMessage, "tf")
-        with NodeProcess(
-            "ngo_estimator", "ngo_node", {**parameters, "mode": "localization", "state": "maze"}
-        ) as process:
-            node = Node(process, weights, probe)
-            yield Again(process, probe, node, messages, transforms, _planar(mapped), later[-1].odom_xyyaw)
+        with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+            node = Node(process, WEIGHTS / "maze2d", probe)
+            yield Again(**vars(mapped), process=process, probe=probe, optimizer=node, transforms=transforms)
             process.send(signal.SIGINT)
             assert process.wait() == 0, process.log
             assert "Traceback" not in process.log, process.log
@@ -82,6 +96,40 @@ def again(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Again]:
 def _planar(message: PoseWithCovarianceStamped) -> np.ndarray:
     pose = message.pose.pose
     return np.array((pose.position.x, pose.position.y, 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)))
+
+
+def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mapped) -> None:
+    """Nothing is published until the robot is found; then one map holds both drives."""
+    later, frames = [_later(message) for message in mapped.steps], mapped.frames
+    parameters = {**mapped.parameters, "state": "maze", "state_mode": "relocalise", "path_rate_hz": 0.0}
+    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+        node = Node(process, WEIGHTS / "maze2d", probe)
+        transforms = probe.collect(TFMessage, "tf")
+        trajectories: list[Trajectory] = probe.collect(Trajectory, "ngo/trajectory")
+        node.publish(mapped.steps[0])
+        process.wait_for_log("dropped relative pose: .*expected later stamps")
+        node.publish(*later[:3])
+        node.wait_for_problem("not localised: ", "support")
+        assert not transforms and not node.poses
+        node.publish(*later[3:])
+        assert _planar(node.wait_for_stamp(_stamp_ns(later[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        process.wait_for_log("localised: several frames agree")
+        process.wait_for_log("the loaded map grows from here")
+        both = frames + len(node.poses)
+        probe.spin_until(lambda: trajectories and len(trajectories[-1].stamps_ns) == both, "both drives in one map")
+        assert len(transforms) == len(node.poses) < len(later)
+        assert node.wait_for_value("frames", bool) == str(both)
+        # The same while the node runs; and a reset begins a new map.
+        load = LoadState.Request(path="maze", mode=LoadState.Request.RELOCALISE)
+        response = probe.call(LoadState, "ngo_node/load_state", load)
+        assert response.success and response.message.startswith(f"loaded {frames} poses from "), response
+        node.wait_for_problem("not localised: no hypothesis yet")
+        assert probe.call(Reset, "ngo_node/reset", Reset.Request()).message == f"forgot {frames} poses"
+        node.publish(later[0])
+        assert np.hypot(*_planar(node.wait_for_stamp(_stamp_ns(later[0])))[:2]) < 0.5
+        process.send(signal.SIGINT)
+        assert process.wait() == 0, process.log
+        assert "Traceback" not in process.log, process.log
 
 
 def test_a_robot_says_that_it_is_not_localised_until_its_pose_is_known_and_right(again: Again) -> None:
@@ -123,6 +171,14 @@ def test_a_localization_without_a_map_is_one_line_and_exit_code_2() -> None:
     with NodeProcess("ngo_estimator", "ngo_node", {"mode": "localization"}) as process:
         assert process.wait() == 2, process.log
         assert len(process.lines) == 1 and "parameter 'state' is ''" in process.lines[0], process.log
+
+
+def _later(message: RelativePose) -> RelativePose:
+    """The same message an hour later."""
+    moved = deepcopy(message)
+    for stamp in (moved.header.stamp, moved.from_stamp, moved.origin_stamp):
+        stamp.sec += 3600
+    return moved
 
 
 def _stamp_ns(message: RelativePose) -> int:

@@ -156,7 +156,6 @@ def test_what_cannot_be_loaded_or_saved_is_one_line_and_changes_nothing(
         ("damaged", 0): "is damaged",
         ("nothing", 0): "No such file",
         ("../office", 0): "expected a folder in",
-        ("office", LoadState.Request.RELOCALISE): "which this version does not have; expected CONTINUE",
         ("office", 7): "mode is 7; expected 0 (CONTINUE) or 1 (RELOCALISE)",
     }
     for arguments, reason in refused.items():

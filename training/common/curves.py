@@ -13,6 +13,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from ngo_common.files import write_whole
+
 Batch = dict[str, Tensor]
 
 _SAMPLE_S = 5.0  # the memory of other processes is asked for this often: it costs milliseconds
@@ -138,6 +140,4 @@ def _kilobytes(path: str, field: str) -> int:
 def write_at_once(path: Path, text: str) -> None:
     """Write a file so that whoever reads it sees all of it or none, in a folder that is made for it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
+    write_whole(path, text)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
+from ngo_common.files import write_together
 from ngo_sim.policy_network import FORMAT, MIRRORED_SENSES, MIRRORED_SIGNS, NETWORK, SENSES, PolicyConfig
-from training.common.curves import write_at_once
 
 
 class Features(BaseFeaturesExtractor):
@@ -100,8 +99,5 @@ def export(path: Path, state: dict[str, Tensor], config: PolicyConfig, details: 
         **details,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial_file = path.with_name(path.name + ".partial")
-    partial_file.write_bytes(weights)
-    os.replace(partial_file, path)
-    write_at_once(path.with_suffix(".json"), json.dumps(description, indent=2) + "\n")
+    write_together({path: weights, path.with_suffix(".json"): json.dumps(description, indent=2) + "\n"})
     return description

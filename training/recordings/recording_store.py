@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
 import shutil
 from collections import Counter
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from tqdm import tqdm
 
+from ngo_common.files import write_whole
 from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.observations import observation
@@ -86,9 +86,7 @@ def make_store(
             described.append(values)
         assert image is not None
         content = {"identity": identity, "image": dataclasses.asdict(image), "recordings": described}
-        partial = index.with_name(f"{_INDEX}.{os.getpid()}")
-        partial.write_text(json.dumps(content, indent=1) + "\n")
-        partial.replace(index)
+        write_whole(index, json.dumps(content, indent=1) + "\n")
     content = json.loads(index.read_text())
     image = config_from_dict(ImageFormat, content["image"])
     recordings = [_open(folder / str(n), image, values) for n, values in enumerate(content["recordings"])]

@@ -1,9 +1,7 @@
 """The errors of a row's trajectories on every prefix, kept on disk so that nothing is computed twice."""
 
-import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ import numpy as np
 
 import ngo_estimator
 import training
+from ngo_common.files import written_whole
 from training.data.worlds import World
 from training.scoring.row_estimators import Arrays, Estimator, prefix
 from training.scoring.scores import scores
@@ -82,11 +81,6 @@ def _read(cache: Path, identity: str) -> Evaluation | None:
 
 def _write(cache: Path, identity: str, evaluation: Evaluation) -> None:
     cache.parent.mkdir(parents=True, exist_ok=True)
-    partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
     columns = {f"{length}:{name}": v for length, values in evaluation.scores.items() for name, v in values.items()}
-    try:
-        np.savez(partial, identity=np.array(identity), poses=evaluation.poses, **columns)  # type: ignore[arg-type]
-        os.replace(partial, cache)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            partial.unlink()
+    with written_whole(cache) as file:
+        np.savez(file, identity=np.array(identity), poses=evaluation.poses, **columns)  # type: ignore[arg-type]

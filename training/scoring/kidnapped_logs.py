@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,13 +34,14 @@ class LogStart:
     """A start: whether its first 10 m lie where the map does, and what came out.
 
     ``claimed`` says whether a pose was claimed within ``WAY_M``, ``right`` whether the first one was, ``way_m`` after
-    how much way.
+    how much way. ``processor_s_per_m`` is the localiser's time up to then.
     """
 
     mapped: bool
     claimed: bool
     right: bool
     way_m: float
+    processor_s_per_m: float
 
 
 def log_starts(drive: LidarDrive, weights: Path, count: int) -> Iterator[LogStart]:
@@ -79,6 +81,7 @@ def summary_of(starts: list[LogStart]) -> dict[str, Any]:
             "right": len(ways),
             "false_claims": sum(start.claimed and not start.right for start in some),
             "way_to_success_m": float(np.median(ways)) if ways else None,
+            "processor_s_per_m": float(np.mean([start.processor_s_per_m for start in some])) if some else None,
         }
     return result
 
@@ -87,13 +90,19 @@ def _start(
     localiser: Localiser, errors: MapErrors, steps: list[LidarStep], way_m: np.ndarray, start: int, mapped: bool
 ) -> LogStart:
     localiser.reset()
+    began, gone_m = time.process_time(), 0.0
     for number in range(start, len(steps)):
-        gone_m = float(way_m[number + 1] - way_m[start])
-        if gone_m > WAY_M:
+        if way_m[number + 1] - way_m[start] > WAY_M:
             break
+        gone_m = float(way_m[number + 1] - way_m[start])
         step = steps[number]
         pose = localiser.update(step, step.relative_xyyaw, step.covariance).pose_xyyaw
         if pose is not None:
             metres, degrees = errors.of(number + 1, pose)
-            return LogStart(mapped, True, metres <= MOST_M and degrees <= MOST_DEG, gone_m)
-    return LogStart(mapped, False, False, math.nan)
+            right = metres <= MOST_M and degrees <= MOST_DEG
+            return LogStart(mapped, True, right, gone_m, _per_m(began, gone_m))
+    return LogStart(mapped, False, False, math.nan, _per_m(began, gone_m))
+
+
+def _per_m(began_s: float, gone_m: float) -> float:
+    return (time.process_time() - began_s) / max(gone_m, 1.0)

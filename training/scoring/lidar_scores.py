@@ -1,9 +1,7 @@
 """The errors of a lidar's rows on drives, kept on disk so that nothing is computed twice."""
 
-import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
+from ngo_common.files import written_whole
 from training.baselines.mrpt_slam import MrptError
 from training.data import lidar_drives
 from training.data.lidar_drives import LidarDrive, TruePoses
@@ -140,12 +139,7 @@ def _read(cache: Path, identity: str) -> Scored | None:
 
 def _write(cache: Path, identity: str, scored: Scored) -> None:
     cache.parent.mkdir(parents=True, exist_ok=True)
-    partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
     errors = {f"error:{name}": values for name, values in scored.errors.items()}
     drawn = {name: getattr(scored, name).astype(np.float32) for name in ("path", "walls", "truth")}
-    try:
-        np.savez(partial, identity=np.array(identity), failed=np.array(scored.failed), **drawn, **errors)  # type: ignore[arg-type]
-        os.replace(partial, cache)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            partial.unlink()
+    with written_whole(cache) as file:
+        np.savez(file, identity=np.array(identity), failed=np.array(scored.failed), **drawn, **errors)  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ngo_common.files import folder_whole, read_file, written_whole
+from ngo_common.files import folder_whole, read_file, write_together, write_whole, written_whole
 
 
 def test_only_files_are_read(tmp_path: Path) -> None:
@@ -49,3 +49,23 @@ def test_a_folder_comes_whole_or_stays_as_it_was(tmp_path: Path, there: bool) ->
         (folder / "part2" / "two").write_text("new")
     assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*")) == ["one", "part2", "part2/two"]
     assert (out / "one").read_text() == "new"
+
+
+@pytest.mark.parametrize("content", ["text", b"text", [b"te", b"xt"]])
+def test_files_come_together_or_stay_as_they_were(
+    tmp_path: Path, content: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert write_together({one: content, two: content}) == [one, two]
+    assert one.read_text() == two.read_text() == "text" and one.stat().st_mode & 0o777 == 0o644
+    two.unlink(), two.mkdir()
+    with pytest.raises(IsADirectoryError, match=str(two)):
+        write_together({one: "other", two: "other"})
+    monkeypatch.setattr(os, "fsync", _full)
+    with pytest.raises(OSError, match=f"No space left on device: '{one}'"):
+        write_whole(one, "other")
+    assert one.read_text() == "text" and sorted(tmp_path.iterdir()) == [one, two]
+
+
+def _full(_: int) -> None:
+    raise OSError(28, "No space left on device")

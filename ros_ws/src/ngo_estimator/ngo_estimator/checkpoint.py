@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +11,7 @@ import safetensors
 from safetensors.torch import load, save
 from torch import nn
 
-from ngo_common.files import read_file
+from ngo_common.files import read_file, write_together
 from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
@@ -81,14 +80,7 @@ def save_checkpoint(
         **details,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    _write_at_once(path, weights)
-    _write_at_once(path.with_suffix(".json"), (json.dumps(description, indent=2) + "\n").encode())
-
-
-def _write_at_once(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    write_together({path: weights, path.with_suffix(".json"): json.dumps(description, indent=2) + "\n"})
 
 
 def load_description(path: Path, kind: str, world: str | None = None) -> dict[str, Any]:

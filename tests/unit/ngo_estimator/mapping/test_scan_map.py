@@ -150,6 +150,18 @@ def test_a_source_that_starts_anew_begins_a_new_map(origin_ns: int) -> None:
     np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(10)), path(0.02)))
 
 
+def test_the_map_goes_on_where_a_trajectory_goes_on_with_another_odometry() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(20))
+    scan_map.update(stamps(20), path(0.01, 20))
+    take(scan_map, range(20, 40), origin_ns=2)  # the robot is found at frame 30
+    both = np.append(stamps(20), stamps(10, first=30)), np.concatenate((path(0.01, 20), path(0.01)[30:40]))
+    assert not scan_map.update(*both).restarted
+    frames = [*range(20), *range(30, 40)]
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(frames, path(0.01)))
+    assert scan_map.waiting == 10
+
+
 def test_a_trajectory_that_begins_later_begins_a_new_map() -> None:
     scan_map = ScanMap(EVERY)
     take(scan_map, range(FRAMES))

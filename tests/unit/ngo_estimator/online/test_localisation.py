@@ -22,6 +22,7 @@ class Map:
     """A map that sees the robot where it truly is, and also where ``copies`` (n, 3) of the map say."""
 
     place_m = 1.0
+    search_every = 1
 
     def __init__(self, copies: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),), seed: int = 0) -> None:
         self.copies, self.pose, self.blind = [np.array(copy) for copy in copies], np.zeros(3), False

@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from ngo_estimator.data.whole_files import write_together
+from ngo_common.files import write_together
 from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 
 FORMATS = ("pgm", "png")

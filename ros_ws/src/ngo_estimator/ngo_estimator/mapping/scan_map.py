@@ -102,7 +102,7 @@ class ScanMap:
         if self._source is not None:
             origin, newest = self._source
             started = origin != step.origin_stamp_ns or step.stamp_ns <= newest - RESTART_AFTER_NS
-            self._run += started
+            self._run += started and step.stamp_ns <= newest  # later stamps cannot be taken for earlier ones
             self._last_odom = None if started else self._last_odom
         self._source = step.origin_stamp_ns, step.stamp_ns
         scans = list(scans)

@@ -7,6 +7,9 @@ from torch import Tensor, nn
 
 from ngo_estimator.geometry import se2
 
+_LARGEST_INPUT = 10.0
+"""Steps of more ``relative_std``, as where frames were lost or nobody saw the motion, look as if they had so many."""
+
 
 @dataclass(frozen=True)
 class PoseAggregationConfig:
@@ -64,8 +67,8 @@ class PoseAggregation(nn.Module):
             log_std: logarithm of their standard deviations ``(batch, steps, 3)``.
             motion_features: ``(batch, steps, motion_feature_size)``.
         """
-        scaled = relative / self.relative_std
-        certainty = log_std - self.relative_std.log()
+        scaled = (relative / self.relative_std).clamp(-_LARGEST_INPUT, _LARGEST_INPUT)
+        certainty = (log_std - self.relative_std.log()).clamp(-_LARGEST_INPUT, _LARGEST_INPUT)
         return self.layers(torch.cat((motion_features, scaled, certainty), dim=-1).mT).mT
 
 
@@ -96,7 +99,7 @@ def block_variances(in_blocks: Tensor, log_std: Tensor) -> Tensor:
     return torch.stack((x, y, heading), dim=-1).sum(-2)
 
 
-def in_block_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
+def in_block_poses(in_blocks: Tensor, meta_relative: Tensor, share: Tensor | None = None) -> Tensor:
     """Poses within blocks ``(batch, blocks, block, 3)`` under corrected relative meta-poses.
 
     A block's correction is spread evenly over its steps, so that the trajectory stays continuous.
@@ -104,11 +107,13 @@ def in_block_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
     Args:
         in_blocks: uncorrected poses within blocks ``(batch, blocks, block, 3)``.
         meta_relative: corrected relative meta-poses ``(batch, blocks, 3)``.
+        share: of the correction in that of each step ``(blocks, block)``, where it is not spread evenly.
     """
     block = in_blocks.shape[2]
     correction = se2.wrapped(meta_relative - in_blocks[..., -1, :])
-    share = torch.arange(1, block + 1, dtype=in_blocks.dtype, device=in_blocks.device) / block
-    return in_blocks + share[:, None] * correction.unsqueeze(-2)
+    if share is None:
+        share = torch.arange(1, block + 1, dtype=in_blocks.dtype, device=in_blocks.device) / block
+    return in_blocks + share[..., None] * correction.unsqueeze(-2)
 
 
 def frame_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:

@@ -160,6 +160,12 @@ class NgoNodeSettings(EstimatorSettings):
         "directory of the node.",
     )
     state: str = setting("", "Folder of a saved state to go on from, relative to save_directory; empty: none.")
+    state_mode: str = setting(
+        "continue",
+        "continue: the odometry that was saved goes on. relocalise: another one begins; the robot is looked for in the "
+        "map of state, and the map grows on from where it is found.",
+        choices=("continue", "relocalise"),
+    )
     mode: str = setting(
         "mapping",
         "mapping: the map grows with every relative pose. localization: the map in state stays as it is, and the "
@@ -206,8 +212,11 @@ class NgoNodeSettings(EstimatorSettings):
         super().__post_init__()
         if self.map_frame == self.odom_frame:
             raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
-        if self.mode == "localization" and not self.state:
-            raise BadParameter("parameter 'state' is ''; allowed: the folder of a saved state, with mode localization")
+        for name, value in (("mode", "localization"), ("state_mode", "relocalise")):
+            if getattr(self, name) == value and not self.state:
+                raise BadParameter(
+                    f"parameter 'state' is ''; allowed: the folder of a saved state, with {name} {value}"
+                )
         if self.relative_pose_depth < self.window_frames:
             raise BadParameter(
                 f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; "

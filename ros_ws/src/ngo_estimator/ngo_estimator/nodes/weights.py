@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from ament_index_python.packages import get_package_share_directory
 
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.lidar_file import is_lidar
-from ngo_estimator.nodes.settings import EstimatorSettings, StepSettings
+from ngo_estimator.nodes.settings import EstimatorSettings, NgoNodeSettings, StepSettings
+
+if TYPE_CHECKING:
+    from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 
 Core = TypeVar("Core")
 
@@ -32,3 +35,21 @@ def load_core(load: Callable[[Path, str], Core], settings: EstimatorSettings) ->
         return load(folder, settings.world)
     except ValueError as error:
         raise StartError(str(error)) from error
+
+
+def load_trajectory(settings: NgoNodeSettings) -> "CorrectedTrajectory":
+    """An empty trajectory with the weights that ``settings`` name; raises ``StartError`` where they cannot be used."""
+    # Imported here because torch takes seconds: a bad parameter is said at once.
+    from ngo_estimator.offline.warm_up import warm_up
+    from ngo_estimator.online.online_trajectory import OnlineTrajectory
+    from ngo_estimator.online.scan_trajectory import ScanTrajectory
+
+    def load(folder: Path, world: str) -> "CorrectedTrajectory":
+        if is_lidar(folder):
+            warm_up()
+            return ScanTrajectory.load(folder, world, settings.iterations_per_step)
+        return OnlineTrajectory.load(
+            folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
+        )
+
+    return load_core(load, settings)

@@ -12,6 +12,7 @@ from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
 from ngo_estimator.geometry import se2
+from ngo_estimator.online.bridge import bridged
 from ngo_estimator.online.map_localisation import MapLocalisation
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.step_log import StepLog, TakenStep
@@ -262,9 +263,39 @@ class CorrectedTrajectory(ABC):
                 "the loaded trajectory; expected the odometry of that one to go on, or a reset"
             )
         taken = self._log.take(step)
-        self._loaded = False
         if taken.restarted:
             self._begin()
+        return self._take(step, taken, optimize)
+
+    def join(self, step: RelativeStep, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
+        """Go on with another odometry, from the frame that ``step`` ends at.
+
+        Nobody knows the motion since the newest frame. A step to the pose that was found stands for it, and loops
+        refine it later.
+
+        Args:
+            pose_xyyaw: ``(3,)`` of the frame as this trajectory has it, before it is laid into ``map``; covariance:
+                ``(3, 3)`` of it.
+
+        Raises:
+            RejectedStep: as of ``update``; the stamp is not later than the newest one, or ``may_join`` is false.
+        """
+        step = self._checked(step)
+        if not self.may_join(step):
+            raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
+        relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
+        return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
+
+    def may_join(self, step: RelativeStep) -> bool:
+        """Whether the trajectory can go on with another odometry from this step's frame."""
+        return self._log.steps > 0
+
+    def check_later(self, step: RelativeStep) -> None:
+        """Raise ``RejectedStep`` if a step of another odometry is not later than the newest frame."""
+        self._log.check_later(step)
+
+    def _take(self, step: RelativeStep, taken: TakenStep, optimize: bool) -> TrajectoryUpdate:
+        self._loaded = False
         if taken.begins:
             self._begin_at(step)
             self._online.append(np.zeros(3))

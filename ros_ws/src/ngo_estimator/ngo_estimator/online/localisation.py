@@ -104,6 +104,7 @@ class Localiser:
         self._window.clear()
         self._odometry = np.zeros(3)
         self._way_m = self._turn_rad = math.inf  # since the last look
+        self._looks_since = 0  # the whole map was asked
         self._track: tuple[np.ndarray, np.ndarray] | None = None
         self._modes: tuple[Mode, ...] = ()
 
@@ -139,6 +140,11 @@ class Localiser:
     def _look(self) -> None:
         """Compare the newest frame with the map, and weigh what the window says."""
         self._way_m = self._turn_rad = 0.0
+        self._looks_since += 1
+        if self._track is not None and self._looks_since < self._matcher.search_every:
+            self._correct(Sightings.none())
+            return
+        self._looks_since = 0
         self._window.add(self._matcher.everywhere())
         hypotheses, place_m = self._window.hypotheses(), self._matcher.place_m
         self._modes = strongest_modes(hypotheses, place_m)
@@ -152,13 +158,13 @@ class Localiser:
         if self._contradicted(hypotheses, agree):
             self._track = None
             return
-        self._correct(hypotheses.where(hypotheses.look == len(self._window) - 1))
+        newest = hypotheses.where(hypotheses.look == len(self._window) - 1)
+        self._correct(Sightings(newest.poses, newest.covariance, newest.belief))
 
-    def _correct(self, newest: Hypotheses) -> None:
+    def _correct(self, newest: Sightings) -> None:
         """Fuse the track with what agrees with it, of the newest look and of the map around."""
         assert self._track is not None
-        near = self._matcher.around(self._track[0])
-        both = Sightings(newest.poses, newest.covariance, newest.belief).and_also(near)
+        both = newest.and_also(self._matcher.around(self._track[0]))
         seen = Hypotheses(both.poses, both.covariance, both.belief, np.zeros(len(both), np.int64))
         seen = seen.where(agreeing(seen, *self._track, self._matcher.place_m))
         if len(seen.look):

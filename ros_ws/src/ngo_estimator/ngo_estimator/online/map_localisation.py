@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,19 +13,24 @@ from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.online.localisation import Localisation, Localiser
 from ngo_estimator.online.step_log import StepLog
 
+if TYPE_CHECKING:
+    from ngo_estimator.online.corrected_trajectory import TrajectoryUpdate
+
 
 @dataclass(frozen=True)
 class LocalisedStep:
     """What a step told.
 
     ``found`` is what is known of the pose after it, ``map_from_odom_xyyaw`` (3,) goes with a pose that is known, None
-    otherwise. ``restarted``: the odometry began anew, ``gap``: steps before this one were lost.
+    otherwise. ``restarted``: the odometry began anew, ``gap``: steps before this one were lost. ``joined`` is what it
+    changed in a trajectory that goes on from here, None where the map stays as it is.
     """
 
     found: Localisation
     map_from_odom_xyyaw: np.ndarray | None
     restarted: bool
     gap: bool
+    joined: "TrajectoryUpdate | None" = None
 
 
 class MapLocalisation:

@@ -7,6 +7,7 @@ import torch
 
 from ngo_estimator.data.state_arrays import Arrays, taken
 from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import turned_covariance
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,12 @@ class MapOrigin:
             return poses_xyyaw
         origin = torch.from_numpy(self.map_from_start_xyyaw)
         return np.asarray(se2.compose(origin, torch.tensor(poses_xyyaw)).numpy())
+
+    def own(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A pose ``(3,)`` in ``map``, and its covariance ``(3, 3)`` along its axes, as the trajectory has both."""
+        origin = torch.from_numpy(self.map_from_start_xyyaw)
+        own = se2.compose(se2.inverse(origin), torch.tensor(pose_xyyaw)).numpy()
+        return own, turned_covariance(-float(origin[2]), covariance)
 
     def covariance_of(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Covariance ``(3, 3)`` in ``map`` of a pose ``(3,)`` in ``map``, with that in the trajectory's own frame.

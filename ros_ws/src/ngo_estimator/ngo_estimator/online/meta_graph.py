@@ -102,6 +102,7 @@ class MetaGraph:
         self.took_s = 0.0
         """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
         self._active, self._before = np.zeros(0, np.int64), np.zeros((0, 3))
+        self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on
 
     @property
     def blocks(self) -> int:
@@ -123,14 +124,21 @@ class MetaGraph:
         """Take the place code of the first frame, where it is known, before the first step."""
         self._origin_code = origin_code
 
-    def append(self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, code: np.ndarray) -> bool:
-        """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block."""
+    def append(
+        self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, code: np.ndarray, joins: bool = False
+    ) -> bool:
+        """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block.
+
+        With ``joins`` the step is where another odometry goes on, in another place.
+        """
         self.optimized, self.fault = False, ""
         log_std = 0.5 * np.log(variance)
         self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
         self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
         last = torch.from_numpy(self.odometry.values[-1])
         self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        if joins:
+            self._joins.append(len(self.odometry) - 1)
         self._relative.append(relative)
         self._log_std.append(log_std)
         self._motion.append(motion)
@@ -191,6 +199,8 @@ class MetaGraph:
         """Measure the newest block again, which begins with the step of number ``first``."""
         if self._loops is None or self._pair_head is None or self._registrations == 0:
             return
+        if self._joins.values[-1:].max(initial=0) > first:
+            return  # its frames were seen from two places
         before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
         origin_code = None if before is None else torch.from_numpy(before).unsqueeze(0)
         rows = self._relative.slice(first), self._log_std.slice(first), self._loops.codes(first)
@@ -377,10 +387,23 @@ class MetaGraph:
         whole = (len(nodes) - 1) * self._block
         in_blocks = se2.between(starts[:-1], odometry[1 : whole + 1].unflatten(0, (-1, self._block))).unsqueeze(0)
         steps = se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
-        corrected = se2.compose(nodes[:-1].unsqueeze(1), in_block_poses(in_blocks, steps)[0]).flatten(0, 1)
+        in_blocks = in_block_poses(in_blocks, steps, self._shares())
+        corrected = se2.compose(nodes[:-1].unsqueeze(1), in_blocks[0]).flatten(0, 1)
         tail = se2.compose(nodes[-1:], se2.between(starts[-1], odometry[whole + 1 :]))
         poses: np.ndarray = torch.cat((nodes[:1], corrected, tail)).numpy()
         return poses
+
+    def _shares(self) -> torch.Tensor | None:
+        """The share of a block's correction in that of each of its frames ``(blocks, block)``; None: evenly spread."""
+        joins = self._joins.values[self._joins.values <= self.blocks * self._block]
+        if len(joins) == 0:
+            return None
+        frames = torch.arange(1, self._block + 1, dtype=torch.float64)
+        shares = (frames / self._block).expand(self.blocks, -1).clone()
+        for frame in joins.tolist():  # the motion that nobody saw is the one that is corrected
+            block = (frame - 1) // self._block
+            shares[block] = (frames >= frame - block * self._block).double()
+        return shares
 
     def places(self) -> PlaceMap:
         """The frames whose place codes are kept; raises ``ValueError`` where none are."""
@@ -430,6 +453,7 @@ class MetaGraph:
             "loop_relative": self.loop_relative,
             "loop_std": self.loop_std,
             "loop_weights": self.loop_weights,
+            "joins": self._joins.values,
             "origin_code": np.zeros(0, np.float32) if code is None else code,
             "iterations": np.array(done),
             **under("keys", self._keys.state()),
@@ -466,6 +490,7 @@ class MetaGraph:
         self.loop_frames = taken(arrays, "loop_frames", np.int64, -1, 2)
         for name, shape in (("loop_relative", (3,)), ("loop_std", (3,)), ("loop_weights", ())):
             setattr(self, name, taken(arrays, name, np.float64, len(self.loop_frames), *shape))
+        self._joins.restore(arrays, "joins")
         code = taken(arrays, "origin_code", np.float32, -1)
         self._origin_code = code if len(code) else None
         information = part(arrays, "information")
@@ -492,6 +517,7 @@ class MetaGraph:
             0 <= self._result_first <= self._result_last <= blocks
             and self._first == (self._keys.nodes[-1] + 1 if len(self._keys) else 0)
             and len(self._kept) <= len(self._keys)
-            and bool((self.loop_frames >= 0).all() and (self.loop_frames <= frames).all()),
+            and bool((self.loop_frames >= 0).all() and (self.loop_frames <= frames).all())
+            and bool((self._joins.values > 0).all() and (self._joins.values <= frames).all()),
             "nodes or key frames are named that are not there",
         )

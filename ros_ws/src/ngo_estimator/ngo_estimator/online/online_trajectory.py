@@ -135,7 +135,7 @@ class OnlineTrajectory(CorrectedTrajectory):
     def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
         code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
         variance = np.clip(np.diagonal(taken.covariance), *_VARIANCES)
-        return self._graph.append(taken.relative, variance, step.motion_feature, code)
+        return self._graph.append(taken.relative, variance, step.motion_feature, code, taken.joins)
 
     def localisation(self, origin: MapOrigin) -> MapLocalisation:
         """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says.

@@ -48,6 +48,7 @@ class PlaceMatcher:
             raise ValueError(
                 f"place codes of the map have {places.codes.shape[1]} numbers; expected {pair_head.config.code_length}"
             )
+        self.search_every = 1
         self.place_m = pair_head.config.offset_scale_m
         self._pair_head, self._search, self._candidates = pair_head, search, candidates
         self._poses = torch.from_numpy(places.poses.astype(np.float64))

@@ -6,7 +6,6 @@ folder stays whole.
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,10 @@ from typing import Any
 import safetensors
 from safetensors.numpy import load, save
 
+from ngo_common.files import PARTIAL, sync_names, write_whole
 from ngo_estimator.data.state_arrays import Arrays, StateError
 
-FORMAT = 1
+FORMAT = 2
 DESCRIPTION = "state.json"
 _KEYS = {"format", "identity", "arrays", "arrays_sha256", "sha256"}
 
@@ -39,8 +39,8 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
         folder.mkdir(exist_ok=True)
         try:
             if name not in old:
-                _put(folder / name, content)
-            _put(folder / DESCRIPTION, _text(description).encode())
+                write_whole(folder / name, content)
+            write_whole(folder / DESCRIPTION, _text(description))
         except OSError:
             if name not in old:
                 (folder / name).unlink(missing_ok=True)
@@ -49,7 +49,7 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
             raise
         for leftover in old - {name, DESCRIPTION}:
             (folder / leftover).unlink(missing_ok=True)
-        _sync(folder.parent)
+        sync_names(folder.parent)
     except OSError as error:
         raise StateError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
 
@@ -82,34 +82,13 @@ def _files_of_a_state(folder: Path) -> set[str]:
         raise StateError(f"{folder}: is a file; expected a folder, or nothing")
     names = {path.name for path in folder.iterdir()}
     for name in sorted(names):
-        whole = name.removesuffix(".partial")
+        if name.endswith(PARTIAL):  # of a crash
+            whole = name.removeprefix(".").removesuffix(PARTIAL).rpartition(".")[0]
+        else:
+            whole = name
         if whole != DESCRIPTION and not (whole.startswith("arrays-") and whole.endswith(".safetensors")):
             raise StateError(f"{folder}: holds '{name}'; expected a saved state, an empty folder or none")
     return names
-
-
-def _put(path: Path, content: bytes) -> None:
-    """Write a file, durably, and give it its name when it is whole."""
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    _sync(path.parent)
-
-
-def _sync(folder: Path) -> None:
-    """Make names in a folder durable."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _text(description: Mapping[str, Any]) -> str:

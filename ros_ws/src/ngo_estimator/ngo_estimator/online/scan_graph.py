@@ -87,6 +87,7 @@ class ScanGraph:
         self._left = 0
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
         self._before = np.zeros((1, 3))
+        self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on, nodes all of them
         self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
         self.loop_weights = np.zeros(0)
         """Of the loops in the last optimisation ``(loops,)``, zero to one."""
@@ -120,11 +121,18 @@ class ScanGraph:
         self._nodes.append(np.zeros(3))
         self._key_stamp_ns = step.from_stamp_ns
 
-    def append(self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None) -> bool:
-        """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise."""
+    def append(
+        self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None, joins: bool = False
+    ) -> bool:
+        """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise.
+
+        With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place.
+        """
         self.optimized, self.fault = False, ""
         last = torch.from_numpy(self.odometry.values[-1])
         self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        if joins:
+            self._joins.append(len(self.odometry) - 1)
         since = self._since_key()
         self._since = propagate(self._since, since, relative, covariance)
         if key is None:
@@ -134,7 +142,7 @@ class ScanGraph:
                 self.advance(self._left)
             except Exception as error:  # it may cost an optimisation, and nothing else
                 self.fail(error)
-        known = key.from_key_stamp_ns == self._key_stamp_ns
+        known = key.from_key_stamp_ns == self._key_stamp_ns and not joins
         # Registration in the same key scans: errors of the steps between do not add up.
         if known:
             covariance = bounded(key.covariance)
@@ -306,6 +314,8 @@ class ScanGraph:
         length = torch.ones(len(nodes), dtype=torch.float64)
         length[:-1] = torch.from_numpy(np.diff(at).astype(np.float64))
         share = (torch.arange(len(odometry), dtype=torch.float64) - first) / length[segment]
+        ends_at = np.append(at[1:], -1)  # the motion that nobody saw is the one that is corrected
+        share[torch.from_numpy(np.isin(ends_at, self._joins.values))[segment]] = 0.0
         poses: np.ndarray = se2.compose(starts[segment], within + share.unsqueeze(-1) * bent[segment]).numpy()
         return poses
 
@@ -321,6 +331,7 @@ class ScanGraph:
         return {
             "odometry": self.odometry,
             "frames": self._frames,
+            "joins": self._joins,
             "nodes": self._nodes,
             "steps": self._steps,
             "step_covariance": self._step_covariance,
@@ -377,7 +388,8 @@ class ScanGraph:
         require(
             bool(ordered)
             and 1 <= len(self._before) <= keys
-            and bool(((self._loop_rows >= 0) & (self._loop_rows < found)).all()),
+            and bool(((self._loop_rows >= 0) & (self._loop_rows < found)).all())
+            and bool(np.isin(self._joins.values, frames[1:]).all()),
             "frames, nodes or loops are named that are not there",
         )
 

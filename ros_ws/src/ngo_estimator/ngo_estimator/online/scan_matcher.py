@@ -18,6 +18,7 @@ from ngo_estimator.optimizer.scan_loops import ScanLoopFinder
 from ngo_estimator.optimizer.walls_seen_through import PlacedScans
 
 _MARGIN_M = 2.0  # around the key scans of the map, where the robot may be
+_SEARCHED = 150  # points in the whole map; a pose that fits is verified with more of them
 _AROUND = np.array((1.0, 1.0, math.radians(15.0)))  # of a pose that is verified
 
 
@@ -30,6 +31,7 @@ class ScanMatcher:
     """
 
     place_m = 1.0
+    search_every = 4
 
     def __init__(self, scans: Sequence[KeyScan], poses: np.ndarray, finder: ScanLoopFinder) -> None:
         points = [transformed(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)]
@@ -61,6 +63,7 @@ class ScanMatcher:
         """Hypotheses of the newest frame's pose, wherever it may be: the best one, and the best well apart from it."""
         source = self._source()
         points = self._finder.search_points(source)
+        points = points[:: max(1, round(len(points) / _SEARCHED))]
         match = None if len(points) == 0 else search(self._search, self._grid, points, self._centre, self._window)
         if match is None:
             return Sightings.none()

@@ -62,7 +62,11 @@ class ScanTrajectory(CorrectedTrajectory):
         self._graph.begin_at(step)
 
     def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
-        return self._graph.append(taken.relative, bounded(taken.covariance), step.key)
+        return self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins)
+
+    def may_join(self, step: RelativeStep) -> bool:
+        """Whether the trajectory can go on with another odometry from this step's frame, which needs a key scan."""
+        return super().may_join(step) and step.key is not None
 
     def localisation(self, origin: MapOrigin) -> MapLocalisation:
         """Localisation in the key scans as they are, which lie in ``map`` as ``origin`` says.

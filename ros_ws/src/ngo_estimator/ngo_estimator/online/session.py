@@ -7,6 +7,8 @@ import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, part, under
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.online.joining import Joining
+from ngo_estimator.online.map_localisation import MapLocalisation
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.saved_state import read_state, write_state
 from ngo_estimator.online.tf_smoothing import SmoothedCorrection
@@ -43,3 +45,11 @@ class Session:
             MapOrigin.from_state(part(arrays, "origin")),
             self.smoothing.restored(part(arrays, "smoothing")),
         )
+
+    def localisation(self) -> MapLocalisation:
+        """Localisation in the map as it is; raises ``ValueError`` where it shows no places."""
+        return self.core.localisation(self.origin)
+
+    def joining(self) -> Joining:
+        """The search for a robot with which the session goes on from another start; raises as ``localisation``."""
+        return Joining(self.core, self.origin)

@@ -48,6 +48,8 @@ class MapMatcher(Protocol):
 
     place_m: float
     """Distance of two frames that show one place."""
+    search_every: int
+    """Where the pose is known, the whole map is asked at every so many looks: it may cost a lot."""
 
     def append(self, step: RelativeStep, odometry: np.ndarray) -> bool:
         """Take the next frame and its pose ``(3,)`` by odometry; returns whether the map may be asked about it."""

@@ -14,7 +14,7 @@ from ngo_estimator.data.relative_step import (
     RelativeStep,
 )
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, require, taken_integer
+from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
 from ngo_estimator.geometry import se2
 
 
@@ -23,7 +23,8 @@ class TakenStep:
     """Motion from the newest frame to the next one.
 
     ``relative`` (3,) and its ``covariance`` (3, 3). ``begins``: it is the first of a trajectory; ``restarted``: there
-    was another before. ``gap``: steps were lost, and the motion is composed from the odometry.
+    was another before. ``gap``: steps were lost, and the motion is composed from the odometry. ``joins``: another
+    odometry goes on from here, and the motion was found in the map.
     """
 
     relative: np.ndarray
@@ -31,6 +32,7 @@ class TakenStep:
     begins: bool
     restarted: bool
     gap: bool
+    joins: bool = False
 
 
 class StepLog:
@@ -43,10 +45,11 @@ class StepLog:
         """Forget everything: the next step begins a new trajectory."""
         self.stamps_ns = GrowingRows((), np.int64)
         self.odometry = GrowingRows((3,), np.float64)
-        """Poses of all frames in ``odom``."""
+        """Poses of all frames in the ``odom`` of the first; that of a later odometry is laid behind it."""
         self.odometry_std = GrowingRows((3,), np.float32)
         """Deviations of each step."""
         self._origin_stamp_ns = 0
+        self._moved = np.zeros(3)  # what carries the poses of the present odometry into that of the first
 
     @property
     def steps(self) -> int:
@@ -55,7 +58,7 @@ class StepLog:
 
     @property
     def last_odom(self) -> np.ndarray:
-        """Pose ``(3,)`` of the newest frame in ``odom``."""
+        """Pose ``(3,)`` of the newest frame, as ``odometry`` has it."""
         pose: np.ndarray = self.odometry.values[-1]
         return pose
 
@@ -95,11 +98,46 @@ class StepLog:
         begins = self.steps == 0
         if begins:
             self._begin(step)
-        self.stamps_ns.append(step.stamp_ns)
-        self.odometry.append(step.odom_xyyaw)
+        self._append(step.stamp_ns, self._laid(step.odom_xyyaw), covariance)
+        return TakenStep(relative, covariance, begins, restarted, gap)
+
+    def join(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> TakenStep:
+        """Take the frame that a step of another odometry ends at, and go on with that odometry.
+
+        Args:
+            relative: ``(3,)`` pose of the frame, seen from the newest one; covariance: ``(3, 3)`` of it.
+
+        Raises:
+            LateStep: it is not newer than the last one. Nothing has changed.
+        """
+        self.check_later(step)
+        laid = se2.compose(torch.from_numpy(self.last_odom), torch.from_numpy(relative))
+        self._moved = se2.compose(laid, se2.inverse(torch.from_numpy(step.odom_xyyaw))).numpy()
+        self._origin_stamp_ns = step.origin_stamp_ns
+        self._append(step.stamp_ns, laid.numpy(), covariance)
+        return TakenStep(relative, covariance, begins=False, restarted=False, gap=False, joins=True)
+
+    def check_later(self, step: RelativeStep) -> None:
+        """Raise ``LateStep`` if a step of another odometry is not newer than the last one."""
+        last = int(self.stamps_ns.values[-1])
+        if step.stamp_ns <= last:
+            raise LateStep(
+                f"step to {step.stamp_ns} ns is of another odometry, and the loaded trajectory ends at {last} ns; "
+                "expected later stamps"
+            )
+
+    def _append(self, stamp_ns: int, odometry: np.ndarray, covariance: np.ndarray) -> None:
+        self.stamps_ns.append(stamp_ns)
+        self.odometry.append(odometry)
         # Beyond it the motion is unknown all the same, and float32 would hold infinity, which no file takes.
         self.odometry_std.append(np.sqrt(np.diagonal(covariance)).clip(max=LARGEST_ODOMETRY))
-        return TakenStep(relative, covariance, begins, restarted, gap)
+
+    def _laid(self, odom_xyyaw: np.ndarray) -> np.ndarray:
+        """A pose ``(3,)`` of the present odometry, as ``odometry`` has it."""
+        if not self._moved.any():
+            return odom_xyyaw
+        laid: np.ndarray = se2.compose(torch.from_numpy(self._moved), torch.from_numpy(odom_xyyaw)).numpy()
+        return laid
 
     def state(self) -> Arrays:
         """All of it, for ``restore``."""
@@ -108,6 +146,7 @@ class StepLog:
             "odometry": self.odometry.values,
             "odometry_std": self.odometry_std.values,
             "origin_stamp_ns": np.array(self._origin_stamp_ns, np.int64),
+            "moved": self._moved,
         }
 
     def restore(self, arrays: Arrays) -> None:
@@ -116,6 +155,7 @@ class StepLog:
         self.odometry.restore(arrays, "odometry")
         self.odometry_std.restore(arrays, "odometry_std")
         self._origin_stamp_ns = taken_integer(arrays, "origin_stamp_ns", -(2**63))
+        self._moved = taken(arrays, "moved", np.float64, 3)
         frames = len(self.stamps_ns)
         require(
             len(self.odometry) == frames and len(self.odometry_std) == max(0, frames - 1) and frames != 1,
@@ -128,7 +168,7 @@ class StepLog:
 
         The covariance of the step stands for all that were lost, in proportion to the time that they took.
         """
-        odom = torch.from_numpy(np.stack((self.last_odom, step.odom_xyyaw)))
+        odom = torch.from_numpy(np.stack((self.last_odom, self._laid(step.odom_xyyaw))))
         longer = (step.stamp_ns - last_ns) / (step.stamp_ns - step.from_stamp_ns)
         return se2.between(odom[0], odom[1]).numpy(), step.covariance * max(longer, 1.0)
 

@@ -33,6 +33,9 @@ from ngo_estimator.geometry.scan_matching import icp
 from ngo_estimator.optimizer.scan_loop_candidates import nearest_places
 from ngo_estimator.optimizer.walls_seen_through import PROFILE_BINS, PlacedScans, placed, range_profile, seen_through
 
+_NEAR_M = 10.0
+"""Points up to there say where a scan looks."""
+
 _SUBMAP_VARIANCE = np.diag((0.01**2, 0.01**2, math.radians(0.15) ** 2))
 """Of the submap's own keys against each other, which registration in it can't see."""
 
@@ -256,8 +259,7 @@ class ScanLoopFinder:
             )
         for scan in scans[len(self._profiles) :]:
             self._profiles.append(range_profile(scan).astype(np.float32))  # as scans have them: nothing is lost
-            near = scan.points[np.linalg.norm(scan.points, axis=1) < 10.0]
-            self._middles.append(near.mean(0) if len(near) else np.zeros(2))
+            self._middles.append(_middle(scan.points))
         if (count - 1) % config.every:
             return ScanLoops.none()
         if not (windows > 0.0).all():
@@ -337,11 +339,7 @@ class ScanLoopFinder:
         seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)
         around = np.array((config.match_m, config.match_m, math.pi))
         chosen = [_Candidate(p, np.zeros(3), around, windows[p]) for p in seen if p not in self._forgotten]
-        middles = self._middles.values
-        cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        views = poses[:, :2] + np.stack(
-            (cosine * middles[:, 0] - sine * middles[:, 1], sine * middles[:, 0] + cosine * middles[:, 1]), axis=1
-        )
+        views = _views(poses, self._middles.values)
         near = nearest_places(
             views, poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys, most=config.most_per_key
         )
@@ -378,6 +376,8 @@ class ScanLoopFinder:
         """A finder that knows these key scans, and has no loops: where the map stays as it is, others are ``seen``."""
         other = ScanLoopFinder(self.config)
         other._profiles = [*self._profiles, *map(range_profile, scans[len(self._profiles) :])]
+        for scan in scans:
+            other._middles.append(_middle(scan.points))
         other._forgotten = set(self._forgotten)
         return other
 
@@ -397,14 +397,18 @@ class ScanLoopFinder:
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Pose ``(3,)`` of a source in a map of key scans, and its covariance ``(3, 3)``; None where a test fails.
 
-        The tests are those of a loop, but for neighbours and the graph's pose.
+        The tests are those of a loop, but for neighbours and the graph's pose. Of the places around, the one is taken
+        whose scans look where the source looks: a scanner does not see what is behind it.
 
         Args:
             scans, poses: all key scans of ``of_fixed_map``, and their poses in the map ``(keys, 3)``.
             expected, window: where to search, and how far to each side ``(3,)`` (m, m, rad).
         """
         known = np.array([k for k in range(len(poses)) if k not in self._forgotten], np.int64)
-        place = int(known[np.linalg.norm(poses[known, :2] - expected[:2], axis=1).argmin()])
+        view = _views(expected[None], _middle(source.points)[None])
+        away = np.linalg.norm(poses[known, :2] - expected[:2], axis=1)
+        difference = np.linalg.norm(_views(poses[known], self._middles.values[known]) - view, axis=1)
+        place = int(known[(difference + 0.5 * away).argmin()])
         submap = self._submap(scans, poses, place)
         fit = self._fit(submap, source, between(poses[place], expected), window)
         if fit is None or fit.through > self.config.most_seen_through:
@@ -484,6 +488,20 @@ class ScanLoopFinder:
         fresh = np.flatnonzero(accepted & ~loops.accepted)
         self.loops = ScanLoops(pairs, loops.relative, loops.covariance, evidence, accepted)
         return self.loops[fresh]
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The middle ``(2,)`` of the points around a robot, in its frame."""
+    near = _within(points, _NEAR_M)
+    return near.mean(0) if len(near) else np.zeros(2)
+
+
+def _views(poses: np.ndarray, middles: np.ndarray) -> np.ndarray:
+    """Where robots at poses ``(n, 3)`` look: the middles ``(n, 2)`` of their points, in the map."""
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return poses[:, :2] + np.stack(
+        (cosine * middles[:, 0] - sine * middles[:, 1], sine * middles[:, 0] + cosine * middles[:, 1]), axis=1
+    )
 
 
 def _within(points: np.ndarray, range_m: float) -> np.ndarray:

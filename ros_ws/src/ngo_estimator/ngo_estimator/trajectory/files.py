@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ngo_common.files import read_file
-from ngo_estimator.data.whole_files import write_together
+from ngo_common.files import read_file, write_together
 from ngo_estimator.trajectory.save_path import check_replaceable
 
 ENDINGS = (".tum", ".txt", ".kitti", ".g2o")

@@ -1,0 +1,61 @@
+"""The newest pose and map -> odom as messages."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.lifecycle import LifecycleNode, LifecyclePublisher
+from tf2_msgs.msg import TFMessage
+
+from ngo_common.nodes.qos import overridable
+from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.settings import NgoNodeSettings
+
+if TYPE_CHECKING:
+    from ngo_estimator.online.tf_smoothing import SmoothedCorrection
+
+_DEPTH = 100
+
+
+class PosePublisher:
+    """Publishes the newest pose, and map -> odom where the node does, smoothed."""
+
+    def __init__(
+        self,
+        node: LifecycleNode,
+        settings: Callable[[], NgoNodeSettings],
+        smoothing: "SmoothedCorrection",
+        built: ExitStack,
+    ) -> None:
+        """Make the publishers, which end with ``built``; ``smoothing`` may be replaced."""
+        self._settings, self.smoothing = settings, smoothing
+
+        def publisher(message_type: type, topic: str) -> LifecyclePublisher:
+            made = node.create_lifecycle_publisher(message_type, topic, _DEPTH, qos_overriding_options=overridable())
+            built.callback(node.destroy_lifecycle_publisher, made)
+            return made
+
+        topics = settings()
+        self._pose = publisher(PoseWithCovarianceStamped, topics.pose_topic)
+        self._tf = publisher(TFMessage, topics.tf_topic) if topics.publish_tf else None
+
+    def publish(
+        self, stamp_ns: int, pose: np.ndarray, covariance: np.ndarray, map_from_odom: np.ndarray, odom: np.ndarray
+    ) -> None:
+        """Publish a pose ``(3,)`` and its covariance ``(3, 3)`` in map, and what goes to ``send_transform``."""
+        self.send_transform(stamp_ns, map_from_odom, odom)
+        settings = self._settings()
+        map_frame = settings.framed(settings.map_frame)
+        self._pose.publish(messages.pose_message(stamp_ns, map_frame, pose, covariance))
+
+    def send_transform(self, stamp_ns: int, map_from_odom: np.ndarray, odom: np.ndarray) -> None:
+        """Publish map -> odom ``(3,)``, smoothed, with the robot's pose ``(3,)`` in odom."""
+        if self._tf is None:
+            return
+        settings = self._settings()
+        map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
+        smoothed = self.smoothing.update(stamp_ns, map_from_odom, odom)
+        ahead_ns = round(1e9 * settings.tf_ahead_s)
+        self._tf.publish(messages.transform_message(stamp_ns + ahead_ns, map_frame, odom_frame, smoothed))
