@@ -22,14 +22,17 @@ from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_matcher import ScanMatcher
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
-from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
+from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder, ScanLoops
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
 
-_KEYS_PER_OPTIMISED = 200
+_KEYS_PER_OPTIMISED = 50
 """For each so many nodes an optimisation waits for one more key scan."""
+
+_AT_WALLS = np.diag((1.0, 1.0, 4.0))
+"""What an error of a pose (m, m, rad) moves, some metres from the robot."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,9 @@ class ScanGraphConfig:
     """How key scans are optimised.
 
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
-    at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
-    ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to
-    each step's covariance: registration in the same few key scans does not see them. About ``most_scans`` key scans are
+    at once where a new loop is ``surprise`` deviations off the graph and ``surprise_m`` at the walls. The Cauchy kernel
+    on steps and loops is ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to each
+    step's covariance: registration in the same few key scans does not see them. About ``most_scans`` key scans are
     kept; where there are more, places that many of them show lose some. Their poses stay.
     """
 
@@ -48,6 +51,7 @@ class ScanGraphConfig:
     iterations: int = 5
     keys_between: int = 8
     surprise: float = 3.0
+    surprise_m: float = 0.06
     kernel: float = 3.0
     step_m: float = 0.005
     step_deg: float = 0.15
@@ -59,9 +63,9 @@ class ScanGraphConfig:
                 f"iterations, keys_between, most_scans are {self.iterations}, {self.keys_between}, {self.most_scans}; "
                 "expected at least 1, 1 and 100"
             )
-        positive = (self.surprise, self.kernel, self.step_m, self.step_deg)
+        positive = (self.surprise, self.surprise_m, self.kernel, self.step_m, self.step_deg)
         if not all(0.0 < value < math.inf for value in positive):
-            raise ValueError(f"surprise, kernel, step_m, step_deg are {positive}; expected positive numbers")
+            raise ValueError(f"surprise, surprise_m, kernel, step_m, step_deg are {positive}; expected positive numbers")
 
 
 class ScanGraph:
@@ -178,17 +182,25 @@ class ScanGraph:
         poses, config = self._nodes.values, self.config
         accepted = self._finder.loops.pairs[self._finder.loops.accepted]
         if (self.keys - 1) % config.loops.every:
-            found = 0.0
+            found = False
         else:
             windows = distance_windows(config.windows, graph_distances(poses, accepted, self.keys - 1))
             loops = self._finder.find(self._scans, poses, windows)
             self._save_memory()
-            off = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance).residuals(poses)
-            found = float(np.sqrt((off**2).sum(1)).max(initial=0.0))
+            found = self._surprises(loops)
             self._waiting = max(self._waiting, int(len(loops) > 0))
         self._waiting += self._waiting > 0
         # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
-        return self._waiting > max(config.keys_between, self.keys // _KEYS_PER_OPTIMISED) or found > config.surprise
+        return self._waiting > max(config.keys_between, self.keys // _KEYS_PER_OPTIMISED) or found
+
+    def _surprises(self, loops: ScanLoops) -> bool:
+        """Whether one of these loops is so far off the graph that it cannot wait."""
+        off = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance).residuals(self._nodes.values)
+        at_walls = RelativePoses(loops.pairs, loops.relative, np.tile(_AT_WALLS, (len(loops), 1, 1)))
+        moved = at_walls.residuals(self._nodes.values)
+        config = self.config
+        far = ((off**2).sum(1) > config.surprise**2) & ((moved**2).sum(1) > config.surprise_m**2)
+        return bool(far.any())
 
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
