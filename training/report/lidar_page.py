@@ -53,15 +53,15 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
     for name, title in (("buildings", "Simulated buildings"), ("aliased", "Buildings whose rooms repeat")):
         parts += [
             f"## {title}",
-            f"Up to {settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} m "
-            "each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have the first of them.",
+            f"Up to {settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} "
+            "m each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have the first of them.",
             _table(result["tables"][name], _BUILDING_COLUMNS),
             _against_ours(result["paired"][name]),
         ]
     parts += [
         "## Mazes, scanners of many qualities",
-        f"Up to {settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE (m), "
-        "aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 scans.",
+        f"Up to {settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE "
+        "(m), aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 scans.",
         _scanners(result),
         "`maze2d`, the simulator's own scanner:",
         _table(result["tables"]["maze2d"], _BUILDING_COLUMNS),
