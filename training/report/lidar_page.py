@@ -61,7 +61,8 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
     parts += [
         "## Mazes, scanners of many qualities",
         f"Up to {settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE "
-        "(m), aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 scans.",
+        "(m), aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 "
+        "scans.",
         _scanners(result),
         "`maze2d`, the simulator's own scanner:",
         _table(result["tables"]["maze2d"], _BUILDING_COLUMNS),
