@@ -65,6 +65,8 @@ class Arguments:
     """Scans in a maze."""
     rows: tuple[str, ...] = ()
     """Rows to measure, by name; none: all."""
+    known: bool = False
+    """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
     weights: Path = runs.WEIGHTS / "scan"
     """Folder with lidar.json, the settings of our estimators."""
     out: Path = runs.ROOT / "training" / "results"
@@ -194,7 +196,9 @@ def _measured(arguments: Arguments, table: str, sources: Sequence[DriveSource], 
     with tqdm(sources, desc=table, unit="drive") as bar:
         for source in bar:
             bar.set_postfix_str(source.name)
-            measured[source.name] = dict(score_drive(source, dict(rows), arguments.weights, cache))
+            measured[source.name] = dict(
+                score_drive(source, dict(rows), arguments.weights, cache, known_only=arguments.known)
+            )
     return measured
 
 
@@ -221,13 +225,16 @@ def _published(log: str) -> dict[str, Numbers]:
 
 
 def _table_numbers(table: Table) -> dict[str, Numbers]:
-    """Of several drives: means over them, the interval by resampling them."""
+    """Of several drives: means over them, the interval by resampling them, and how many these are."""
     by_row: dict[str, dict[str, list[float]]] = {}
     for rows in table.values():
         for row, scored in rows.items():
             for key, values in scored.errors.items():
                 by_row.setdefault(row, {}).setdefault(key, []).append(float(values.mean()))
-    return {row: {key: _interval(np.array(values)) for key, values in errors.items()} for row, errors in by_row.items()}
+    return {
+        row: {key: {**_interval(np.array(values)), "drives": len(values)} for key, values in errors.items()}
+        for row, errors in by_row.items()
+    }
 
 
 def _paired(table: Table) -> dict[str, Any]:

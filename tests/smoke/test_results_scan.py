@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,7 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert set(result["tables"]["maze2d"]) == {name for name in there if not ROWS[name].needs_wheels}
     ate = result["tables"]["buildings"]["ours"]["ate_m"]
     assert 0.0 < ate["mean"] < 0.3
+    assert ate["drives"] == 2
     assert ate["ci95"][0] <= ate["mean"] <= ate["ci95"][1]
     assert result["paired"]["buildings"]["wheels"]["ate_m"]["relative_percent"]["mean"] > 0.0
     assert result["logs"] == {}
@@ -52,6 +54,12 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(lidar_rows.DriveRuns, "__init__", no_run)
     again = results_scan.main(arguments)
     assert again["tables"] == result["tables"]
+
+    for stored in (tmp_path / "runs" / "scan" / "results" / "buildings").glob("*_20001.*.npz"):
+        stored.unlink()
+    known = results_scan.main(replace(arguments, known=True))
+    assert known["tables"]["buildings"]["ours"]["ate_m"]["drives"] == 1
+    assert known["tables"]["aliased"] == result["tables"]["aliased"]
 
 
 def test_a_row_that_does_not_exist_is_refused() -> None:

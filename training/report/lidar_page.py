@@ -53,15 +53,16 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
     for name, title in (("buildings", "Simulated buildings"), ("aliased", "Buildings whose rooms repeat")):
         parts += [
             f"## {title}",
-            f"{settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} m "
-            "each or 20,000 scans, with drawn scanners and wheels.",
+            f"Up to {settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} "
+            "m each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have the first of them.",
             _table(result["tables"][name], _BUILDING_COLUMNS),
             _against_ours(result["paired"][name]),
         ]
     parts += [
         "## Mazes, scanners of many qualities",
-        f"{settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE (m), "
-        "aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 scans.",
+        f"Up to {settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE "
+        "(m), aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 "
+        "scans.",
         _scanners(result),
         "`maze2d`, the simulator's own scanner:",
         _table(result["tables"]["maze2d"], _BUILDING_COLUMNS),
@@ -98,7 +99,11 @@ _BUILDING_COLUMNS = {
 def _table(rows: Mapping[str, Any], columns: Mapping[str, str]) -> str:
     shown = {key: title for key, title in columns.items() if any(key in numbers for numbers in rows.values())}
     body = [[_TITLES.get(row, row), *(_number(numbers.get(key)) for key in shown)] for row, numbers in rows.items()]
-    return _markdown(["", *shown.values()], body)
+    counts = [max((number.get("drives", 0) for number in numbers.values()), default=0) for numbers in rows.values()]
+    if not any(counts):  # one log
+        return _markdown(["", *shown.values()], body)
+    counted = [[name, str(count), *numbers] for (name, *numbers), count in zip(body, counts, strict=True)]
+    return _markdown(["", "drives", *shown.values()], counted)
 
 
 def _across(logs: Mapping[str, Any], key: str) -> str:

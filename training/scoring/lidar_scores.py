@@ -52,10 +52,13 @@ class Scored:
     failed: str = ""
 
 
-def score_drive(source: DriveSource, rows: dict[str, Row], weights: Path, cache: Path) -> Iterator[tuple[str, Scored]]:
+def score_drive(
+    source: DriveSource, rows: dict[str, Row], weights: Path, cache: Path, known_only: bool = False
+) -> Iterator[tuple[str, Scored]]:
     """What each row makes of a drive, from ``cache/DRIVE.ROW.npz`` where settings, drive and code are those of today.
 
-    A row that the drive has no wheels for is left out; the drive is made only if a row is not known yet.
+    A row that the drive has no wheels for is left out; the drive is made only if a row is not known yet. With
+    ``known_only`` such a row is left out, too.
     """
     runs: DriveRuns | None = None
     for name, row in rows.items():
@@ -65,6 +68,8 @@ def score_drive(source: DriveSource, rows: dict[str, Row], weights: Path, cache:
         code = _code((*_ALWAYS, *source.code, *row.code))
         identity = json.dumps([name, identity_of(row.settings), source.identity, code, _weights(row, weights)])
         known = _read(path, identity)
+        if known is None and known_only:
+            continue
         if known is None:
             runs = runs or DriveRuns(source.make(), weights)
             known = _scored(runs, row)

@@ -89,7 +89,7 @@ def test_a_loop_is_accepted_when_a_neighbour_agrees() -> None:
     scans, finder = scanned(HALLWAY, TWICE), ScanLoopFinder(ScanLoopConfig(most_per_key=1))
     for count in range(1, len(scans) + 1):
         fresh = finder.find(scans[:count], TWICE[:count], np.tile((0.5, 0.5, 0.2), (count, 1)))
-        assert fresh.accepted.all()
+        assert finder.loops.accepted[fresh].all()
         if len(finder.loops) == 1:
             assert not finder.loops.accepted.any() and len(fresh) == 0
         elif len(finder.loops) == 2:

@@ -22,14 +22,18 @@ from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_matcher import ScanMatcher
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
+from ngo_estimator.optimizer.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
 
-_KEYS_PER_OPTIMISED = 200
+_KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key scan."""
+
+_KEYS_PER_SURPRISED = 400
+"""The same where a loop surprises."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +41,11 @@ class ScanGraphConfig:
     """How key scans are optimised.
 
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
-    at once where a new loop is ``surprise`` deviations off the graph. The Cauchy kernel on steps and loops is
-    ``kernel`` deviations wide. ``step_m`` and ``step_deg`` are deviations that are added to
-    each step's covariance: registration in the same few key scans does not see them. About ``most_scans`` key scans are
-    kept; where there are more, places that many of them show lose some. Their poses stay.
+    at once where a new loop is ``surprise`` deviations off the graph and ``surprise_m`` at the walls. The Cauchy kernel
+    on steps and loops is ``kernel`` deviations wide. A loop is left out where a way through the graph joins its keys
+    with at most ``redundant`` times its variance, unless it is that far off. ``step_m`` and ``step_deg`` are deviations
+    that are added to each step's covariance: registration in the same few key scans does not see them. About
+    ``most_scans`` key scans are kept; where there are more, places that many of them show lose some. Their poses stay.
     """
 
     loops: ScanLoopConfig = field(default_factory=ScanLoopConfig)
@@ -48,6 +53,8 @@ class ScanGraphConfig:
     iterations: int = 5
     keys_between: int = 8
     surprise: float = 3.0
+    surprise_m: float = 0.06
+    redundant: float = 15.0
     kernel: float = 3.0
     step_m: float = 0.005
     step_deg: float = 0.15
@@ -59,9 +66,11 @@ class ScanGraphConfig:
                 f"iterations, keys_between, most_scans are {self.iterations}, {self.keys_between}, {self.most_scans}; "
                 "expected at least 1, 1 and 100"
             )
-        positive = (self.surprise, self.kernel, self.step_m, self.step_deg)
+        positive = (self.surprise, self.surprise_m, self.redundant, self.kernel, self.step_m, self.step_deg)
         if not all(0.0 < value < math.inf for value in positive):
-            raise ValueError(f"surprise, kernel, step_m, step_deg are {positive}; expected positive numbers")
+            raise ValueError(
+                f"surprise, surprise_m, redundant, kernel, step_m, step_deg are {positive}; expected positive numbers"
+            )
 
 
 class ScanGraph:
@@ -77,6 +86,7 @@ class ScanGraph:
         self._steps = GrowingRows((3,), np.float64)
         self._step_covariance = GrowingRows((3, 3), np.float64)  # for the optimisation
         self._published_covariance = GrowingRows((3, 3), np.float64)
+        self._step_variance = GrowingRows((), np.float64)  # the largest of each
         self._scans = KeyScanStore()
         self._key_stamp_ns = 0
         self._finder = ScanLoopFinder(config.loops)
@@ -88,6 +98,7 @@ class ScanGraph:
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
         self._before = np.zeros((1, 3))
         self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on, nodes all of them
+        self._used = GrowingRows((), np.int64)  # loops that the graph needs, among all that were verified
         self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
         self.loop_weights = np.zeros(0)
         """Of the loops in the last optimisation ``(loops,)``, zero to one."""
@@ -172,6 +183,7 @@ class ScanGraph:
         floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
         self._steps.append(since)
         self._step_covariance.append(covariance + floor)
+        self._step_variance.append(largest_variances((covariance + floor)[None])[0])
         self._published_covariance.append(published + floor)
         pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
         self._end = propagate(self._end, pose, since, published + floor)
@@ -183,20 +195,39 @@ class ScanGraph:
 
     def _look_for_loops(self) -> bool:
         """Ask for loops of the newest key; returns whether an optimisation is due."""
-        poses, config = self._nodes.values, self.config
-        accepted = self._finder.loops.pairs[self._finder.loops.accepted]
-        if (self.keys - 1) % config.loops.every:
-            found = 0.0
-        else:
-            windows = distance_windows(config.windows, graph_distances(poses, accepted, self.keys - 1))
-            loops = self._finder.find(self._scans, poses, windows)
-            self._save_memory()
-            off = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance).residuals(poses)
-            found = float(np.sqrt((off**2).sum(1)).max(initial=0.0))
-            self._waiting = max(self._waiting, int(len(loops) > 0))
-        self._waiting += self._waiting > 0
         # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
-        return self._waiting > max(config.keys_between, self.keys // _KEYS_PER_OPTIMISED) or found > config.surprise
+        wait = max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
+        if (self.keys - 1) % self.config.loops.every == 0:
+            poses, used = self._nodes.values, self._finder.loops.pairs[self._used.values]
+            windows = distance_windows(self.config.windows, graph_distances(poses, used, self.keys - 1))
+            fresh = self._finder.find(self._scans, poses, windows)
+            self._save_memory()
+            if len(fresh):
+                surprises = self._use(fresh)
+                self._waiting = max(self._waiting, wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
+        self._waiting += self._waiting > 0
+        return self._waiting > wait
+
+    def _use(self, rows: np.ndarray) -> bool:
+        """Take those newly accepted loops into the graph that it needs; returns whether one surprises."""
+        loops, known, config = self._finder.loops[rows], self._finder.loops[self._used.values], self.config
+        measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
+        off = (measured.residuals(self._nodes.values) ** 2).sum(1)
+        at_walls = np.tile(np.diag((1.0, 1.0, WALLS_M)), (len(rows), 1, 1))
+        moved = (RelativePoses(loops.pairs, loops.relative, at_walls).residuals(self._nodes.values) ** 2).sum(1)
+        surprising = (off > config.surprise**2) & (moved > config.surprise_m**2)
+        chain = np.arange(self.keys - 1)
+        needed = needed_loops(
+            np.concatenate((np.stack((chain, chain + 1), axis=1), known.pairs)),
+            np.concatenate((self._step_variance.values, largest_variances(known.covariance))),
+            loops.pairs,
+            largest_variances(loops.covariance),
+            surprising,
+            config.redundant,
+        )
+        for row in rows[needed]:
+            self._used.append(row)
+        return bool(surprising.any())
 
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
@@ -211,15 +242,15 @@ class ScanGraph:
         return ScanMatcher(self._scans[:], origin.poses(self._nodes.values.copy()), self._finder)
 
     def measurements(self) -> tuple[RelativePoses, RelativePoses]:
-        """The steps from each node to the next, and the accepted loops."""
-        loops = self._finder.loops[np.flatnonzero(self._finder.loops.accepted)]
+        """The steps from each node to the next, and the loops that the graph needs."""
+        loops = self._finder.loops[self._used.values]
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._chain(self._step_covariance.values), measured
 
     def begin(self) -> None:
         """Begin to optimise all nodes."""
         began = time.perf_counter()
-        self._rows = np.flatnonzero(self._finder.loops.accepted)
+        self._rows = self._used.values.copy()
         steps, measured = self.measurements()
         gates = np.ones(len(self._rows))
         self._running = ScanPoseGraph(steps, measured, gates, self._nodes.values, self.config.kernel)
@@ -278,7 +309,7 @@ class ScanGraph:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
         self.fault = ""
         if self._running is None:
-            if not self._finder.loops.accepted.any():
+            if len(self._used) == 0:
                 return False
             self.begin()
         self._left = _MOST_ITERATIONS
@@ -336,6 +367,8 @@ class ScanGraph:
             "steps": self._steps,
             "step_covariance": self._step_covariance,
             "published_covariance": self._published_covariance,
+            "step_variance": self._step_variance,
+            "used": self._used,
         }
 
     def state(self) -> Arrays:
@@ -379,7 +412,8 @@ class ScanGraph:
     def _check(self) -> None:
         """Raise ``StateError`` where the parts of a restored state do not belong together."""
         keys, frames, found = self.keys, self._frames.values, len(self._finder.loops)
-        steps = {len(rows) for rows in (self._steps, self._step_covariance, self._published_covariance)}
+        of_steps = (self._steps, self._step_covariance, self._published_covariance, self._step_variance)
+        steps = {len(rows) for rows in of_steps}
         require(
             keys > 0 and len(self._scans) == len(frames) == keys and steps == {keys - 1},
             f"there are not {keys} key scans, and a step less",
@@ -388,7 +422,7 @@ class ScanGraph:
         require(
             bool(ordered)
             and 1 <= len(self._before) <= keys
-            and bool(((self._loop_rows >= 0) & (self._loop_rows < found)).all())
+            and all(bool(((rows >= 0) & (rows < found)).all()) for rows in (self._loop_rows, self._used.values))
             and bool(np.isin(self._joins.values, frames[1:]).all()),
             "frames, nodes or loops are named that are not there",
         )

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from torch import Tensor
 
 from ngo_estimator.data.state_arrays import Arrays, require, taken
@@ -18,6 +18,15 @@ from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, norma
 # Pivots stay on the diagonal. No relaxed supernodes: they fill columns that have little in common, and are many times
 # slower in graphs of thousands of poses.
 _SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "options": {"SymmetricMode": True}}
+
+_LEAST_REUSED = 400_000
+"""Numbers in a factor from which on its use for another matrix is faster than to factorise that."""
+
+_MOST_REFINEMENTS = 30
+"""So many steps of conjugate gradients take about as long as to factorise."""
+
+_TOLERANCE = 1e-6
+"""Of a solution by another matrix's factor: its residual against the right hand side."""
 
 
 class GraphStructure:
@@ -85,11 +94,33 @@ class FactorisedInformation:
     Args:
         rank: place of each pose in the order of elimination ``(poses,)``.
         matrix: ``(3 poses, 3 poses)``, in this order.
+        near: the same poses in the same order, with a matrix that differs little. Where factors are large, its factor
+            serves: conjugate gradients solve what the difference leaves.
     """
 
-    def __init__(self, rank: np.ndarray, matrix: csc_matrix) -> None:
+    def __init__(self, rank: np.ndarray, matrix: csc_matrix, near: "FactorisedInformation | None" = None) -> None:
         self._rank, self._matrix = rank, matrix
-        self._factor = splu(matrix, permc_spec="NATURAL", **_SYMMETRIC)
+        self._exact = False
+        if near is None or near._factor.nnz < _LEAST_REUSED:
+            self._factorise()
+        else:
+            self._factor = near._factor
+
+    def _factorise(self) -> None:
+        self._factor: SuperLU = splu(self._matrix, permc_spec="NATURAL", **_SYMMETRIC)
+        self._exact = True
+
+    def _solved(self, right: np.ndarray) -> np.ndarray:
+        """Solution ``(rows,)`` of the equations with the right hand side ``(rows,)``."""
+        solution: np.ndarray
+        if not self._exact:
+            known = LinearOperator(self._matrix.shape, self._factor.solve, dtype=np.float64)
+            solution, failed = cg(self._matrix, right, rtol=_TOLERANCE, maxiter=_MOST_REFINEMENTS, M=known)
+            if not failed:
+                return solution
+            self._factorise()
+        solution = self._factor.solve(right)
+        return solution
 
     def rows(self, nodes: np.ndarray) -> np.ndarray:
         """Rows of the matrix ``(n, 3)`` that belong to nodes ``(n,)``, none of them node 0."""
@@ -101,6 +132,8 @@ class FactorisedInformation:
         wanted = self.rows(np.asarray(nodes)).ravel()
         right = np.zeros((self._matrix.shape[0], len(wanted)))
         right[wanted, np.arange(len(wanted))] = 1.0
+        if not self._exact:
+            self._factorise()
         covariance: np.ndarray = self._factor.solve(right)[wanted]
         return 0.5 * (covariance + covariance.T)
 
@@ -124,12 +157,14 @@ class FactorisedInformation:
 class NormalEquations(FactorisedInformation):
     """The factorised normal equations of one graph, at the poses where its factors were linearised."""
 
-    def __init__(self, factors: Sequence[Factors], structure: GraphStructure) -> None:
+    def __init__(
+        self, factors: Sequence[Factors], structure: GraphStructure, near: FactorisedInformation | None = None
+    ) -> None:
         """Sum the factors of a batch of one; raises ``RuntimeError`` where a pose has no factor at all."""
         nodes, hessian, gradient = (blocks[0] for blocks in normal_blocks(factors))
         self._right = torch.zeros(structure.count, 3, dtype=torch.float64)
         self._right.index_add_(0, nodes.flatten(), gradient.reshape(-1, 3))
-        super().__init__(structure.rank, structure.matrix(hessian))
+        super().__init__(structure.rank, structure.matrix(hessian), near)
 
     def step(self) -> Tensor:
         """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""
@@ -138,5 +173,5 @@ class NormalEquations(FactorisedInformation):
         right = np.empty(rows.size)
         right[rows] = self._right[1:].numpy()
         step = np.zeros((count, 3))
-        step[1:] = self._factor.solve(right)[rows]
+        step[1:] = self._solved(right)[rows]
         return torch.from_numpy(step).unsqueeze(0)

@@ -239,7 +239,7 @@ class ScanLoopFinder:
 
     def find(
         self, scans: Sequence[KeyScan], poses: np.ndarray, windows: np.ndarray, matches: Sequence[int] = ()
-    ) -> ScanLoops:
+    ) -> np.ndarray:
         """Loops of the last key, under the present poses.
 
         Args:
@@ -250,7 +250,8 @@ class ScanLoopFinder:
                 searched in all directions.
 
         Returns:
-            The loops that this call made acceptable, the last key's and earlier ones with which they agree.
+            Which of ``loops`` ``(n,)`` this call made acceptable, the last key's and earlier ones with which they
+            agree.
         """
         count, config = len(scans), self.config
         if poses.shape != (count, 3) or windows.shape != (count, 3):
@@ -261,7 +262,7 @@ class ScanLoopFinder:
             self._profiles.append(range_profile(scan).astype(np.float32))  # as scans have them: nothing is lost
             self._middles.append(_middle(scan.points))
         if (count - 1) % config.every:
-            return ScanLoops.none()
+            return np.zeros(0, np.int64)
         if not (windows > 0.0).all():
             raise ValueError(f"the narrowest of the windows is {windows.min()}; expected positive half widths")
         found = ScanLoops.none()
@@ -460,10 +461,10 @@ class ScanLoopFinder:
             np.zeros(1, bool),
         )
 
-    def _agreed(self, found: ScanLoops, poses: np.ndarray) -> ScanLoops:
-        """Count agreeing neighbours of new loops and of old ones near them; keep all, return the newly accepted."""
+    def _agreed(self, found: ScanLoops, poses: np.ndarray) -> np.ndarray:
+        """Count agreeing neighbours of new loops and of old ones near them; keep all, return which became accepted."""
         if len(found) == 0:
-            return found
+            return np.zeros(0, np.int64)
         config, old = self.config, len(self.loops)
         loops = self.loops.extended(found)
         pairs, evidence = loops.pairs, loops.evidence.copy()
@@ -485,9 +486,9 @@ class ScanLoopFinder:
             evidence[k, _AGREEING] += len(agree)
         needed = np.maximum(config.least_agreeing, config.agreeing_per_deviation * evidence[:, _DISAGREEMENT])
         accepted = evidence[:, _AGREEING] >= needed
-        fresh = np.flatnonzero(accepted & ~loops.accepted)
+        fresh: np.ndarray = np.flatnonzero(accepted & ~loops.accepted)
         self.loops = ScanLoops(pairs, loops.relative, loops.covariance, evidence, accepted)
-        return self.loops[fresh]
+        return fresh
 
 
 def _middle(points: np.ndarray) -> np.ndarray:
