@@ -7,8 +7,9 @@ import os
 import signal
 import socket
 import subprocess
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +20,8 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 _LOG_TAIL_LINES = 15
 _POLL_S = 0.05
-_END_S = 5.0
+_END_S = 20.0  # a loaded machine; a second Ctrl-C kills at once
+_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class GraphError(RuntimeError):
@@ -49,6 +51,24 @@ class NodeSpec:
             text = yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix("...\n").strip()
             command += ["-p", f"{name}:={text}"]
         return command
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C and requests to end until the block is left. Only in the main thread, which alone gets them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    # A handler of Python's is not passed on to a process that is started in the block; a mask of signals would be.
+    handlers = {number: signal.signal(number, lambda got, _: held.append(got)) for number in _ENDINGS}
+    try:
+        yield
+    finally:
+        for ending, handler in handlers.items():
+            signal.signal(ending, handler)
+        for number in held:
+            signal.raise_signal(number)
 
 
 class Graph:
@@ -91,7 +111,8 @@ class Graph:
         }
         environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         command = spec.command()
-        with self._log_path(spec.executable).open("wb") as log:
+        # A process that was started and is not yet known here would never be ended.
+        with self._log_path(spec.executable).open("wb") as log, uninterrupted():
             # A session of its own: Ctrl-C in the terminal reaches this program alone, which then ends the nodes in
             # order.
             self._processes[spec.executable] = subprocess.Popen(

@@ -100,4 +100,4 @@ def test_interrupted_it_leaves_no_node_behind(signal_number: int, weights: Path,
         code = demo.wait(60)
     assert code == 130, (tmp_path / "log").read_text()
     assert len(started) >= 3
-    wait_until(lambda: not any(map(running, started)), "no process is left", 10.0)
+    wait_until(lambda: not any(map(running, started)), "no process is left")

@@ -6,9 +6,10 @@ import hashlib
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ from training import (
 from training.baselines.deepvo import DEEPVO
 from training.common import runs
 from training.data import feature_store, worlds
+
+ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
 class Killed(RuntimeError):
@@ -245,23 +248,61 @@ def test_all_networks_train_together_and_make_a_set_of_weights(tmp_path: Path, m
         train_end_to_end.main(dataclasses.replace(toy.end_to_end("maze2d", tmp_path), steps=100))
 
 
-def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.smoke.two_processes", str(tmp_path)]
-    one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=runs.ROOT, env=one_thread, capture_output=True, text=True, timeout=150)
+def ranks(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What the two processes wrote."""
+    first, second = (json.loads((folder / f"rank{rank}.json").read_text()) for rank in range(2))
+    return first, second
+
+
+@pytest.fixture(scope="module")
+def two_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training of two epochs by two processes of one machine."""
+    folder = tmp_path_factory.mktemp("two_processes")
+    command = [sys.executable, "-m", "tests.smoke.two_processes", str(folder)]
+    done = subprocess.run(command, cwd=runs.ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=150)
     assert done.returncode == 0, done.stderr[-2000:]
-    first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
+    return folder
+
+
+def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(two_processes: Path) -> None:
+    first, second = ranks(two_processes)
     assert len(first["mazes"]) == len(second["mazes"]) == len({*first["mazes"], *second["mazes"]}) / 2 > 0
     assert first["weights"] == second["weights"] != first["weights_at_first"]
     # Of all validation data, in both.
     assert first["logged_rmse_m"] == second["logged_rmse_m"] == pytest.approx(first["rmse_m"], rel=1e-5)
     # Written once, by one of them.
-    assert [row["epoch"] for row in curve(tmp_path)] == ["0", "1"]
-    weights = tmp_path / "weights" / "maze2d" / f"{LOCAL}.safetensors"
+    assert [row["epoch"] for row in curve(two_processes)] == ["0", "1"]
+    weights = two_processes / "weights" / "maze2d" / f"{LOCAL}.safetensors"
     assert hashlib.sha256(weights.read_bytes()).hexdigest() == first["weights"]
     training = load_local(weights.parent)[1]["training"]
     assert training["processes"] == 2
     assert training["command"].startswith("python -m training.train_local --accelerator cpu --devices 2 --strategy ddp")
+
+
+def test_two_machines_train_as_two_processes_and_go_on_after_one_is_lost(two_processes: Path, tmp_path: Path) -> None:
+    """Groups of processes stand for the machines."""
+
+    def train(folders: Sequence[Path], *arguments: str) -> list[tuple[int, str]]:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        torchrun = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1"]
+        torchrun += ["--master-addr=127.0.0.1", f"--master-port={port}"]
+        machines, logs = [], [tmp_path / "machine0.log", tmp_path / "machine1.log"]
+        for rank, (folder, log) in enumerate(zip(folders, logs, strict=True)):
+            program = [f"--node-rank={rank}", "-m", "tests.smoke.two_processes", str(folder), *arguments]
+            with log.open("w") as stderr:
+                machines.append(subprocess.Popen([*torchrun, *program], cwd=runs.ROOT, env=ONE_THREAD, stderr=stderr))
+        return [(machine.wait(150), log.read_text()) for machine, log in zip(machines, logs, strict=True)]
+
+    assert all(code != 0 for code, _ in train([tmp_path] * 2, "lost"))
+    assert [row["epoch"] for row in curve(tmp_path)] == ["0"]
+    assert all("not the same for all processes" in error for _, error in train([tmp_path, tmp_path / "other"]))
+    assert [code for code, _ in train([tmp_path] * 2)] == [0, 0]
+    assert [row["epoch"] for row in curve(tmp_path)] == ["0", "1"]
+    lost, whole = ranks(tmp_path), ranks(two_processes)
+    assert lost[0]["weights"] == lost[1]["weights"] == whole[0]["weights"]
+    assert [set(rank["mazes"]) < set(other["mazes"]) for rank, other in zip(lost, whole, strict=True)] == [True, True]
 
 
 def test_the_speed_of_making_data_is_measured(

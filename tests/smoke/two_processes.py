@@ -1,10 +1,14 @@
-"""The local network trained by two processes, as a program: ``python -m tests.smoke.two_processes FOLDER``.
+"""The local network trained by two processes, as a program: ``python -m tests.smoke.two_processes FOLDER [lost]``.
 
-Each writes the mazes that it trained on, the weights that it ended with and their error to ``FOLDER/rankN.json``.
+They are of one machine, or of two where torchrun starts it with ``--nnodes 2``. With ``lost`` the second process dies
+in the second epoch. Each writes the mazes that it trained on, the weights that it ended with and their error to
+``FOLDER/rankN.json``.
 """
 
 import hashlib
 import json
+import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +23,7 @@ from training.data.batches import Batch
 from training.data.streams import PairStream
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, lost: bool) -> None:
     patch = pytest.MonkeyPatch()
     toy.shrink(patch, 97, 300)
     made = PairStream.__iter__
@@ -36,6 +40,10 @@ def main(folder: Path) -> None:
     def note(self: Any) -> None:
         at_first.append(digest(self))
 
+    def die(self: Any) -> None:
+        if lost and self.current_epoch == 1 and self.global_rank == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+
     def write(self: Any) -> None:
         result = {
             "mazes": mazes,
@@ -48,9 +56,12 @@ def main(folder: Path) -> None:
 
     patch.setattr(PairStream, "__iter__", noted)
     patch.setattr(train_local.LocalTraining, "on_train_start", note)
+    patch.setattr(train_local.LocalTraining, "on_train_epoch_start", die)
     patch.setattr(train_local.LocalTraining, "on_train_end", write)
-    train_local.main(toy.local("maze2d", folder, epochs=2, accelerator="cpu", devices="2", strategy="ddp"))
+    nodes = int(os.environ.get("GROUP_WORLD_SIZE", "1"))
+    processes: dict[str, Any] = {"devices": str(2 // nodes), "num_nodes": nodes, "strategy": "ddp"}
+    train_local.main(toy.local("maze2d", folder, epochs=2, accelerator="cpu", **processes))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), "lost" in sys.argv[2:])

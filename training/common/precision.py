@@ -14,7 +14,7 @@ GAIN = 1.25
 _ROUNDS = 3
 
 
-def resolved(accelerator: str, devices: str) -> tuple[Resolved, str]:
+def resolved(accelerator: str, devices: str, num_nodes: int) -> tuple[Resolved, str]:
     """The better precision for a device by Lightning's name, and why, in words.
 
     A GPU says what it can. A CPU is measured: many have instructions for bfloat16 and still lose time on conversions.
@@ -26,7 +26,7 @@ def resolved(accelerator: str, devices: str) -> tuple[Resolved, str]:
         return "32-true", "the GPU has no bfloat16"
     if accelerator not in ("auto", "cpu"):
         return "32-true", f"bfloat16 is not tried on {accelerator}"
-    if devices not in ("auto", "1"):
+    if num_nodes > 1 or devices not in ("auto", "1"):
         return "32-true", "several processes train on CPUs"
     gain = cpu_gain()
     why = f"on this CPU bfloat16 has {gain:.2f} times the speed of float32"

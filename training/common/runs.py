@@ -1,7 +1,9 @@
 """The folder of a run with its record, and its trainer, for all trainings."""
 
 import dataclasses
+import hashlib
 import json
+import os
 import shlex
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,6 +14,8 @@ from typing import Any
 
 import lightning
 import torch
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 
 from training.common.curves import Batch, Curves, batch_size, write_at_once
@@ -27,12 +31,14 @@ class RunError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerArguments:
-    """Device, processes and precision of a training."""
+    """Device, processes, machines and precision of a training."""
 
     accelerator: str = "auto"
     """Kind of device by Lightning's name, such as cpu or gpu; auto: a GPU where there is one."""
     devices: str = "auto"
-    """Processes that train together, each on batches of its own; auto: one, or one a GPU."""
+    """Processes that train together on a machine, each on batches of its own; auto: one, or one a GPU."""
+    num_nodes: int = 1
+    """Machines that train together, each started by torchrun, with one ``runs`` folder that all of them share."""
     strategy: str = "auto"
     """How processes work together, by Lightning's name, such as ddp; auto: ddp if there are several."""
     precision: Precision = "auto"
@@ -125,6 +131,27 @@ class BestWeights(Callback):
         self.value, self.epoch, self.weights = state_dict["value"], state_dict["epoch"], state_dict["weights"]
 
 
+class SameStart(Callback):
+    """Sees to it that all processes of a training go on from one checkpoint, before the first of them does."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Raise ``RunError`` in every process where their folders hold different checkpoints."""
+        if trainer.world_size == 1:
+            return
+        path = resume_from(self.folder)
+        mine = "no checkpoint" if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
+        found: list[str] = [""] * trainer.world_size
+        torch.distributed.all_gather_object(found, mine)
+        if len(set(found)) > 1:
+            held = ", ".join(f"process {rank}: {what}" for rank, what in enumerate(found))
+            raise RunError(
+                f"{self.folder} is not the same for all processes ({held}); expected a folder that all machines share"
+            )
+
+
 class Run:
     """A training in a folder of its own: ``run.json``, ``metrics.csv`` and ``last.ckpt``, and its trainer.
 
@@ -150,6 +177,7 @@ class Run:
         settings: Mapping[str, Any] | None = None,
     ) -> None:
         self.folder = folder
+        check_launcher(arguments.num_nodes)
         why = ""
         if arguments.precision == "auto":
             precision, why = self._precision(arguments)
@@ -168,9 +196,10 @@ class Run:
             epochs,
             seed,
             arguments.precision,
-            [self.curves, *([] if self.best is None else [self.best])],
+            [SameStart(folder), self.curves, *([] if self.best is None else [self.best])],
             accelerator=arguments.accelerator,
             devices=arguments.devices,
+            num_nodes=arguments.num_nodes,
             strategy=arguments.strategy,
         )
         self.is_first = bool(self.trainer.is_global_zero)
@@ -183,7 +212,7 @@ class Run:
         if path.exists() and resume_from(self.folder) is not None:
             begun: Precision = json.loads(path.read_text())["arguments"]["precision"]
             return begun, "as the run began"
-        return resolved(arguments.accelerator, arguments.devices)
+        return resolved(arguments.accelerator, arguments.devices, arguments.num_nodes)
 
     def _check_arguments(self) -> None:
         path = self.folder / "run.json"
@@ -226,6 +255,19 @@ class Run:
 
     def _write(self) -> None:
         write_at_once(self.folder / "run.json", json.dumps(self._description, indent=2) + "\n")
+
+
+def check_launcher(num_nodes: int) -> None:
+    """Raise ``RunError`` where several machines are to train together and nothing started this process as one of them.
+
+    Without the check it would wait for the others for half an hour.
+    """
+    known = TorchElasticEnvironment.detect() or SLURMEnvironment.detect() or "NODE_RANK" in os.environ
+    if num_nodes != 1 and not (known and num_nodes > 1):
+        raise RunError(
+            f"--num-nodes is {num_nodes}, and this process was started alone; expected 1, or a start by torchrun on "
+            "each machine: see docs/how-to/train_the_shipped_networks.md"
+        )
 
 
 def _now() -> str:

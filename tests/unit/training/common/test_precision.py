@@ -16,19 +16,19 @@ def test_a_cpu_gets_bfloat16_only_where_that_is_clearly_faster(
     gain: float, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(precision, "cpu_gain", lambda: gain)
-    assert resolved("cpu", "auto") == (expected, f"on this CPU bfloat16 has {gain:.2f} times the speed of float32")
+    assert resolved("cpu", "auto", 1) == (expected, f"on this CPU bfloat16 has {gain:.2f} times the speed of float32")
 
 
 @pytest.mark.parametrize(("supported", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
 def test_a_gpu_says_what_it_can(supported: bool, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: supported)
-    assert resolved("auto", "auto")[0] == resolved("gpu", "2")[0] == expected
+    assert resolved("auto", "auto", 1)[0] == resolved("gpu", "2", 1)[0] == expected
 
 
 def test_nothing_is_measured_for_several_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(precision, "cpu_gain")
-    assert resolved("cpu", "2")[0] == "32-true"
+    assert resolved("cpu", "2", 1)[0] == resolved("cpu", "1", 2)[0] == "32-true"
 
 
 def test_the_measurement_leaves_the_random_numbers_alone() -> None:

@@ -27,7 +27,7 @@ def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
     record = runs.record("train_local", Arguments("maze2d", batch_size=4, out=Path("/elsewhere"), devices="2"))
     assert record["command"] == "python -m training.train_local --devices 2 --world maze2d --batch-size 4"
     expected = {"world": "maze2d", "learning_rate": 1e-3, "batch_size": 4}
-    trainer = {"accelerator": "auto", "devices": "2", "strategy": "auto", "precision": "auto"}
+    trainer = {"accelerator": "auto", "devices": "2", "num_nodes": 1, "strategy": "auto", "precision": "auto"}
     assert record["arguments"] == {**trainer, **expected}
     assert record["revision"]
 
@@ -100,3 +100,9 @@ def test_a_run_does_not_go_on_with_other_settings_of_its_world(tmp_path: Path) -
     assert run.finish({})["settings"] == {"drivers": ["corners"], "loss_scale": 0.1}
     with pytest.raises(ValueError, match=r"given loss_scale 0.3; expected loss_scale 0.1 to go on with it"):
         begin(drivers=["corners"], loss_scale=0.3)
+
+
+@pytest.mark.parametrize("nodes", [0, 2])
+def test_a_training_on_machines_that_nothing_started_together_is_refused(nodes: int, tmp_path: Path) -> None:
+    with pytest.raises(runs.RunError, match=f"--num-nodes is {nodes}, and this process was started alone"):
+        begin(tmp_path, num_nodes=nodes)
