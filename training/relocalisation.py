@@ -105,7 +105,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
             "logs": result["logs"],
         }
     if arguments.logs is not None:
-        result["logs"] = {**made, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
+        of_logs = {**made, "command": f"{made['command']} --logs FOLDER"}
+        result["logs"] = {**of_logs, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
     write_at_once(path, json.dumps(result, indent=2) + "\n")
     write_at_once(arguments.docs / "results_relocalisation.md", relocalisation_page.page(result))
     for table, rows in result["tables"].items():

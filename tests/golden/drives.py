@@ -9,8 +9,8 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 
 FOLDER = Path(__file__).parent
 WEIGHTS = FOLDER.parents[1] / "ros_ws/src/ngo_estimator/weights"

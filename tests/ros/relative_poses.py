@@ -13,8 +13,8 @@ from ngo_estimator.checkpoint import OPTIMIZER, PLACE, PlaceNetworks, save_check
 from ngo_estimator.geometry import se2
 from ngo_estimator.nodes.messages import relative_pose_message, relative_step, to_ns
 from ngo_estimator.odometry.local_odometry import LocalEstimate
-from ngo_estimator.online.corrected_trajectory import TrajectoryUpdate
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 from tests.unit.ngo_estimator.samples import place_config, small_optimizer
 
 from .estimator_graph import FIRST_RUN_NS, RUN_NS, STEP_NS

@@ -36,11 +36,12 @@ def page(result: dict[str, Any]) -> str:
 
 _LOGS = """## Real logs of a lidar
 
-Written by `{command}` at revision {revision}. The first half of a drive is the map, and the robot starts at {starts}
-places of the second half. Within 30 m a claimed pose is right where the map of the whole drive has the robot (0.5 m,
-5 deg): there is no better truth. A start counts as mapped where 90 % of its first 10 m lie within 2 m of the map's way.
-In the other starts the robot may come to the map later. `aces`, `mit-csail`, `belgioioso`, `freiburg-101` and `seattle`
-served development."""
+Written by `{command}` at revision {revision}.
+
+The first half of a drive is the map. The robot starts at {starts} places of the second half and drives up to 30 m. A
+pose is right where the map of the whole drive has the robot (0.5 m, 5 deg): there is no better truth. A start counts
+as mapped where 90 % of its first 10 m lie within 2 m of the map's way. From the others the robot may come to the map
+later, or never. `aces`, `mit-csail`, `belgioioso`, `freiburg-101` and `seattle` served development."""
 
 
 def _log_table(tables: dict[str, Any]) -> str:

@@ -18,9 +18,9 @@ import ngo_estimator
 from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
-from ngo_estimator.online.corrected_trajectory import Trajectory
 from ngo_estimator.online.scan_graph import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.online.trajectory_update import Trajectory
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses
 from ngo_recordings.scan_stream import WheelPose
 from training.baselines import lidar_peers, mrpt_slam

@@ -12,7 +12,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.odometry.local_odometry import LocalEstimate
-from ngo_estimator.online.corrected_trajectory import Trajectory as WholeTrajectory
+from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
 
 
 def over_the_wire(message: Any) -> Any:

@@ -15,8 +15,8 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.odometry.frame_pairing import FramePairing
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.odometry.rejected_frames import RejectedFrame
-from ngo_estimator.online.corrected_trajectory import TrajectoryUpdate
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 from tests.unit.ngo_estimator.samples import local_config, place_config, small_optimizer
 
 PERIOD_NS = 100_000_000

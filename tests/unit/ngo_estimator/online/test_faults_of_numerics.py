@@ -11,9 +11,9 @@ import torch
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.online import meta_graph
-from ngo_estimator.online.corrected_trajectory import TrajectoryUpdate
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 
 WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"

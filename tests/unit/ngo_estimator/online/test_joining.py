@@ -15,12 +15,13 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.bridge import bridged
-from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory, TrajectoryUpdate
+from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.joining import Joining
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.saved_state import read_state, write_state
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 from tests.golden.drives import WEIGHTS, GoldenDrive, estimates
 from tests.unit.ngo_estimator.lidar_steps import HOUSE, drifted, lidar_steps, loop_way
 from tests.unit.ngo_estimator.online.test_saved_state import assert_same

@@ -88,3 +88,21 @@ def test_a_lidar_finds_its_pose_in_the_key_scans_of_a_house() -> None:
     expected = ORIGIN.poses(other[-1])
     off = between(expected, last_pose(found[-1]))
     assert np.hypot(*off[:2]) < 0.05 and abs(off[2]) < 0.02
+
+
+def test_a_scanner_that_sees_no_more_than_what_is_ahead_is_found_on_the_way_back() -> None:
+    """The scans from the same place show what is behind it; those from farther on show what it sees."""
+    way, angles = loop_way(1.0), fan(181)
+    mapped = ScanTrajectory()
+    for step in lidar_steps(way, lambda k, stamp_ns: scan_at(HOUSE, way[k], stamp_ns, angles)):
+        mapped.update(step)
+    back = way[40::-1] + (0.0, 0.0, math.pi)
+    matcher, seen, asked = mapped.graph.matcher(MapOrigin.of_first_pose(np.zeros(3))), 0, 0
+    odometry = np.array([between(back[0], pose) for pose in back])
+    for step in lidar_steps(odometry, lambda k, stamp_ns: scan_at(HOUSE, back[k], stamp_ns, angles)):
+        if matcher.append(step, step.odom_xyyaw):
+            pose = compose(back[0], step.odom_xyyaw)
+            poses = matcher.around(pose).poses
+            asked, seen = asked + 1, seen + len(poses)
+            assert all(np.hypot(*between(pose, found)[:2]) < 0.1 for found in poses)
+    assert asked > 10 and seen >= 0.8 * asked

@@ -6,8 +6,8 @@ import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from tests.unit.ngo_estimator.online.test_online_memory import SeesPoses, robust_graph
 from tests.unit.ngo_estimator.samples import small_optimizer

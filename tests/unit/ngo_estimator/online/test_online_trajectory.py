@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from ngo_estimator.checkpoint import CheckpointError, write_untrained
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RejectedStep, RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs

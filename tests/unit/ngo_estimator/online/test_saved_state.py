@@ -251,7 +251,7 @@ def test_a_state_is_replaced_by_a_whole_one_or_not_at_all(
                 raise OSError(28, "No space left on device")
 
         monkeypatch.setattr(os, "fsync", fsync)
-        with pytest.raises(StateError, match=r"state: cannot be written \(No space left on device\)"):
+        with pytest.raises(StateError, match=r"state/\S+: cannot be written \(No space left on device\)"):
             write_state(folder, core.identity, core.state())
         calls.clear()
         with pytest.raises(StateError, match="cannot be written"):

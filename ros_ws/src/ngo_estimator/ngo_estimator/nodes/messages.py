@@ -28,7 +28,7 @@ from ngo_estimator.geometry.planar_covariance import to_planar, to_spatial
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
     from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
     from ngo_estimator.geometry import key_scan
-    from ngo_estimator.online.corrected_trajectory import Trajectory as WholeTrajectory
+    from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
 _LOOP_WIDTH_M = 0.03

@@ -32,9 +32,9 @@ from ngo_estimator.nodes.weights import load_trajectory
 
 if TYPE_CHECKING:
     from ngo_estimator.nodes.file_services import Loaded
-    from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
     from ngo_estimator.online.map_localisation import LocalisedStep
     from ngo_estimator.online.tf_smoothing import SmoothedCorrection
+    from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100

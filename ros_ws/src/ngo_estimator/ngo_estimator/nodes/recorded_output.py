@@ -15,7 +15,7 @@ from ngo_estimator.mapping.scan_source import ScanSource
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
-from ngo_estimator.online.corrected_trajectory import Trajectory
+from ngo_estimator.online.trajectory_update import Trajectory
 from ngo_estimator.trajectory.errors import aligned, associate
 from ngo_estimator.trajectory.files import SpatialPoses, write_trajectory
 from ngo_estimator.trajectory.plot import save_plot

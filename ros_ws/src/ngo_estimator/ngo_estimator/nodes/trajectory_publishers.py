@@ -20,7 +20,7 @@ from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.online.publication_pace import PublicationPace
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.corrected_trajectory import Trajectory as WholeTrajectory
+    from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
 
 _DEPTH = 10
 

@@ -13,8 +13,8 @@ from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.odometry.frame_pairing import FramePairing
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
-from ngo_estimator.online.corrected_trajectory import Trajectory, TrajectoryUpdate
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.files import SpatialPoses, seconds
 from ngo_recordings.frames import Frame
 

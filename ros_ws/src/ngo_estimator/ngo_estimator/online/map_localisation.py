@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,9 +11,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.online.localisation import Localisation, Localiser
 from ngo_estimator.online.step_log import StepLog
-
-if TYPE_CHECKING:
-    from ngo_estimator.online.corrected_trajectory import TrajectoryUpdate
+from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class LocalisedStep:
     map_from_odom_xyyaw: np.ndarray | None
     restarted: bool
     gap: bool
-    joined: "TrajectoryUpdate | None" = None
+    joined: TrajectoryUpdate | None = None
 
 
 class MapLocalisation:
