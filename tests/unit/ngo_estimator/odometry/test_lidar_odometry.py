@@ -141,11 +141,10 @@ def test_stamps_that_came_already_and_restarts() -> None:
     np.testing.assert_array_equal(again[-1].odom_xyyaw, fed(LidarOdometry(), ours)[-1].odom_xyyaw)
 
 
-@pytest.mark.parametrize("with_wheels", [True, False])
-def test_deskew_helps_a_robot_that_turns(with_wheels: bool) -> None:
-    """A scanner that sweeps for 0.09 s on a robot that turns to and fro, after it stood."""
+def swept_scans(turns: list[float]) -> tuple[np.ndarray, list[LidarScan], list[LidarScan]]:
+    """Poses of a robot that turns by so much (rad) from scan to scan, and scans that sweep for 0.09 s, which do not say
+    it and which do."""
     sweep_s, rays = 0.09, len(ANGLES)
-    turns = [0.0] * 5 + [math.radians(8.0 if k // 8 % 2 else -8.0) for k in range(56)]
     steps_xyyaw = [np.array((0.05 if turn else 0.0, 0.0, turn)) for turn in turns]
     poses = [np.array((1.5, 1.2, 0.6))]
     for step in steps_xyyaw:
@@ -158,15 +157,40 @@ def test_deskew_helps_a_robot_that_turns(with_wheels: bool) -> None:
         ranges += noise.normal(0.0, 0.005, rays)
         plain.append(scan_of(ranges, k))
         swept.append(scan_of(ranges, k, time_increment=sweep_s / rays))
+    return np.array(poses), plain, swept
+
+
+@pytest.mark.parametrize("with_wheels", [True, False])
+def test_deskew_helps_a_robot_that_turns(with_wheels: bool) -> None:
+    """It turns to and fro, after it stood."""
+    poses, plain, swept = swept_scans([0.0] * 5 + [math.radians(8.0 if k // 8 % 2 else -8.0) for k in range(56)])
     found = []
     for each in (plain, swept):
         records: list[Any] = list(each)
         if with_wheels:
-            records = [record for pair in zip(wheels(np.array(poses)), each, strict=False) for record in pair]
+            records = [record for pair in zip(wheels(poses), each, strict=False) for record in pair]
         steps = fed(LidarOdometry(), records)
         errors = [between(between(poses[0], p), step.odom_xyyaw) for p, step in zip(poses[1:], steps, strict=False)]
         found.append(float(np.sqrt(np.mean(np.square(errors)[:, :2].sum(1)))))
     assert found[1] < (0.1 if with_wheels else 0.7) * found[0]
+
+
+@pytest.mark.parametrize("with_wheels", [True, False])
+def test_a_turn_that_begins_within_a_sweep_is_in_the_covariance_where_no_wheels_tell_it(with_wheels: bool) -> None:
+    begins = 10
+    poses, _, swept = swept_scans([0.0] * begins + [math.radians(6.0)] * 10)
+    records: list[Any] = list(swept)
+    if with_wheels:
+        records = [record for pair in zip(wheels(poses), swept, strict=False) for record in pair]
+    steps = fed(LidarOdometry(), records)
+    relative = [between(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)]
+    errors = np.array([abs(step.relative_xyyaw[2] - true[2]) for step, true in zip(steps, relative, strict=False)])
+    deviations = np.array([math.sqrt(step.covariance[2, 2]) for step in steps])
+    # The scan at which it begins to turn says so only at the end: by then it has swept over half of 5.4 degrees.
+    assert (errors[begins - 1 : begins + 2] < 3.0 * deviations[begins - 1 : begins + 2]).all()
+    largest = math.degrees(deviations[begins - 1 : begins + 2].max())
+    assert largest < 0.5 if with_wheels else largest > 1.5
+    assert math.degrees(deviations[3 : begins - 2].max()) < 0.5
 
 
 def hostile_scans() -> dict[str, LidarScan]:

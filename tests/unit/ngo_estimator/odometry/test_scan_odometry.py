@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,6 +153,23 @@ def test_late_wheels_are_found_out() -> None:
         scan = scan_at(ROOM, fine[round(10 * i - 100 * lag_s)], i * STEP_NS, fan(181))
         odometry.update(scan, wheels)
     assert wheels.lag_s == pytest.approx(lag_s, abs=0.02)
+
+
+@pytest.mark.parametrize("with_wheels", [False, True])
+def test_a_match_of_few_points_after_a_pause_is_sure_by_wheels_alone(with_wheels: bool) -> None:
+    """Half of the scan shows what was not there before: without wheels the robot may as well be where it was going."""
+    poses = np.tile(round_trip(60)[0], (11, 1))
+    scans = scans_along(ROOM, poses, fan(361, 360.0))
+    late = replace(scans[-1], stamp_ns=scans[-2].stamp_ns + 5 * STEP_NS)
+    seen = np.random.default_rng(0).random(len(late.points)) < 0.62
+    scans[-1] = replace(late, points=np.where(seen[:, None], late.points, 0.4 * late.points))
+    wheels = np.zeros((11, 3)) + 1e-3 * np.arange(11)[:, None]
+    estimates, _ = drive(scans, wheels if with_wheels else None)
+    last = estimates[-1]
+    assert 0.5 <= last.share < 0.7 and last.searched == (not with_wheels) and not last.unsure
+    assert np.hypot(*last.pose[:2]) < 0.05
+    deviation = math.sqrt(last.since_key_covariance[0, 0])
+    assert deviation < 0.05 if with_wheels else deviation > 0.15
 
 
 def test_scans_come_in_order() -> None:

@@ -12,7 +12,7 @@ from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.planar_motion import Array, between, compose
+from ngo_estimator.geometry.planar_motion import Array, between, compose, turned_covariance
 from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep, key_scan
 from ngo_estimator.networks.step_deviation import StepDeviation
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
@@ -125,6 +125,7 @@ class LidarOdometry:
         self._origin: KeyScan | None = None
         self._robot_odom: Array | None = None
         self._key_ns = 0
+        self._key_doubt = self._last_doubt = np.zeros((3, 3))
         self._origin_ns = 0
 
     @property
@@ -209,7 +210,8 @@ class LidarOdometry:
         )
 
     def _step(self, scan: LidarScan) -> LidarStep | None:
-        key = self._key_scan(scan)
+        sweep = self._sweep(scan)
+        key = self._key_scan(scan, sweep)
         if len(key.points) < _LEAST_POINTS:
             raise UnusableImage(f"the scan has {len(key.points)} usable returns; expected at least {_LEAST_POINTS}")
         last = self._last
@@ -218,24 +220,37 @@ class LidarOdometry:
         if last is None:
             self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns
             return None
-        self._last_steps.append(((key.stamp_ns - last.stamp_ns) * 1e-9, estimate.step))
-        return self._published(key, last, estimate)
+        elapsed_s = (key.stamp_ns - last.stamp_ns) * 1e-9
+        self._last_steps.append((elapsed_s, estimate.step))
+        doubt = np.zeros((3, 3))
+        if sweep is not None and self._wheels is None:
+            # Its points were moved by another motion than the robot turned out to have: by half of it on the mean.
+            off = 0.5 * _duration_s(scan) * (estimate.step / elapsed_s - sweep.twist)
+            doubt = np.outer(off, off)
+        return self._published(key, last, estimate, doubt)
 
-    def _published(self, key: KeyScan, last: KeyScan, estimate: ScanEstimate) -> LidarStep:
+    def _published(self, key: KeyScan, last: KeyScan, estimate: ScanEstimate, doubt: Array) -> LidarStep:
+        """The step; ``doubt`` ``(3, 3)`` is the covariance that the sweep's motion adds to the scan's pose, along the
+        robot's axes."""
         least = np.diag((self.config.least_variance_m2, self.config.least_variance_m2, self.config.least_variance_rad2))
+        both = self._last_doubt + turned_covariance(estimate.step[2], doubt)
+        self._last_doubt = doubt
         key_step = None
         if estimate.is_key:
-            key_step = KeyScanStep(
-                key, self._key_ns, estimate.since_key, estimate.since_key_covariance + least, estimate.factors
-            )
-            self._key_ns = key.stamp_ns
+            own = estimate.since_key_covariance + least
+            more = self._key_doubt + turned_covariance(estimate.since_key[2], doubt)
+            # The network that gave the factors knows nothing of sweeps.
+            scaled = own.diagonal() * estimate.factors**2 + more.diagonal()
+            factors = np.sqrt(scaled / (own + more).diagonal())
+            key_step = KeyScanStep(key, self._key_ns, estimate.since_key, own + more, factors)
+            self._key_ns, self._key_doubt = key.stamp_ns, doubt
         origin, self._origin = self._origin, None
         nothing = np.zeros(0, np.float32)
         return LidarStep(
             stamp_ns=key.stamp_ns,
             from_stamp_ns=last.stamp_ns,
             relative_xyyaw=estimate.step,
-            covariance=estimate.step_covariance + least,
+            covariance=estimate.step_covariance + least + both,
             origin_stamp_ns=self._origin_ns,
             odom_xyyaw=estimate.pose,
             motion_feature=nothing,
@@ -256,7 +271,7 @@ class LidarOdometry:
         self._robot_odom = pose
         return pose
 
-    def _key_scan(self, scan: LidarScan) -> KeyScan:
+    def _key_scan(self, scan: LidarScan, sweep: Sweep | None) -> KeyScan:
         angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
@@ -267,7 +282,7 @@ class LidarOdometry:
                 scan.ranges,
                 (least, largest),
                 self.mounting,
-                self._sweep(scan),
+                sweep,
                 self.config.points,
             )
         except ValueError as error:

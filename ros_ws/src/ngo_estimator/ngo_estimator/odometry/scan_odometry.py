@@ -31,7 +31,8 @@ class ScanOdometryConfig:
     ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
     where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
     ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that is
-    ``farthest_deviations`` from the prediction is no better than it.
+    ``farthest_deviations`` from the prediction is no better than it. Where no wheels lead, one of less than
+    ``sure_share`` after a search is as likely as the prediction.
     """
 
     key_distance_m: float = 0.3
@@ -137,7 +138,9 @@ class ScanOdometry:
         prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, doubt, searched = self._register(scan, prediction)
         unsure = self._is_unsure(found, prediction)
-        pose, covariance = (prediction.mean, prediction.covariance) if unsure else (found.pose, found.covariance)
+        pose, covariance = prediction.mean, prediction.covariance
+        if not unsure:
+            pose, covariance = found.pose, self._covariance_of(found, prediction, searched)
         if doubt is not None and not unsure:
             covariance, unsure = covariance + doubt, True
         return self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
@@ -185,6 +188,14 @@ class ScanOdometry:
             if again.share > best.share and not self._is_unsure(again, prediction):
                 best = again
         return best, None if prediction.measured else place.doubt, True
+
+    def _covariance_of(self, found: Registration, prediction: Prediction, searched: bool) -> Array:
+        """The registration's covariance; that of two places where it may as well be the predicted one."""
+        if prediction.by_wheels or not searched or found.share >= self.config.sure_share:
+            return found.covariance
+        away = found.pose - prediction.mean
+        away[2] = wrap(away[2])
+        return 0.5 * (found.covariance + prediction.covariance + np.outer(away, away))
 
     def _best(self, scan: KeyScan, starts: list[Array], prior: tuple[Array, Array], open_share: float) -> Registration:
         """The registration, among those from all starts, that fits most points."""

@@ -17,7 +17,7 @@ from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded, propagate
-from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_matcher import ScanMatcher
@@ -140,8 +140,7 @@ class ScanGraph:
         With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place.
         """
         self.optimized, self.fault = False, ""
-        last = torch.from_numpy(self.odometry.values[-1])
-        self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        self.odometry.append(compose(self.odometry.values[-1], relative.astype(np.float64)))
         if joins:
             self._joins.append(len(self.odometry) - 1)
         since = self._since_key()
@@ -174,8 +173,7 @@ class ScanGraph:
 
     def _since_key(self) -> np.ndarray:
         """Pose ``(3,)`` of the newest frame, seen from the last node."""
-        ends = torch.from_numpy(self.odometry.values[[int(self._frames.values[-1]), -1]])
-        since: np.ndarray = se2.between(ends[0], ends[1]).numpy()
+        since: np.ndarray = between(self.odometry.values[int(self._frames.values[-1])], self.odometry.values[-1])
         return since
 
     def _complete(self, key: KeyScanStep, since: np.ndarray, covariance: np.ndarray, published: np.ndarray) -> None:
@@ -185,7 +183,7 @@ class ScanGraph:
         self._step_covariance.append(covariance + floor)
         self._step_variance.append(largest_variances((covariance + floor)[None])[0])
         self._published_covariance.append(published + floor)
-        pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
+        pose = compose(self._nodes.values[-1], since)
         self._end = propagate(self._end, pose, since, published + floor)
         self._nodes.append(pose)
         self._frames.append(len(self.odometry) - 1)
@@ -318,7 +316,7 @@ class ScanGraph:
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
         since = self._since_key()
-        pose = se2.compose(torch.from_numpy(self._nodes.values[-1]), torch.from_numpy(since)).numpy()
+        pose = compose(self._nodes.values[-1], since)
         return pose, propagate(self._end, pose, since, self._since)
 
     def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
