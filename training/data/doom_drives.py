@@ -78,9 +78,7 @@ def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
             yield from _levels(place, [seed], frames, driver, np.random.default_rng([seed, 2]))
 
 
-def _levels(
-    place: str, seeds: Sequence[int], frames: int, driver: str, rng: np.random.Generator
-) -> Iterator[Episode]:
+def _levels(place: str, seeds: Sequence[int], frames: int, driver: str, rng: np.random.Generator) -> Iterator[Episode]:
     """An episode in the level or the maze of each seed; the size of all mazes is drawn by ``rng``."""
     env: Any = Maze3D(Maze3DConfig(level="rooms")) if place == "rooms" else WORLDS["maze3d"].make_random(rng)
     try:

@@ -90,6 +90,8 @@ class World(Domain):
     """Numbers of steps after which a table gives errors."""
     error_windows: tuple[int, ...] = (1,)
     """Lengths of the windows of steps over which losses sum errors: errors that last make the sum drift."""
+    deviation_steps: int = 1
+    """Number of steps over whose sums the deviations of the local network are fitted."""
 
     @property
     def stream_drivers(self) -> tuple[str, ...]:
@@ -242,7 +244,8 @@ WORLDS["doom"] = dataclasses.replace(
     # Walls have any height there, and a picture does not tell how far they are.
     registration=None,
     overlaps=0,
-    smoothing=False,
+    # Along a wall that slows the robot errors last.
+    deviation_steps=100,
     tables={"unseen": Table()},
 )
 

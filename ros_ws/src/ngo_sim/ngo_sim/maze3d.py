@@ -26,8 +26,8 @@ from ngo_sim.doom_map import (
     wall_faces,
 )
 from ngo_sim.drivers import Action
-from ngo_sim.rooms_level import rooms_textmap
 from ngo_sim.mazes import Maze, check_aliased, check_maze_size, kruskal_maze, repeated_maze
+from ngo_sim.rooms_level import rooms_textmap
 
 TICS_PER_S = 35
 """Doom's fixed rate of simulation."""
@@ -150,7 +150,8 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     "maze_seed" of reset takes maze, textures and decorations of another seed; start and noise remain those of s.
     Option "drawn_start" of reset draws the start on a Doom map, among the places of things that lie there.
     A Doom map has its own looks and start, and poses are in the map's own axes. There and in a level of
-    rooms `maze` is None, and a door opens to who walks against it. Raises ValueError for a map that is not there.
+    rooms `maze` is None, a door opens to who walks against it, and what flickers does so by the engine's clock.
+    Raises ValueError for a map that is not there.
 
     The engine is a process, which ends with close(), with the environment or with the interpreter,
     whichever comes first.

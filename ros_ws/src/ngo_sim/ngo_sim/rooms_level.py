@@ -10,7 +10,9 @@ from __future__ import annotations
 import functools
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import networkx as nx
 import numpy as np
@@ -19,6 +21,7 @@ from ngo_sim.doom_engine import MAZE_GAME
 from ngo_sim.doom_map import DECORATIONS, UNITS_PER_M, thing
 from ngo_sim.doom_wad import read_wad
 
+T = TypeVar("T")
 Point = tuple[float, float]
 Edge = tuple[Point, int]
 """The corner at which an edge of a convex polygon begins (counter-clockwise), and the line that it lies on."""
@@ -112,7 +115,7 @@ class _Level:
     def chance(self, probability: float) -> bool:
         return bool(self.rng.random() < probability)
 
-    def drawn(self, options):  # type: ignore[no-untyped-def]
+    def drawn(self, options: Sequence[T]) -> T:
         return options[int(self.rng.integers(len(options)))]
 
     # Rooms
@@ -181,7 +184,8 @@ class _Level:
                 for b, edge_b, _, low_b, high_b in (span for span in spans if not span[2]):
                     low, high = max(low_a, low_b) + 0.1, min(high_a, high_b) - 0.1
                     if high - low > _BODY_M and not graph.has_edge(a, b):
-                        graph.add_edge(a, b, line=line, thickness=2 * half_walls[line], edges={a: edge_a, b: edge_b}, low=low, high=high,
+                        graph.add_edge(a, b, line=line, thickness=2 * half_walls[line],
+                                       edges={a: edge_a, b: edge_b}, low=low, high=high,
                                        weight=self.rng.random())  # fmt: skip
         if not graph:
             return
@@ -199,7 +203,7 @@ class _Level:
             if tree.has_edge(a, b) or self.chance(0.5):
                 self.link(rooms, a, b, graph.edges[a, b], tree.has_edge(a, b))
 
-    def link(self, rooms: list[_Room], a: int, b: int, between: dict, needed: bool) -> None:  # type: ignore[type-arg]
+    def link(self, rooms: list[_Room], a: int, b: int, between: dict[str, Any], needed: bool) -> None:
         """Open the wall between two rooms: by strips of floor from one to the other, each a sector of its own."""
         length = between["high"] - between["low"]
         width = self.rng.uniform(_BODY_M, min(length, self.drawn((2.0, 3.0, 5.0, 20.0))))
@@ -207,7 +211,7 @@ class _Level:
         origin, direction = self.lines[between["line"]]
         ends = []  # of the opening on either room's edge
         for room in (a, b):
-            start, end = _sides(rooms[room].edges)[between["edges"][room]]
+            start, _ = _sides(rooms[room].edges)[between["edges"][room]]
             away = _cross(direction, (start[0] - origin[0], start[1] - origin[1]))
             normal = -direction[1] * away, direction[0] * away
             ends.append([(origin[0] + at * direction[0] + normal[0], origin[1] + at * direction[1] + normal[1])
@@ -245,10 +249,10 @@ class _Level:
             if i:
                 first, last = (near_0, near_1) if self.left_of(near_0, near_1, far_0) else (near_1, near_0)
                 self.line(first, last, sector, wall, sectors[i - 1])
-        for room, (first, last), sector in ((a, ends[0], sectors[0]), (b, ends[1], sectors[-1])):
+        for room, opening, sector in ((a, ends[0], sectors[0]), (b, ends[1], sectors[-1])):
             edge = between["edges"][room]
             start = rooms[room].edges[edge][0]
-            first, last = sorted((first, last), key=lambda point: math.dist(point, start))
+            first, last = sorted(opening, key=lambda point: math.dist(point, start))
             rooms[room].openings.setdefault(edge, []).append((first, last, sector, does))
 
     @staticmethod
@@ -296,7 +300,9 @@ class _Level:
             kinds = _STANDING_THINGS if self.chance(0.5) else DECORATIONS
             center = self.free_place(room, taken, 0.4, 0.4)
             if center is not None:
-                self.parts["thing"].append(thing(int(self.drawn(kinds)), *(value * UNITS_PER_M for value in center), 0))
+                x, y = center
+                kind = int(self.drawn(kinds))
+                self.parts["thing"].append(thing(kind, x * UNITS_PER_M, y * UNITS_PER_M, 0))
 
     def free_place(self, room: _Room, taken: list[tuple[Point, float]], radius: float, gap: float) -> Point | None:
         """A drawn middle of a circle in a room that keeps a gap to its walls and to what is taken, or None."""
@@ -342,9 +348,7 @@ class _Level:
         )
         return len(self.parts["sector"]) - 1
 
-    def line(
-        self, start: Point, end: Point, sector: int, wall: str, behind: int | None = None, does: str = ""
-    ) -> None:
+    def line(self, start: Point, end: Point, sector: int, wall: str, behind: int | None = None, does: str = "") -> None:
         """A line with ``sector`` on its left: a wall, or open to the sector ``behind``."""
         if math.dist(start, end) < 1e-3:
             return
