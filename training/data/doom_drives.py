@@ -1,7 +1,8 @@
 """Drives of ``world:=doom``: through generated levels of rooms, through freedoom's maps, and through mazes.
 
-What is driven follows from the seed alone. Seeds of training take freedoom's training maps; all others take those for
-validation. The test maps are in no seed.
+What is driven follows from the seed alone. Seeds that something learns from take freedoom's training maps; those of
+validation, and the last ones of the optimizer, which calibrate the local network, take the maps for validation. The
+test maps are in no seed.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ _DRIVERS = {
     "rooms": (("explorer", "learned", "random"), (0.65, 0.3, 0.05)),
     "maze": (("random_goals", "learned", "explorer"), (0.65, 0.15, 0.2)),
 }
-_HELD_OUT = (*("map",) * 4, "rooms", "rooms", "maze", "maze")
+_ONE_BY_ONE = (*("map",) * 4, "rooms", "rooms", "maze", "maze")
+_CALIBRATION = 1000  # of the optimizer's seeds
 
 
 def map_drive(of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False) -> Episode:
@@ -57,7 +59,7 @@ def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
     Training seeds share what the first one draws: levels or mazes of their own, or one long drive on a map, in parts.
     Of other seeds each has its own, in turn maps, rooms and mazes.
     """
-    if seeds[0] in TRAIN_SEEDS and seeds[0] not in OPTIMIZER_TRAIN_SEEDS:
+    if seeds[0] in TRAIN_SEEDS:
         rng = np.random.default_rng([seeds[0], 2])
         place = str(rng.choice(_PLACES, p=_PLACE_SHARES))
         names, shares = _DRIVERS[place]
@@ -70,12 +72,14 @@ def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
             yield from _levels(place, seeds, frames, driver, rng)
         return
     for seed in seeds:
-        place = _HELD_OUT[seed % len(_HELD_OUT)]
-        if place == "map":
+        place, rng = _ONE_BY_ONE[seed % len(_ONE_BY_ONE)], np.random.default_rng([seed, 2])
+        learned_from = seed in OPTIMIZER_TRAIN_SEEDS and seed < OPTIMIZER_TRAIN_SEEDS[-_CALIBRATION]
+        if place == "map" and learned_from:
+            yield map_drive(TRAIN_MAPS[int(rng.integers(len(TRAIN_MAPS)))], seed, frames, drawn_start=True)
+        elif place == "map":
             yield map_drive(VALIDATION_MAPS[seed % len(VALIDATION_MAPS)], seed, frames)
         else:
-            driver = _DRIVERS[place][0][seed % 2]
-            yield from _levels(place, [seed], frames, driver, np.random.default_rng([seed, 2]))
+            yield from _levels(place, [seed], frames, _DRIVERS[place][0][seed % 2], rng)
 
 
 def _levels(place: str, seeds: Sequence[int], frames: int, driver: str, rng: np.random.Generator) -> Iterator[Episode]:

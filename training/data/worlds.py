@@ -244,6 +244,7 @@ WORLDS["doom"] = dataclasses.replace(
     # Walls have any height there, and a picture does not tell how far they are.
     registration=None,
     overlaps=0,
+    smoothing=False,
     # Along a wall that slows the robot errors last.
     deviation_steps=100,
     tables={"unseen": Table()},
