@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_place
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
 from training.common import runs
 from training.common.command_line import run_command
@@ -124,17 +125,24 @@ class Drives:
         self._networks = (described["sha256"], described_place["sha256"])
         self._world = world_named(arguments.world)
 
+    def drive(self, of: Map, seed: int, drawn_start: bool = False) -> Episode:
+        """A drive, which is simulated once."""
+        start = "-drawn" if drawn_start else ""
+        path = self._folder / "drives" / f"{map_name(of)}-{seed}-{self._frames}{start}.npz"
+        if not path.exists():
+            drive = map_drive(of, seed, self._frames, drawn_start=drawn_start)
+            _save(path, observations=drive.observations, actions=drive.actions, poses=drive.poses_xyyaw)
+        with np.load(path) as stored:
+            return Episode(stored["observations"], stored["actions"], stored["poses"], self._world.period_s, None)
+
     def features(self, of: Map, seed: int, drawn_start: bool = False) -> Features:
         """What the networks make of a drive."""
         key = hashlib.sha256(json.dumps([self._networks, of, seed, self._frames, drawn_start]).encode()).hexdigest()
         path = self._folder / f"{map_name(of)}-{seed}-{key[:12]}.npz"
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            drive = map_drive(of, seed, self._frames, drawn_start=drawn_start)
+            drive = self.drive(of, seed, drawn_start)
             features = features_of(self._world, drive, self._weights, (self.local, self.place))
-            partial = path.with_suffix(".part.npz")
-            np.savez(partial, actions=drive.actions, poses=drive.poses_xyyaw, **features)  # type: ignore[arg-type]
-            partial.rename(path)
+            _save(path, actions=drive.actions, poses=drive.poses_xyyaw, **features)
         with np.load(path) as stored:
             return dict(stored)
 
@@ -145,6 +153,14 @@ class Drives:
         errors = {row: errors_of(estimate, features["truth"]) for row, estimate in estimates.items()}
         tracks = {row: estimate.poses[:, :2] for row, estimate in estimates.items()}
         return Scored(errors, {"truth": features["truth"][:, :2], **tracks})
+
+
+def _save(path: Path, **arrays: np.ndarray) -> None:
+    """Write arrays as a file that is there as a whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".part.npz")
+    np.savez(partial, **arrays)  # type: ignore[arg-type]
+    partial.rename(path)
 
 
 def row_estimators(arguments: Arguments, drives: Drives) -> dict[str, Callable[[Features], Estimate]]:
