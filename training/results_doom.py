@@ -7,6 +7,7 @@ Each map is driven by the explorer with three seeds. The command writes ``traini
 where ``training/results/doom.gtsam.json`` is missing. Run it again to continue after a stop.
 """
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
@@ -77,14 +78,14 @@ def main(arguments: Arguments) -> dict[str, Any]:
     torch.set_num_threads(1)
     folder = arguments.weights / arguments.world
     drives = Drives(folder, arguments)
-    estimators = row_estimators(arguments, drives)
+    rows = row_estimators(arguments, drives)
     seeds = range(_FIRST_SEED[arguments.split], _FIRST_SEED[arguments.split] + arguments.seeds)
     maps = _MAPS[arguments.split][: arguments.maps or None]
     result: dict[str, Any] = {**runs.record("results_doom", arguments), "maps": {}}
     result.pop("arguments")
     tracks: dict[str, dict[str, np.ndarray]] = {}
     for of in tqdm(maps, desc=f"{arguments.world} {arguments.split}", unit="map"):
-        found = [drives.scored(of, seed, estimators) for seed in seeds]
+        found = [drives.scored(of, seed, rows) for seed in seeds]
         entry: dict[str, Any] = {
             row: {metric: mean_interval(np.array([one.errors[row][metric] for one in found])).as_json()
                   for metric in METRICS}
@@ -146,13 +147,28 @@ class Drives:
         with np.load(path) as stored:
             return dict(stored)
 
-    def scored(self, of: Map, seed: int, estimators: dict[str, Callable[[Features], Estimate]]) -> Scored:
+    def scored(self, of: Map, seed: int, rows: "Rows") -> Scored:
         """The errors of the rows on a drive."""
-        features = self.features(of, seed)
-        estimates = {row: estimator(features) for row, estimator in estimators.items()}
-        errors = {row: errors_of(estimate, features["truth"]) for row, estimate in estimates.items()}
-        tracks = {row: estimate.poses[:, :2] for row, estimate in estimates.items()}
-        return Scored(errors, {"truth": features["truth"][:, :2], **tracks})
+        key = hashlib.sha256(json.dumps([self._networks, rows.identity, self._frames]).encode()).hexdigest()
+        path = self._folder / "scored" / f"{map_name(of)}-{seed}-{key[:12]}.json"
+        if not path.exists():
+            features = self.features(of, seed)
+            estimates = {row: estimator(features) for row, estimator in rows.estimators.items()}
+            errors = {row: errors_of(estimate, features["truth"]) for row, estimate in estimates.items()}
+            tracks = {row: estimate.poses[:, :2].tolist() for row, estimate in estimates.items()}
+            tracks["truth"] = features["truth"][:, :2].tolist()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_at_once(path, json.dumps({"errors": errors, "tracks": tracks}))
+        stored = json.loads(path.read_text())
+        return Scored(stored["errors"], {row: np.array(track) for row, track in stored["tracks"].items()})
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The estimators of all rows, and what identifies them beside the networks of the odometry and of places."""
+
+    estimators: dict[str, Callable[[Features], Estimate]]
+    identity: str
 
 
 def _save(path: Path, **arrays: np.ndarray) -> None:
@@ -163,18 +179,19 @@ def _save(path: Path, **arrays: np.ndarray) -> None:
     partial.rename(path)
 
 
-def row_estimators(arguments: Arguments, drives: Drives) -> dict[str, Callable[[Features], Estimate]]:
+def row_estimators(arguments: Arguments, drives: Drives) -> Rows:
     """The estimators of all rows."""
     fitted = [drives.features(of, _FIT_SEED, drawn_start=True) for of in TRAIN_MAPS[:_FIT_MAPS]]
     actions = ActionsFit.of([(one["actions"], one["poses"]) for one in fitted])
     settings = load_settings(arguments.out / f"{arguments.world}.gtsam.json")
     core = OnlineTrajectory.load(arguments.weights / arguments.world, world=arguments.world)
-    return {
+    estimators = {
         "actions_only": actions.estimate,
         "local": local,
         "gtsam": gtsam_graph(settings, drives.place.pair_head),
         "ours": ours(core),
     }
+    return Rows(estimators, json.dumps([core.identity, dataclasses.asdict(settings)]))
 
 
 if __name__ == "__main__":
