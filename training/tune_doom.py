@@ -35,11 +35,11 @@ from training.scoring.doom_rows import Features, gtsam_graph, local
 from training.scoring.lidar_errors import absolute_error_m
 from training.scoring.online_estimate import with_origin
 
-BELIEFS = (0.0, -1.0, -2.0, -3.0)
+BELIEFS = (-1.0, -1.5, -2.0, -2.5)
 """Added to what a loop is believed, in quarters of its logit."""
-STEP_SCALES = (0.5, 1.0)
+STEP_SCALES = (0.125, 0.25, 0.5)
 """Factors of the deviations of steps."""
-LOOP_SCALES = (0.0, -1.2)
+LOOP_SCALES = (0.0, -0.6)
 """Stretch of the deviations of loops: the information gets the factor exp(4 tanh(x / 2))."""
 MOST_HARM = 1.05
 """Largest ratio of a drive's error to that of its odometry."""
@@ -132,7 +132,7 @@ def write_pose_graph(
     """Choose GTSAM's settings by the same rule, and write them."""
     start = PoseGraphSettings(search=LoopSearch(per_pose=4, most=128, views=1))
     best, least = start, np.inf
-    grid = itertools.product((2.0, 4.0), (0.5, 1.0), (1.0, 3.0), (1.0, 3.0))
+    grid = itertools.product((2.0, 3.0), (0.25, 0.5, 1.0), (1.0, 3.0), (1.0,))
     for min_logit, step, loop, drift in grid:
         settings = dataclasses.replace(
             start, min_logit=min_logit, odometry_position_scale=2.0 * step, odometry_heading_scale=step,
