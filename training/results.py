@@ -3,6 +3,7 @@
     python -m training.results --world maze2d
     python -m training.results --world maze3d
     python -m training.results --world scan      # of the lidar: training.results_scan
+    python -m training.results --world doom      # of other Doom maps: training.results_doom
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
 measured in mazes that nothing was trained or chosen on. The command writes ``training/results/WORLD.json``,
@@ -18,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from tqdm import tqdm
 
-from training import results_scan
+from training import results_doom, results_scan
 from training.common import runs
 from training.common.command_line import run_command
 from training.common.curves import write_at_once
@@ -192,7 +193,10 @@ def summary(
 
 
 if __name__ == "__main__":
-    if "--world scan" in " ".join(sys.argv).replace("--world=", "--world "):
+    given = " ".join(sys.argv).replace("--world=", "--world ")
+    if "--world scan" in given:
         run_command(results_scan.main, results_scan.Arguments, results_scan.__doc__)
+    elif "--world doom" in given:
+        run_command(results_doom.main, results_doom.Arguments, results_doom.__doc__)
     else:
         run_command(main, Arguments, __doc__)

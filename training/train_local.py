@@ -206,13 +206,15 @@ def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, 
 
 
 @torch.no_grad()
-def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig:
+def calibrated(network: LocalPoseNetwork, pairs: list[Batch], steps: int = 1) -> LocalPoseConfig:
     """The network's configuration with the bias and scale of each component that fit ``pairs`` best (least squares).
 
-    Each deviation is scaled so that its mean square equals that of the errors.
+    Each deviation is scaled so that its mean square equals that of the errors, of both summed over so many ``steps``
+    that follow each other in a drive. Where errors last, more of them make deviations larger than those of a step.
     """
     network = network.eval()
     parts = [estimated(network, p) for p in pairs]
+    lengths = [len(p["relative"]) for p in pairs]
     estimates, log_std = (torch.cat([part[k] for part in parts]).double() for k in (0, 1))
     truth = torch.cat([p["relative"] for p in pairs]).double()
     mean, std = list(network.config.relative_mean), list(network.config.relative_std)
@@ -225,7 +227,11 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
         mean[i], std[i], bias[i] = float(scale * mean[i]), float(scale * std[i]), float(scale * bias[i] + rest)
         fits[:, i] = scale * estimates[:, i] + rest
         log_std[:, i] += math.log(scale)
-    deviation = ((fits - truth) / log_std.exp()).square().mean(0).sqrt().clamp(min=0.01).tolist()
+    errors, variances = (fits - truth).split(lengths), log_std.mul(2.0).exp().split(lengths)
+    squares = [
+        _sums(error, steps).square() / _sums(variance, steps) for error, variance in zip(errors, variances, strict=True)
+    ]
+    deviation = torch.cat(squares).mean(0).sqrt().clamp(min=0.01).tolist()
     return dataclasses.replace(
         network.config,
         relative_mean=(mean[0], mean[1], mean[2]),
@@ -235,15 +241,21 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch]) -> LocalPoseConfig
     )
 
 
+def _sums(values: Tensor, steps: int) -> Tensor:
+    """Sums of each ``steps`` rows of ``values`` ``(n, 3)`` that follow each other; of all rows where there are less."""
+    return values.unfold(0, min(steps, len(values)), 1).sum(-1)
+
+
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
     recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
     steps: Steps
+    lasting = 1
     if recorded is None:
         world = simulated_world(arguments)
         domain: Domain = world
         steps = SimulatedSteps(arguments, world)
-        windows = world.error_windows
+        windows, lasting = world.error_windows, world.deviation_steps
         of_steps = {"action_history": world.action_history, "error_windows": list(windows)}
         settings: dict[str, Any] | None = {**of_steps, **world.stream_settings}
     else:
@@ -270,7 +282,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     if not run.is_first:
         return {}
     training.cpu()
-    final = LocalPoseNetwork(calibrated(training.network, steps.unseen())).eval()
+    final = LocalPoseNetwork(calibrated(training.network, steps.unseen(), lasting)).eval()
     final.load_state_dict(training.network.state_dict())
     metrics = measure(final, data.validation, RPE_STEPS if recorded is None else 0)
     about = {} if recorded is None else {"data": recorded.about}

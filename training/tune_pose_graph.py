@@ -37,7 +37,7 @@ from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.common import runs
 from training.common.command_line import run_command
 from training.data.feature_store import open_store
-from training.data.worlds import world_named
+from training.data.worlds import WorldName, world_named
 from training.scoring.metrics import trajectory_error
 
 GRID: tuple[tuple[dict[str, Any], ...], ...] = (
@@ -74,7 +74,7 @@ _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was the
 class Arguments:
     """Settings of the search."""
 
-    world: Literal["maze2d", "maze3d"]
+    world: WorldName
     """World to tune for."""
     trajectories: int = 0
     """Validation trajectories of each table of results; 0 for all."""

@@ -370,7 +370,7 @@ def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path, number: sig
 
 
 BAD_STARTS = """
-local_node world:=mars             parameter 'world' is 'mars'; allowed: maze2d, maze3d or scan
+local_node world:=mars             parameter 'world' is 'mars'; allowed: maze2d, maze3d, doom or scan
 local_node wrld:=maze2d            parameter 'wrld' is 'maze2d', but unknown; did you mean world
 local_node image_topic:='a/'       parameter 'image_topic' is 'a/'; allowed: a topic name
 local_node image_depth:=5.5        parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000

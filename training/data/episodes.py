@@ -33,6 +33,11 @@ def episodes_in(
     """
     from ngo_sim.episodes import record_episode  # training on recordings does without the simulators
 
+    if world.name == "doom":
+        from training.data.doom_drives import doom_episodes
+
+        yield from doom_episodes(seeds, frames)
+        return
     env = world.make_random(np.random.default_rng(mazes[0]), size)
     try:
         if hasattr(env, "preload"):

@@ -167,9 +167,11 @@ class PlaceStream(_Stream):
     def batches(self, episodes: list[Episode], rng: np.random.Generator) -> Iterator[Batch]:
         pairs = [(episode, revisits(episode.poses_xyyaw, self.world, self.MIN_STEPS_APART)) for episode in episodes]
         usable = [(episode, found) for episode, found in pairs if len(found)]
+        plan = episodes[0].maze
+        if not usable and plan is None:
+            return  # a driver that went nowhere on a map
         if not usable:
-            plan = episodes[0].maze
-            assert plan is not None  # worlds are mazes
+            assert plan is not None
             raise ValueError(
                 f"in none of {len(episodes)} mazes of {plan.walls.shape} blocks is a place seen twice in "
                 f"{self.frames} frames, {self.MIN_STEPS_APART} or more apart; expected longer episodes or smaller mazes"
@@ -188,7 +190,8 @@ class PlaceStream(_Stream):
                     "a": images[maze][index[:, 0]],
                     "b": images[maze][index[:, 1]],
                     "poses": torch.from_numpy(episode.poses_xyyaw[chosen]).float(),
-                    "maze": torch.full((len(chosen),), maze),
+                    # Parts of one drive on a map share its frame.
+                    "maze": torch.full((len(chosen),), 0 if episode.maze is None else maze),
                 }
                 if angles is not None:
                     plan = episode.maze

@@ -5,6 +5,7 @@ The simulators are imported where an environment is made: training on recordings
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,7 @@ from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE, Domain
 if TYPE_CHECKING:
     import gymnasium
 
-WorldName = Literal["maze2d", "maze3d"]
+WorldName = Literal["maze2d", "maze3d", "doom"]
 
 # A maze is a function of its seed and size: these ranges never meet (tests/unit/training/data/test_worlds.py).
 TEST_SEEDS = range(0, 1_000)
@@ -89,6 +90,8 @@ class World(Domain):
     """Numbers of steps after which a table gives errors."""
     error_windows: tuple[int, ...] = (1,)
     """Lengths of the windows of steps over which losses sum errors: errors that last make the sum drift."""
+    deviation_steps: int = 1
+    """Number of steps over whose sums the deviations of the local network are fitted."""
 
     @property
     def stream_drivers(self) -> tuple[str, ...]:
@@ -231,6 +234,21 @@ WORLDS = {
         },
     ),
 }
+# Levels of rooms, maps of freedoom and mazes, together (training/data/doom_drives.py).
+WORLDS["doom"] = dataclasses.replace(
+    WORLDS["maze3d"],
+    name="doom",
+    driver="explorer",
+    training_drivers=(),
+    optimizer_driver=None,
+    # Walls have any height there, and a picture does not tell how far they are.
+    registration=None,
+    overlaps=0,
+    smoothing=False,
+    # Along a wall that slows the robot errors last.
+    deviation_steps=100,
+    tables={"unseen": Table()},
+)
 
 
 def world_named(name: str) -> World:

@@ -236,3 +236,12 @@ def test_a_history_that_no_batch_tells_is_refused(count: int) -> None:
 def test_a_history_of_actions_that_are_not_told_is_refused() -> None:
     with pytest.raises(ValueError, match="action_history is 4 with without_action; expected one of the two"):
         Arguments(world="maze3d", action_history=4, without_action=True)
+
+
+def test_deviations_of_many_steps_hold_errors_that_last(network: LocalPoseNetwork) -> None:
+    (pairs,) = pairs_with_truth(network, torch.ones(3), torch.zeros(3))
+    generator = torch.Generator().manual_seed(3)
+    lasting = torch.randn(8, 1, 3, generator=generator).expand(8, 25, 3).flatten(0, 1)  # 25 steps each
+    pairs["relative"] = pairs["relative"] + 0.01 * lasting
+    of_steps, of_many = (torch.tensor(calibrated(network, [pairs], steps).deviation_scale) for steps in (1, 25))
+    assert (of_many > 2.5 * of_steps).all()

@@ -34,6 +34,7 @@ RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
+    "doom": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
 }
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -199,7 +200,7 @@ def write_untrained(weights: Path, world: str, image: ImageFormat | None = None)
             image=image,
             width=0.125,
             actions=3 if world in WORLD_IMAGES else 0,
-            period_s=2 / 35 if world == "maze3d" else 0.1,
+            period_s=2 / 35 if world in ("maze3d", "doom") else 0.1,
             relative_std=std,
         )
     )

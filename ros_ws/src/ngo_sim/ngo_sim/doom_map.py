@@ -205,18 +205,19 @@ def textmap(
     x, y = (value * UNITS_PER_M for value in start_xy)
     parts = [
         'namespace="zdoom";\n',
-        _thing(1, x, y, int(start_heading_deg) % 360),
+        thing(1, x, y, int(start_heading_deg) % 360),
         f'sector{{heightfloor=0;heightceiling={WALL_HEIGHT_UNITS};texturefloor="{style.floor}";'
         f'textureceiling="{style.ceiling}";lightlevel={style.light_level};}}\n',
     ]
     parts += [f"vertex{{x={cx * block_units:.4f};y={cy * block_units:.4f};}}\n" for cx, cy in corners]
     parts += [f'sidedef{{sector=0;texturemiddle="{texture}";}}\n' for texture in style.wall_textures]
     parts += [f"linedef{{v1={v1};v2={v2};sidefront={side};blocking=true;}}\n" for side, (v1, v2) in enumerate(ends)]
-    parts += [_thing(item.kind, item.x_m * UNITS_PER_M, item.y_m * UNITS_PER_M, 0) for item in decorations]
+    parts += [thing(item.kind, item.x_m * UNITS_PER_M, item.y_m * UNITS_PER_M, 0) for item in decorations]
     return "".join(parts)
 
 
-def _thing(kind: int, x: float, y: float, angle: int) -> str:
+def thing(kind: int, x: float, y: float, angle: int) -> str:
+    """The UDMF text of a thing of one of Doom's numbers at x, y in map units, facing ``angle`` in degrees."""
     return (
         f"thing{{type={kind};x={x:.4f};y={y:.4f};angle={angle};"
         "skill1=true;skill2=true;skill3=true;skill4=true;skill5=true;single=true;coop=true;dm=true;}\n"

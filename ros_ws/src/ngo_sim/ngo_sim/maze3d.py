@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ngo_common.settings import BadParameter, Settings, setting
 from ngo_sim.doom_engine import RESOLUTIONS, DoomEngine
-from ngo_sim.doom_level import DoomLevel, load_level
+from ngo_sim.doom_level import DoomLevel, load_level, with_drawn_start
 from ngo_sim.doom_map import (
     PLAYER_RADIUS_UNITS,
     TEXTURE_SETS,
@@ -27,6 +27,7 @@ from ngo_sim.doom_map import (
 )
 from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_aliased, check_maze_size, kruskal_maze, repeated_maze
+from ngo_sim.rooms_level import rooms_textmap
 
 TICS_PER_S = 35
 """Doom's fixed rate of simulation."""
@@ -39,7 +40,7 @@ _STANDING_M, _STEPS_A_PRESS = 0.02, 24
 _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TURN_RIGHT: -1.0}
 
 
-# A Doom map brings its own walls, looks and things.
+# A Doom map brings its own walls, looks and things, and so does a level of rooms.
 _OF_MAZES = ("rows", "cols", "extra_openings", "aliased", "block_m", "light_level", "textures", "decorations")
 
 
@@ -84,6 +85,9 @@ class Maze3DConfig(Settings):
     light_level: int = setting(208, "Light of the whole maze; 0 is black.", minimum=0, maximum=255)
     textures: str = setting("all", "Set of the textures of walls, floor and ceiling.", choices=tuple(TEXTURE_SETS))
     decorations: int = setting(0, "Number of things in the maze that block nobody.", minimum=0, maximum=1000)
+    level: str = setting(
+        "maze", "What is drawn from the seed: a maze, or rooms of all sizes and shapes.", choices=("maze", "rooms")
+    )
     wad: str = setting(
         "",
         "File of a Doom map to drive in instead of a maze.",
@@ -100,12 +104,14 @@ class Maze3DConfig(Settings):
             raise ValueError(f"width x height is {self.width} x {self.height}; it must be one of {allowed}")
         if bool(self.wad) != bool(self.map):
             raise ValueError(f"wad is {self.wad!r} and map is {self.map!r}; they must be given both, or neither")
-        for item in fields(self) if self.wad else ():
+        if self.wad and self.level != "maze":
+            raise BadParameter(f"parameter 'level' is {self.level!r}; allowed: 'maze' together with wad")
+        for item in fields(self) if self.wad or self.level != "maze" else ():
             value = getattr(self, item.name)
             if item.name in _OF_MAZES and value != item.default:
                 raise BadParameter(
-                    f"parameter '{item.name}' is {value!r}; allowed: {item.default!r} together with wad, for it shapes "
-                    "mazes alone"
+                    f"parameter '{item.name}' is {value!r}; allowed: {item.default!r} together with "
+                    f"{'wad' if self.wad else 'level'}, for it shapes mazes alone"
                 )
 
     @property
@@ -125,14 +131,14 @@ _Seeds = tuple[int, int]  # of the episode and of its maze
 
 @dataclass(frozen=True, eq=False)
 class DoomWorld:
-    """A maze and its UDMF text, which adds textures and the start."""
+    """A maze, or None for a level of rooms, and the UDMF text, which has textures and the start."""
 
-    maze: Maze
+    maze: Maze | None
     text: str
 
 
 class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
-    """Drive through a Kruskal maze in ViZDoom, or through the Doom map of the config.
+    """Drive through a Kruskal maze or a level of rooms in ViZDoom, or through the Doom map of the config.
 
     Observations are uint8 (height, width, 3) RGB, the exact mean of 2 x 2 rendered pixels. Actions are
     `ngo_sim.drivers.Action`. The reward is the distance travelled in the step in m; episodes never end by
@@ -142,8 +148,10 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
     reset(seed=s) makes maze, textures, decorations, start and noise functions of s and the config, to the byte,
     preloaded or not. Maze, start and noise are the same with any textures, light and decorations. Option
     "maze_seed" of reset takes maze, textures and decorations of another seed; start and noise remain those of s.
-    A Doom map has its own looks and start, `maze` is None there, and poses are in the map's own axes; a
-    door opens to who walks against it. Raises ValueError for a map that is not there.
+    Option "drawn_start" of reset draws the start on a Doom map, among the places of things that lie there.
+    A Doom map has its own looks and start, and poses are in the map's own axes. There and in a level of
+    rooms `maze` is None, a door opens to who walks against it, and what flickers does so by the engine's clock.
+    Raises ValueError for a map that is not there.
 
     The engine is a process, which ends with close(), with the environment or with the interpreter,
     whichever comes first.
@@ -171,12 +179,13 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         self._pose_xyyaw = np.zeros(3)
         self._turn_rate_deg = 0.0  # a step
         self._steps_walled_in = 0
+        self._start_was_drawn = False
         self._frame = 0
 
     @property
     def default_driver(self) -> str:
         """Who drives where nobody is named."""
-        return "random_goals" if self._level is None else "explorer"
+        return "explorer" if self._level is not None or self.config.level == "rooms" else "random_goals"
 
     def preload(self, seeds: Iterable[int], maze_seeds: Iterable[int] | None = None) -> None:
         """Write the maps of these seeds, instead of those preloaded before, into one WAD.
@@ -203,17 +212,21 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         """Stand still at the start of the seed's maze; without a seed, of one drawn by the generator."""
         super().reset(seed=seed)
         options = options or {}
-        if unknown := sorted(set(options) - {"maze_seed"}):
-            raise ValueError(f"options has {unknown}; it may have 'maze_seed'")
+        if unknown := sorted(set(options) - {"maze_seed", "drawn_start"}):
+            raise ValueError(f"options has {unknown}; it may have 'maze_seed' and 'drawn_start'")
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         if self._level is not None:
             if "maze_seed" in options:
                 raise ValueError("options has 'maze_seed'; a Doom map has no maze of a seed")
-            if not self._engine.running:
-                level = self._level
+            drawn = bool(options.get("drawn_start", False))
+            if drawn or self._start_was_drawn or not self._engine.running:
+                level = with_drawn_start(self._level, _generator(seed, stream=4)) if drawn else self._level
+                self._start_was_drawn = drawn
                 self._engine.start(level.lumps, level.name, level.game_wad, harmless=True, rehearse=not level.shipped)
             map_name = self._level.name
+        elif "drawn_start" in options:
+            raise ValueError("options has 'drawn_start'; a maze's start is always drawn")
         else:
             seeds = (seed, int(options.get("maze_seed", seed)))
             if not self._engine.running or seeds not in self._loaded:
@@ -246,7 +259,7 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         self._frame += 1
         moved = self._pose_xyyaw - last_pose_xyyaw
         travelled = math.hypot(moved[0], moved[1])
-        walled_in = self._level is not None and action == Action.FORWARD and travelled < _STANDING_M
+        walled_in = self.maze is None and action == Action.FORWARD and travelled < _STANDING_M
         self._steps_walled_in = self._steps_walled_in + 1 if walled_in else 0
         return mean_2x2(self._picture), travelled, False, False, self._info()
 
@@ -260,6 +273,8 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
 
     def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
         config = self.config
+        if config.level == "rooms":
+            return DoomWorld(None, rooms_textmap(_generator(maze_seed, stream=7), _generator(seed, stream=4)))
         maze_rng, rng = _generator(maze_seed, stream=0), _generator(maze_seed, stream=1)
         if config.aliased:
             maze = repeated_maze(config.rows, config.cols, maze_rng, config.block_m)
@@ -302,7 +317,7 @@ def _generator(seed: int, stream: int) -> np.random.Generator:
     """Return one of the independent generators of a seed.
 
     0: maze, 1: textures and start, 2: actuation noise, 4: start in the maze of another seed, 5: textures of a part
-    of them, 6: decorations (3 is the driver's).
+    of them, 6: decorations, 7: levels of rooms (3 is the driver's).
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
 

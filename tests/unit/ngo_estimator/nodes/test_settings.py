@@ -58,7 +58,7 @@ def test_any_world_may_be_named_together_with_its_weights() -> None:
         assert LocalNodeSettings(world=world).world == world
     assert NgoNodeSettings(world="our_robot-2", weights="/weights").world == "our_robot-2"
     for world, weights in (("our_robot", ""), ("../maze2d", "/weights"), ("", "/weights")):
-        with pytest.raises(BadParameter, match=f"'world' is '{world}'; allowed: maze2d, maze3d or scan, or the name"):
+        with pytest.raises(BadParameter, match=f"'world' is '{world}'; allowed: maze2d, maze3d, doom or scan, or"):
             LocalNodeSettings(world=world, weights=weights)
 
 

@@ -57,7 +57,7 @@ class Arguments:
     out: Path
     """Folder for the results, new or empty."""
     world: str | None = None
-    """World whose weights are used: maze2d, maze3d or scan (any 2D lidar), the default for laser scans."""
+    """World whose weights are used: maze2d, maze3d, doom or scan (any 2D lidar), the default for laser scans."""
     weights: Path | None = None
     """Folder of weights of your own, instead of those of a world."""
     topics: tyro.conf.OmitArgPrefixes[TopicArguments] = field(default_factory=TopicArguments)
@@ -88,7 +88,7 @@ class Arguments:
         if not self.recordings:
             raise ValueError("no recording was given; expected .mcap files, rosbag2 folders, .bag, .log or .clf files")
         if self.world is not None and self.weights is not None:
-            raise ValueError("expected either --world (maze2d, maze3d or scan) or --weights FOLDER, not both")
+            raise ValueError("expected either --world (maze2d, maze3d, doom or scan) or --weights FOLDER, not both")
         if self.out.exists() and not self.out.is_dir():
             raise ValueError(f"{self.out} is a file; expected a folder for the results")
         if self.out.is_dir() and any(self.out.iterdir()) and not self.overwrite:
@@ -100,7 +100,7 @@ class Arguments:
         world = self.world
         if world is None and self.weights is None:
             if not any(info.type_name == SCAN_TYPE and info.count for info in recording.topics.values()):
-                raise ValueError("expected --world (maze2d or maze3d) or --weights FOLDER: there are no laser scans")
+                raise ValueError("expected --world (but scan) or --weights FOLDER: there are no laser scans")
             world = LIDAR_WORLD
         folder = self.weights if self.weights is not None else shipped / str(world)
         if not folder.is_dir():

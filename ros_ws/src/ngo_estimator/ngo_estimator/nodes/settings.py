@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from ngo_common.settings import BadParameter, FramedSettings, frame, pose, setting, topic
 
-SHIPPED_WORLDS = ("maze2d", "maze3d", "scan")
+SHIPPED_WORLDS = ("maze2d", "maze3d", "doom", "scan")
 """Worlds whose weights are in the package."""
-_WORLD_NAMES = "maze2d, maze3d or scan, or the name of another one and its folder in 'weights'"
+_WORLD_NAMES = "maze2d, maze3d, doom or scan, or the name of another one and its folder in 'weights'"
 
 
 _TRANSPORTS = ("raw", "compressed")
@@ -20,7 +20,7 @@ class StepSettings(FramedSettings):
 
     world: str = setting(
         "maze3d",
-        "World whose weights are used; scan: any 2D lidar.",
+        "World whose weights are used; doom: any map of maze3d; scan: any 2D lidar.",
         allowed=_WORLD_NAMES,
         check=lambda value: re.fullmatch(r"[\w-]+", value) is not None,
     )

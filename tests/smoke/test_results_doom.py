@@ -1,0 +1,32 @@
+"""The table of Doom maps from networks that learned nothing: choices, JSON and page."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ngo_estimator.checkpoint import write_untrained
+from training import results_doom, tune_doom
+from training.data.doom_drives import TEST_MAPS
+from training.scoring.doom_rows import METRICS, ROWS
+
+
+def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_untrained(tmp_path / "weights" / "doom", "doom")
+    monkeypatch.setattr(results_doom, "_FIT_MAPS", 1)
+    monkeypatch.setitem(results_doom._MAPS, "test", TEST_MAPS[-1:])
+    monkeypatch.setattr(results_doom, "draw_levels", lambda path: None)
+    monkeypatch.setattr(tune_doom, "VALIDATION_MAPS", TEST_MAPS[-2:-1])
+    for name in ("BELIEFS", "STEP_SCALES", "LOOP_SCALES"):
+        monkeypatch.setattr(tune_doom, name, getattr(tune_doom, name)[:1])
+    folders = {"weights": tmp_path / "weights", "runs": tmp_path / "runs", "out": tmp_path / "out"}
+    folders["out"].mkdir()
+    tune_doom.main(tune_doom.Arguments(seeds=1, frames=120, **folders))
+    result = results_doom.main(results_doom.Arguments(seeds=2, frames=120, docs=tmp_path / "docs", **folders))
+    assert json.loads((tmp_path / "out" / "doom.json").read_text()) == result
+    (entry,) = result["maps"].values()
+    assert all(set(entry[row]) == set(METRICS) for row in ROWS)
+    assert set(entry["ours"]["ate_m"]) == {"mean", "ci95"} and 0.0 <= entry["ours"]["within_3_std"]["mean"] <= 1.0
+    page = (tmp_path / "docs" / "results_doom.md").read_text()
+    assert "take_cover" in page and all(f"`{row}`" in page for row in ROWS)
+    assert (tmp_path / "docs" / "images" / "results_doom_maps.png").stat().st_size > 1000

@@ -1,0 +1,105 @@
+"""The page of the table of Doom maps, docs/results_doom.md, and the figure of its paths."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.lines import Line2D
+
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
+from training.report.results_page import interval, markdown, number
+from training.scoring.doom_rows import METRICS, ROWS
+
+_TITLES = {
+    "actions_only": "linear fit of the latest twelve actions",
+    "local": "odometry of the local network",
+    "gtsam": "robust pose graph (GTSAM), same odometry and loops, tuned on validation maps",
+    "ours": "corrected (`ngo_node`)",
+}
+_COLUMNS = {
+    "translation_percent": "Final error, % of the path",
+    "ate_m": "ATE, m",
+    "within_3_std": "Poses within three published deviations",
+}
+_COLOURS = {"truth": "0.6", "actions_only": "tab:red", "local": "tab:orange", "gtsam": "tab:green", "ours": "tab:blue"}
+
+
+def page(result: dict[str, Any], weights: Path) -> str:
+    """The page of a JSON's content; ``weights`` is the folder of the networks."""
+    maps = result["maps"]
+    medians = [
+        [f"`{row}`: {_TITLES[row]}", *(_median(maps, row, metric) for metric in METRICS)] for row in ROWS
+    ]  # fmt: skip
+    parts = [
+        _INTRODUCTION.format(**result),
+        "## Median over maps\n\nIn brackets: smallest and largest mean of a map.\n\n"
+        + markdown(["Row", *_COLUMNS.values()], medians),
+        "![Paths on every map](images/results_doom_maps.png)",
+    ]
+    for metric, title in _COLUMNS.items():
+        rows = [[name, *(interval(entry[row][metric]) for row in ROWS)] for name, entry in maps.items()]
+        parts.append(f"## {title}\n\n" + markdown(["Map", *(f"`{row}`" for row in ROWS)], rows))
+    parts.append("## Training\n\n" + markdown(["Network", "Command", "Minutes", "Datapoints/s"], _trainings(weights)))
+    parts.append(_LEVELS)
+    return "\n\n".join(parts) + "\n"
+
+
+def _median(maps: dict[str, Any], row: str, metric: str) -> str:
+    means = [entry[row][metric]["mean"] for entry in maps.values()]
+    return f"{number(float(np.median(means)))} [{number(min(means))}, {number(max(means))}]"
+
+
+def _trainings(weights: Path) -> list[list[str]]:
+    rows = []
+    for kind in (LOCAL, PLACE, SMOOTHER, OPTIMIZER):
+        path = weights / f"{kind}.json"
+        training = json.loads(path.read_text())["training"] if path.exists() else {}
+        if isinstance(training, dict) and "seconds" in training:
+            speed = number(training["datapoints_per_s"])
+            rows.append([kind, f"`{training['command']}`", number(training["seconds"] / 60.0), speed])
+    return rows
+
+
+def draw(path: Path, tracks: dict[str, dict[str, np.ndarray]]) -> None:
+    """Draw the paths ``(steps, 2)`` of all rows on the first drive of each map."""
+    across = 5
+    down = -(-len(tracks) // across)
+    figure, axes = plt.subplots(down, across, figsize=(3.2 * across, 3.0 * down), squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, (name, lines) in zip(axes.flat, tracks.items(), strict=False):
+        for row, line in lines.items():
+            if row != "actions_only":  # it leaves the picture
+                axis.plot(line[:, 0], line[:, 1], color=_COLOURS[row], linewidth=2.0 if row == "truth" else 0.8)
+        axis.set_title(name, fontsize=8)
+        axis.set_aspect("equal")
+    handles = [Line2D([], [], color=_COLOURS[row], label=row) for row in _COLOURS if row != "actions_only"]
+    figure.legend(handles=handles, loc="lower right", ncols=2)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=70)
+    plt.close(figure)
+
+
+_INTRODUCTION = """# Doom maps that nobody trained on
+
+Written by `{command}` at revision {revision}.
+
+Three drives of 1000 frames on each map, by the driver `explorer`, from the map's own start. No training and no choice
+has seen these maps: freedoom2's MAP21 to MAP32 and the scenarios of ViZDoom (`training/data/doom_drives.py`).
+
+- **Final error**: distance of the last two positions, in percent of the path, aligned at the first pose alone.
+- **ATE**: root mean square distance of positions after the best rigid alignment.
+- **Within three deviations**: share of the poses whose x, y and heading, as published when they were new, each lie
+  within three of their published deviations of the truth. For `gtsam` these are the deviations of its odometry.
+
+Brackets behind means hold 95 % intervals by resampling the three drives, which is a coarse measure."""
+
+_LEVELS = """## Levels to learn from
+
+`ros2 run ngo_sim maze3d --ros-args -p level:=rooms -p seed:=7` drives through one. Columns: the plan with a drive of
+the explorer, and what it sees.
+
+![Generated levels](images/doom_levels.png)"""

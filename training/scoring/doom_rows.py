@@ -1,0 +1,147 @@
+"""The rows of the table of Doom maps: poses of a drive, each with the covariance that is published with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from training.baselines.loop_factors import found_loops
+from training.baselines.pose_graph import PoseGraphSettings, optimize
+from training.data.batches import action_histories, relative_poses
+from training.scoring.lidar_errors import WITHIN_DEVIATIONS, absolute_error_m
+from training.scoring.metrics import path_length_m, trajectory_error
+from training.scoring.online_estimate import steps_of, with_origin
+from training.scoring.row_estimators import seen_in
+
+ROWS = ("actions_only", "local", "gtsam", "ours")
+METRICS = ("translation_percent", "ate_m", "within_3_std")
+WINDOW = 100
+"""Steps over which errors of steps add up where their deviations are fitted: they last, and a trajectory is a sum."""
+
+Features = dict[str, np.ndarray]
+"""Of one drive, as of ``features_of``, with ``actions`` ``(steps,)`` uint8."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """``poses`` ``(steps, 3)`` of a drive in the end; ``published`` ``(steps, 3)``, each as it was when it was new.
+
+    ``covariances`` ``(steps, 3, 3)`` are those published. All are seen from the first frame.
+    """
+
+    poses: np.ndarray
+    published: np.ndarray
+    covariances: np.ndarray
+
+
+@dataclass(frozen=True)
+class ActionsFit:
+    """Steps as a linear function of the latest twelve actions.
+
+    ``weights`` ``(inputs, 3)``; ``covariance`` ``(3, 3)`` of a step, so that it holds over ``WINDOW`` steps.
+    """
+
+    weights: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, drives: list[tuple[np.ndarray, np.ndarray]]) -> ActionsFit:
+        """The least squares fit to ``drives``: actions ``(steps,)`` and true poses ``(steps + 1, 3)`` of each."""
+        inputs = [_action_inputs(actions) for actions, _ in drives]
+        steps = [relative_poses(poses).numpy() for _, poses in drives]
+        weights = np.linalg.lstsq(np.concatenate(inputs), np.concatenate(steps))[0]
+        sums = np.concatenate([_windows(one @ weights - step) for one, step in zip(inputs, steps, strict=True)])
+        return cls(weights, np.diag((sums**2).mean(0) / WINDOW))
+
+    def estimate(self, features: Features) -> Estimate:
+        """The trajectory of a drive."""
+        relative = _action_inputs(features["actions"]) @ self.weights
+        return odometry(relative, np.broadcast_to(self.covariance, (len(relative), 3, 3)))
+
+
+def _action_inputs(actions: np.ndarray) -> np.ndarray:
+    history = action_histories(actions)
+    one_hot = torch.nn.functional.one_hot(history + 1, 4)[..., 1:]
+    return np.column_stack((one_hot.flatten(1).double().numpy(), np.ones(len(actions))))
+
+
+def _windows(errors: np.ndarray) -> np.ndarray:
+    """Sums of errors ``(steps, 3)`` over each ``WINDOW`` steps that follow each other."""
+    sums = np.cumsum(np.concatenate((np.zeros((1, 3)), errors)), axis=0)
+    return np.asarray(sums[WINDOW:] - sums[:-WINDOW])
+
+
+def odometry(relative: np.ndarray, covariances: np.ndarray) -> Estimate:
+    """The trajectory of steps ``(steps, 3)``, each with its covariance ``(3, 3)``, independent of the others."""
+    poses = se2.r2g(torch.from_numpy(relative).double()).numpy()
+    found, covariance = [], np.zeros((3, 3))
+    for pose, step, own in zip(poses, relative.astype(np.float64), covariances, strict=True):
+        covariance = propagate(covariance, pose, step, own)
+        found.append(covariance)
+    return Estimate(poses, poses, np.array(found))
+
+
+def local(features: Features) -> Estimate:
+    """The odometry of the local network, as ``local_node`` publishes it."""
+    variances = np.exp(2.0 * features["log_std"].astype(np.float64))
+    return odometry(features["relative"], variances[:, None] * np.eye(3))
+
+
+def gtsam_graph(settings: PoseGraphSettings, pair_head: PairHead) -> Callable[[Features], Estimate]:
+    """GTSAM on the same odometry and loops, at the end of a drive; its covariance is that of the odometry."""
+
+    def estimate(features: Features) -> Estimate:
+        whole = len(features["relative"]) // settings.block * settings.block
+        batch = {name: value[None, :whole] for name, value in features.items() if name != "origin_code"}
+        batch["origin_code"] = features["origin_code"][None]
+        seen = seen_in(batch, settings.calibrated(batch["relative"]))
+        loops = found_loops(pair_head, seen, settings.search, settings.block)[0]
+        poses = optimize(batch["relative"][0], batch["log_std"][0], loops, settings)
+        tail = se2.r2g(torch.from_numpy(settings.calibrated(features["relative"][whole:])))
+        if len(tail):
+            poses = np.concatenate((poses, se2.compose(torch.from_numpy(poses[-1:]), tail).numpy()))
+        by = np.array([settings.odometry_position_scale] * 2 + [settings.odometry_heading_scale]) ** 2
+        variances = by * np.exp(2.0 * features["log_std"].astype(np.float64))
+        return Estimate(poses, poses, odometry(features["relative"], variances[:, None] * np.eye(3)).covariances)
+
+    return estimate
+
+
+def ours(core: OnlineTrajectory) -> Callable[[Features], Estimate]:
+    """The online core, as ``ngo_node`` publishes it."""
+
+    def estimate(features: Features) -> Estimate:
+        core.reset()
+        updates = [core.update(step) for step in steps_of(features)]
+        core.finish()
+        trajectory = core.trajectory()
+        assert trajectory is not None
+        published = np.array([update.pose_xyyaw for update in updates])
+        return Estimate(trajectory.poses_xyyaw[1:], published, np.array([update.covariance for update in updates]))
+
+    return estimate
+
+
+def errors_of(estimate: Estimate, truth: np.ndarray) -> dict[str, float]:
+    """``METRICS`` of an estimate, true poses ``(steps, 3)`` seen from the first frame.
+
+    The final error in percent of the path; the root mean square distance (m) after the best rigid alignment; and the
+    share of the published poses whose x, y and heading each lie within three of their deviations of the truth.
+    """
+    true, found = with_origin(truth), with_origin(estimate.poses)
+    off = np.abs(estimate.published - truth)
+    off[:, 2] = np.abs(np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2])))
+    deviations = np.sqrt(np.diagonal(estimate.covariances, axis1=1, axis2=2))
+    return {
+        "translation_percent": trajectory_error(found, true).final_percent,
+        "ate_m": absolute_error_m(found, true),
+        "within_3_std": float((off <= WITHIN_DEVIATIONS * deviations).all(axis=1).mean()),
+        "path_m": path_length_m(true),
+    }

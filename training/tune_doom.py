@@ -1,0 +1,158 @@
+"""Choose how ``world:=doom`` closes loops, and GTSAM's settings beside it, on the validation maps.
+
+    python -m training.tune_doom
+
+The optimizer is the robust pose graph that an untrained one is, without a network. What is chosen: how much belief a
+loop needs, and how far deviations of steps and loops are stretched. A choice that makes any drive's error much larger
+than its odometry's is out, whatever it gains elsewhere. The optimizer's covariance is then fitted to its errors. The
+command writes ``neural_graph_optimizer.safetensors`` and ``training/results/doom.gtsam.json``.
+"""
+
+import dataclasses
+import itertools
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_place, save_checkpoint
+from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from training import results_doom
+from training.baselines.pose_graph import PoseGraphSettings
+from training.calibrate_covariance import normalized_errors
+from training.common import runs
+from training.common.command_line import run_command
+from training.data.doom_drives import VALIDATION_MAPS
+from training.data.features import OPTIMIZER_INPUTS
+from training.data.worlds import world_named
+from training.scoring.doom_rows import Features, gtsam_graph, local
+from training.scoring.lidar_errors import absolute_error_m
+from training.scoring.online_estimate import with_origin
+
+BELIEFS = (-1.0, -1.5, -2.0, -2.5)
+"""Added to what a loop is believed, in quarters of its logit."""
+STEP_SCALES = (0.125, 0.25, 0.5)
+"""Factors of the deviations of steps."""
+LOOP_SCALES = (0.0, -0.6)
+"""Stretch of the deviations of loops: the information gets the factor exp(4 tanh(x / 2))."""
+MOST_HARM = 1.05
+"""Largest ratio of a drive's error to that of its odometry."""
+HARM_BELOW_M = 0.2
+"""Errors that small do not count as harm."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the choice."""
+
+    seeds: int = 3
+    """Drives of each validation map."""
+    frames: int = 1000
+    """Frames of a drive."""
+    weights: Path = runs.WEIGHTS
+    """Folder with doom/*.safetensors, which gets the optimizer."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets doom.gtsam.json."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of what is kept of each drive."""
+
+
+def main(arguments: Arguments) -> None:
+    """Choose, print and write."""
+    torch.set_num_threads(1)
+    folder = arguments.weights / "doom"
+    about = runs.record("tune_doom", arguments)
+    drives = results_doom.Drives(
+        folder, results_doom.Arguments(weights=arguments.weights, runs=arguments.runs, frames=arguments.frames)
+    )
+    features = [drives.features(of, 10_000 + k) for of in VALIDATION_MAPS for k in range(arguments.seeds)]
+    odometry = np.array([error(local(one).poses, one) for one in features])
+    pair_head = drives.place.pair_head
+    best: tuple[float, NeuralGraphOptimizer] | None = None
+    for belief, step, loop in itertools.product(BELIEFS, STEP_SCALES, LOOP_SCALES):
+        optimizer = robust_graph(folder, belief, step, loop)
+        corrected = np.array([error(corrected_poses(optimizer, pair_head, one), one) for one in features])
+        ratios, harm = corrected / odometry, harmful(corrected, odometry)
+        score = float(np.exp(np.log(ratios).mean()))
+        print(f"belief {belief} steps {step} loops {loop}: {score:.3f}, worst {ratios.max():.3f}", flush=True)
+        if not harm and (best is None or score < best[0]):
+            best = score, optimizer
+    chosen = robust_graph(folder, -5.0, 1.0, 0.0) if best is None else best[1]
+    core = OnlineTrajectory(chosen.eval(), pair_head)
+    scale = float(np.mean(np.concatenate([normalized_errors(core, one) for one in features])))
+    chosen.config = dataclasses.replace(chosen.config, covariance_scale=scale)
+    validation = {"ate_ratio": None if best is None else best[0], "odometry_ate_m": float(odometry.mean())}
+    place_sha256 = load_place(folder, "doom")[1]["sha256"]
+    details = {"place_encoder_sha256": place_sha256, "training": about, "metrics": {"validation": validation}}
+    save_checkpoint(folder / f"{OPTIMIZER}.safetensors", chosen, OPTIMIZER, "doom", details)
+    print(f"ATE {validation['ate_ratio']} of the odometry's, covariance scale {scale:.2f}")
+    write_pose_graph(arguments, features, odometry, drives)
+
+
+def error(poses: np.ndarray, features: Features) -> float:
+    """ATE (m) of poses ``(steps, 3)`` of a drive."""
+    return absolute_error_m(with_origin(poses), with_origin(features["truth"]))
+
+
+def harmful(corrected: np.ndarray, odometry: np.ndarray) -> bool:
+    """Whether any of the errors ``(drives,)`` (m) is much larger than that of its odometry."""
+    return bool((corrected > np.maximum(MOST_HARM * odometry, HARM_BELOW_M)).any())
+
+
+def robust_graph(folder: Path, belief: float, step_scale: float, loop_scale: float) -> NeuralGraphOptimizer:
+    """An untrained optimizer without a network; arguments as of the grids above."""
+    network, world = load_local(folder, "doom")[0], world_named("doom")
+    aggregation = PoseAggregationConfig(
+        motion_feature_size=network.config.feature_size, relative_std=network.config.relative_std
+    )
+    search = LoopSearch(per_pose=world.loops_per_pose, most=world.max_loops, views=world.loop_views)
+    optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig(aggregation=aggregation, network=False, search=search))
+    with torch.no_grad():
+        optimizer.log_scale.fill_(float(np.log(step_scale)))
+        optimizer.loop_gate.head.bias.copy_(torch.tensor([belief, loop_scale, loop_scale]))
+    return optimizer.eval()
+
+
+def corrected_poses(optimizer: NeuralGraphOptimizer, pair_head: torch.nn.Module, features: Features) -> np.ndarray:
+    """The corrected poses ``(steps, 3)`` of a drive."""
+    inputs = [torch.from_numpy(np.asarray(features[name], dtype=np.float32)) for name in OPTIMIZER_INPUTS]
+    poses: np.ndarray = optimize_offline(optimizer, pair_head, *inputs).poses[0].numpy()  # type: ignore[arg-type]
+    return poses
+
+
+def write_pose_graph(
+    arguments: Arguments, features: list[Features], odometry: np.ndarray, drives: results_doom.Drives
+) -> None:
+    """Choose GTSAM's settings by the same rule, and write them."""
+    start = PoseGraphSettings(search=LoopSearch(per_pose=4, most=128, views=1))
+    best, least = start, np.inf
+    grid = itertools.product((2.0, 3.0), (0.25, 0.5, 1.0), (1.0, 3.0), (1.0,))
+    for min_logit, step, loop, drift in grid:
+        settings = dataclasses.replace(
+            start, min_logit=min_logit, odometry_position_scale=2.0 * step, odometry_heading_scale=step,
+            loop_position_scale=loop, loop_heading_scale=loop, drift_m=drift,
+        )  # fmt: skip
+        estimator = gtsam_graph(settings, drives.place.pair_head)
+        corrected = np.array([error(estimator(one).poses, one) for one in features])
+        ratios = corrected / odometry
+        score = float(np.exp(np.log(ratios).mean()))
+        print(f"gtsam {min_logit} {step} {loop} {drift}: {score:.3f}, worst {ratios.max():.3f}", flush=True)
+        if score < least:
+            best, least = settings, score
+    result = {
+        "settings": dataclasses.asdict(best),
+        "validation": {"ate_ratio": least},
+        "tuning": runs.record("tune_doom", arguments),
+    }
+    path = arguments.out / "doom.gtsam.json"
+    path.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)
