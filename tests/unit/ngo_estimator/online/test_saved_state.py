@@ -208,8 +208,8 @@ def test_other_settings_weights_and_formats_are_refused(
     other = OnlineTrajectory(small_optimizer("loops"), small_pair_head(), 32, 2)
     assert refusal(folder, other).startswith(f'{path}: was saved with weights_sha256 "')
     assert refusal(folder, scans()).startswith(f"{path}: was saved with graph null; here it is ")
-    monkeypatch.setattr(saved_state, "FORMAT", 2)
-    assert refusal(folder, core) == f"{path}: is of format 1; expected 2"
+    monkeypatch.setattr(saved_state, "FORMAT", 3)
+    assert refusal(folder, core) == f"{path}: is of format 2; expected 3"
 
 
 def test_a_lidars_other_settings_are_named(tmp_path: Path) -> None:
@@ -322,5 +322,5 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
 def test_the_description_says_what_was_saved(saved: tuple[Path, OnlineTrajectory]) -> None:
     folder, core = saved
     values = json.loads((folder / "state.json").read_text())
-    assert values["format"] == 1 and values["identity"] == core.identity
+    assert values["format"] == 2 and values["identity"] == core.identity
     assert (folder / values["arrays"]).is_file()

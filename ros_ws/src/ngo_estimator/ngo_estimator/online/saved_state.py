@@ -16,7 +16,7 @@ from safetensors.numpy import load, save
 
 from ngo_estimator.data.state_arrays import Arrays, StateError
 
-FORMAT = 1
+FORMAT = 2
 DESCRIPTION = "state.json"
 _KEYS = {"format", "identity", "arrays", "arrays_sha256", "sha256"}
 
