@@ -79,9 +79,13 @@ class BlockCholesky:
         """Solution ``(count, 3, n)`` for right hand sides of this shape, rows as the pairs count them."""
         ordered = np.empty_like(right)
         ordered[self._structure.rank] = right
-        solve(self._structure.starts, self._structure.rows, self._diagonal, self._lower, ordered)
+        self.solve_ordered(ordered)
         solution: Array = ordered[self._structure.rank]
         return solution
+
+    def solve_ordered(self, right: Array) -> None:
+        """Solve in place for right hand sides ``(count, 3, n)`` whose rows are in the order of elimination."""
+        solve(self._structure.starts, self._structure.rows, self._diagonal, self._lower, right)
 
 
 @njit(cache=True)

@@ -4,7 +4,6 @@ The factors of some hundred poses fill a few per cent of the matrix.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -58,6 +57,17 @@ class FactorisedInformation:
         diagonal[:, [0, 1, 2], [0, 1, 2]] *= 1.0 + RELATIVE_JITTER
         self._factor = BlockCholesky(structure, diagonal, lower.copy())
 
+    def step(self, right: Array) -> Array:
+        """Changes ``(nodes + 1, 3)`` of all poses, node 0 staying where it is.
+
+        Args:
+            right: right hand side ``(nodes, 3, 1)`` in the order of elimination; it is used up.
+        """
+        self._factor.solve_ordered(right)
+        step = np.zeros((len(right) + 1, 3))
+        step[1:] = right[self._structure.rank, :, 0]
+        return step
+
     def covariance(self, nodes: Sequence[int] | Array) -> Array:
         """Joint covariance ``(3 n, 3 n)`` of the poses of ``n`` different nodes, node 0 excepted, in the map."""
         rows = np.asarray(nodes) - 1
@@ -90,32 +100,64 @@ class NormalEquations(FactorisedInformation):
         """Sum the factors of a batch of one; raises ``ArithmeticError`` where a pose has no factor at all."""
         _, hessian, gradient = (blocks[0].numpy() for blocks in normal_blocks(factors))
         diagonal, lower, self._right = structure.empty()
-        _add(structure.ranks, structure.place, hessian, gradient, diagonal, lower, self._right)
-        self._rank = structure.blocks.rank
+        _add_all(structure.ranks, structure.place, hessian, gradient, diagonal, lower, self._right)
         super().__init__(structure.blocks, diagonal, lower)
 
-    def step(self) -> Tensor:
+    def solution(self) -> Tensor:
         """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""
-        step = np.zeros((1, len(self._right) + 1, 3))
-        step[0, 1:] = self._factor.solve(self._right[self._rank])[..., 0]
-        return torch.from_numpy(step)
+        return torch.from_numpy(self.step(self._right.copy())).unsqueeze(0)
 
 
 @njit(cache=True)
-def _add(ranks: Any, place: Any, hessian: Any, gradient: Any, diagonal: Any, lower: Any, right: Any) -> None:
-    """Add the factors' ``(factors, 6, 6)`` and ``(factors, 6)`` to the blocks of a matrix and a right hand side."""
+def _add(
+    hessian: Array, gradient: Array, ranks: Array, place: int, diagonal: Array, lower: Array, right: Array
+) -> None:
+    """Add a factor's ``(6, 6)`` and ``(6,)`` to the blocks of a matrix and a right hand side."""
+    a, b = ranks
+    for which in range(2):
+        at, first = (b, 3) if which else (a, 0)
+        if at >= 0:
+            for r in range(3):
+                right[at, r, 0] += gradient[first + r]
+                for c in range(3):
+                    diagonal[at, r, c] += hessian[first + r, first + c]
+    if place >= 0:
+        row, column = (0, 3) if a > b else (3, 0)
+        for r in range(3):
+            for c in range(3):
+                lower[place, r, c] += hessian[row + r, column + c]
+
+
+@njit(cache=True)
+def _add_all(
+    ranks: Array, place: Array, hessian: Array, gradient: Array, diagonal: Array, lower: Array, right: Array
+) -> None:
     for k in range(len(ranks)):
-        a, b = ranks[k]
-        for which in range(2):
-            at, first = (b, 3) if which else (a, 0)
-            if at < 0:
-                continue
-            for r in range(3):
-                right[at, r, 0] += gradient[k, first + r]
-                for c in range(3):
-                    diagonal[at, r, c] += hessian[k, first + r, first + c]
-        if place[k] >= 0:
-            row, column = (0, 3) if a > b else (3, 0)
-            for r in range(3):
-                for c in range(3):
-                    lower[place[k], r, c] += hessian[k, row + r, column + c]
+        _add(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)
+
+
+@njit(cache=True)
+def add_factor(
+    jacobian: Array,
+    residual: Array,
+    information: Array,
+    ranks: Array,
+    place: int,
+    diagonal: Array,
+    lower: Array,
+    right: Array,
+) -> None:
+    """Add a factor to the blocks of ``GraphStructure.empty``.
+
+    Args:
+        jacobian: ``(3, 6)``; residual: ``(3,)``; information: of its independent components ``(3,)``.
+        ranks: ``(2,)``, and ``place``: of this factor, as in the structure.
+    """
+    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+    for r in range(3):
+        for i in range(6):
+            weighted = information[r] * jacobian[r, i]
+            gradient[i] += weighted * residual[r]
+            for j in range(6):
+                hessian[i, j] += weighted * jacobian[r, j]
+    _add(hessian, gradient, ranks, place, diagonal, lower, right)

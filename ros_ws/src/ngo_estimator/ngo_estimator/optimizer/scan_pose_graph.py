@@ -95,7 +95,7 @@ class ScanPoseGraph:
             self._steps.factors(self.poses, self._kernel_weights(self._steps)),
             self._loops.factors(self.poses, self.weights),
         ]
-        step = NormalEquations(factors, self._structure).step()[0].numpy()
+        step = NormalEquations(factors, self._structure).solution()[0].numpy()
         for _ in range(_HALVINGS):
             poses = self.poses + step
             cost = self._total(poses)
