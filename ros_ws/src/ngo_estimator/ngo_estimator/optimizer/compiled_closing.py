@@ -276,7 +276,7 @@ def _add_chain(
     right: Array,
 ) -> None:
     """Add the factors of ``chain_factors``."""
-    jacobian, residual, information = np.zeros((3, 6)), np.empty(3), np.empty(3)
+    jacobian, hessian, gradient = np.zeros((3, 6)), np.empty((6, 6)), np.empty(6)
     for k in range(len(deviation)):
         cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
         x, y = poses[k + 1, 0] - poses[k, 0], poses[k + 1, 1] - poses[k, 1]
@@ -284,9 +284,15 @@ def _add_chain(
         jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = sin, -cos, -cos * x - sin * y
         jacobian[0, 3], jacobian[0, 4], jacobian[1, 3], jacobian[1, 4] = cos, sin, -sin, cos
         jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
-        for c in range(3):
-            residual[c], information[c] = -deviation[k, c], 1.0 / step_std[k, c] ** 2
-        add_factor(jacobian, residual, information, ranks[k], place[k], diagonal, lower, right)
+        hessian[:], gradient[:] = 0.0, 0.0
+        for r in range(3):
+            information = 1.0 / step_std[k, r] ** 2
+            for i in range(6):
+                weighted = information * jacobian[r, i]
+                gradient[i] -= weighted * deviation[k, r]
+                for j in range(6):
+                    hessian[i, j] += weighted * jacobian[r, j]
+        add_factor(hessian, gradient, ranks[k], place[k], diagonal, lower, right)
 
 
 @njit(cache=True, error_model="numpy")
@@ -302,13 +308,25 @@ def _add_loops(
     right: Array,
 ) -> None:
     """Add the factors of ``pair_factors``."""
-    jacobian = np.zeros((3, 6))
-    for c in range(3):
-        jacobian[c, c], jacobian[c, 3 + c] = -1.0, 1.0
+    hessian, gradient = np.zeros((6, 6)), np.empty(6)
     for k in range(len(nodes)):
         a, b = nodes[k]
-        jacobian[0, 2], jacobian[1, 2] = poses[b, 1] - poses[a, 1], poses[a, 0] - poses[b, 0]
-        add_factor(jacobian, residuals[k], information[k], ranks[k], place[k], diagonal, lower, right)
+        # What the start's heading does to the residual.
+        lever = (poses[b, 1] - poses[a, 1], poses[a, 0] - poses[b, 0], -1.0)
+        turned, squares = 0.0, 0.0
+        for c in range(3):
+            weight = information[k, c]
+            hessian[c, c], hessian[3 + c, 3 + c] = weight, weight
+            hessian[c, 3 + c], hessian[3 + c, c] = -weight, -weight
+            gradient[c], gradient[3 + c] = -weight * residuals[k, c], weight * residuals[k, c]
+            turned += weight * lever[c] * residuals[k, c]
+            squares += weight * lever[c] ** 2
+        for c in range(2):
+            moment = information[k, c] * lever[c]
+            hessian[c, 2], hessian[2, c] = -moment, -moment
+            hessian[3 + c, 2], hessian[2, 3 + c] = moment, moment
+        hessian[2, 2], gradient[2] = squares, turned
+        add_factor(hessian, gradient, ranks[k], place[k], diagonal, lower, right)
 
 
 @njit(cache=True)

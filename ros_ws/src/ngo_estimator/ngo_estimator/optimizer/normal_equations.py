@@ -109,10 +109,15 @@ class NormalEquations(FactorisedInformation):
 
 
 @njit(cache=True)
-def _add(
+def add_factor(
     hessian: Array, gradient: Array, ranks: Array, place: int, diagonal: Array, lower: Array, right: Array
 ) -> None:
-    """Add a factor's ``(6, 6)`` and ``(6,)`` to the blocks of a matrix and a right hand side."""
+    """Add a factor to the blocks of ``GraphStructure.empty``.
+
+    Args:
+        hessian: ``(6, 6)``; gradient: ``(6,)``.
+        ranks: ``(2,)``, and ``place``: of this factor, as in the structure.
+    """
     a, b = ranks
     for which in range(2):
         at, first = (b, 3) if which else (a, 0)
@@ -133,31 +138,4 @@ def _add_all(
     ranks: Array, place: Array, hessian: Array, gradient: Array, diagonal: Array, lower: Array, right: Array
 ) -> None:
     for k in range(len(ranks)):
-        _add(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)
-
-
-@njit(cache=True)
-def add_factor(
-    jacobian: Array,
-    residual: Array,
-    information: Array,
-    ranks: Array,
-    place: int,
-    diagonal: Array,
-    lower: Array,
-    right: Array,
-) -> None:
-    """Add a factor to the blocks of ``GraphStructure.empty``.
-
-    Args:
-        jacobian: ``(3, 6)``; residual: ``(3,)``; information: of its independent components ``(3,)``.
-        ranks: ``(2,)``, and ``place``: of this factor, as in the structure.
-    """
-    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-    for r in range(3):
-        for i in range(6):
-            weighted = information[r] * jacobian[r, i]
-            gradient[i] += weighted * residual[r]
-            for j in range(6):
-                hessian[i, j] += weighted * jacobian[r, j]
-    _add(hessian, gradient, ranks, place, diagonal, lower, right)
+        add_factor(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)
