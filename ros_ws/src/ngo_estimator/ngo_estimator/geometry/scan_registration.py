@@ -7,12 +7,14 @@ scan with the lines between neighbouring points of the other, and takes a robust
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import wrap
 
 _EDGE_ON = 0.08
 """A line that passes the scanner closer than this share of its range joins two surfaces, and is none."""
@@ -29,7 +31,7 @@ _SEEN_BY_BOTH = 0.15
 _FARTHEST = 25.0
 """Squared deviations of the prior, over three components, from which on scans and start contradict each other."""
 
-_TOGETHER = 1024  # pairs that are registered at once
+Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -98,94 +100,150 @@ def register(
         The pose ``(..., 3)`` and the logarithm of its deviations ``(..., 2)``, of the dtype of ``start``. Where too few
         points find a line, or the scans and the start contradict each other, both are as they were.
     """
-    shape, kind = start.shape[:-1], start.dtype
+    shape = start.shape[:-1]
     if steps == 0 or start.numel() == 0:
         return start, log_std
-    with torch.no_grad():
-        flat = [x.expand(*shape, -1).reshape(-1, x.shape[-1]).float() for x in (a, b, start, log_std)]
-        chunks = zip(*(x.split(_TOGETHER) for x in flat), strict=True)
-        parts = [_register(config, one, steps) for one in map(_Pairs._make, chunks)]
-        pose, after = (torch.cat(column) for column in zip(*parts, strict=True))
-    return pose.to(kind).reshape(*shape, 3), after.to(kind).reshape(*shape, 2)
+    pairs = [x.detach().expand(*shape, -1).reshape(-1, x.shape[-1]).float().cpu() for x in (a, b, start, log_std)]
+    ranges_a, ranges_b, poses, deviations = (x.contiguous().numpy() for x in pairs)
+    poses, deviations = poses.copy(), deviations.copy()
+    angles = config.angles_rad.numpy().astype(np.float64)
+    settings = (
+        config.noise_m, config.noise_share, config.widest_tolerance_m, config.last_tolerance,
+        math.radians(config.field_of_view_deg) / 2.0,
+    )  # fmt: skip
+    _register(ranges_a, ranges_b, poses, deviations, np.cos(angles), np.sin(angles), settings, steps)
+    pose, after = (torch.from_numpy(values).to(start) for values in (poses, deviations))
+    return pose.reshape(*shape, 3), after.reshape(*shape, 2)
 
 
-class _Pairs(NamedTuple):
-    """As the arguments of ``register``, ``(n, ...)``."""
+@njit(cache=True, error_model="numpy")
+def _surfaces(ranges: Array, cos: Array, sin: Array, surfaces: Array) -> None:
+    """Of neighbouring points ``(rays - 1, 5)``: the first point, the normal of the line through both, its distance.
 
-    a: Tensor
-    b: Tensor
-    start: Tensor
-    log_std: Tensor
-
-
-def _register(config: RegistrationConfig, pairs: _Pairs, steps: int) -> tuple[Tensor, Tensor]:
-    a, b, start, log_std = pairs
-    half = math.radians(config.field_of_view_deg) / 2.0
-    increment = 2.0 * half / (config.rays - 1)
-    angles = config.angles_rad.to(a)
-    directions = torch.stack((angles.cos(), angles.sin()), dim=-1)
-    lines, points, normals, there = _surfaces(a, b, directions)
-    prior = torch.exp(-2.0 * log_std)[:, [0, 0, 1]]
-    # How far the points may be from where the start has them.
-    away = torch.exp(2.0 * log_std)
-    farthest = (away[:, 0] + away[:, 1] * b.square().mean(-1)).sqrt().unsqueeze(-1)
-    pose = start
-    information = torch.diag_embed(prior)
-    share = torch.zeros_like(start[:, 0])
-    solved = torch.ones_like(share, dtype=torch.bool)  # not where prior and points together leave a direction open
-    variance = config.noise_m**2 + points.square().sum(-1) * config.noise_share**2
-    least = config.last_tolerance * variance.sqrt()
-    for step in range(steps):
-        turned = se2.rotate(pose[:, 2:], points)
-        seen = turned + pose[:, None, :2]
-        place = (half - torch.atan2(seen[..., 1], seen[..., 0])) / increment
-        inside = (place >= 0.0) & (place < config.rays - 1)
-        index = place.clamp(0.0, config.rays - 2).long()
-        line = lines.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
-        normal = line[..., :2]
-        distance = (normal * seen).sum(-1) - line[..., 2]
-        both = inside & there & (line[..., 2] != 0.0)
-        alike = (se2.rotate(pose[:, 2:], normals) * normal).sum(-1) > _ALIKE
-        tolerance = torch.maximum(2.0 * 0.25**step * farthest.clamp(max=0.5 * config.widest_tolerance_m), least)
-        weight = (both & alike) / (1.0 + (distance / tolerance).square()).square()
-        lever = normal[..., 1] * turned[..., 0] - normal[..., 0] * turned[..., 1]
-        jacobian = torch.cat((normal, lever.unsqueeze(-1)), dim=-1)
-        weighted = jacobian * (weight / variance).unsqueeze(-1)
-        moved = se2.wrapped(start - pose)
-        information = weighted.mT @ jacobian + torch.diag_embed(prior)
-        gradient = -(weighted * distance.unsqueeze(-1)).sum(1) + prior * moved
-        change, singular = torch.linalg.solve_ex(information, gradient)
-        solved &= (singular == 0) & change.isfinite().all(-1)
-        pose = torch.where(solved.unsqueeze(-1), pose + change, pose)
-        share = weight.sum(-1) / both.sum(-1).clamp(min=_SEEN_BY_BOTH * config.rays)
-    return _where_better(start, log_std, prior, se2.wrapped(pose), information, share * solved)
+    The normal and the distance are 0 where there is no surface.
+    """
+    for k in range(len(ranges) - 1):
+        x, y = ranges[k] * cos[k], ranges[k] * sin[k]
+        along_x, along_y = ranges[k + 1] * cos[k + 1] - x, ranges[k + 1] * sin[k + 1] - y
+        length = max(math.sqrt(along_x * along_x + along_y * along_y), 1e-6)
+        normal_x, normal_y = -along_y / length, along_x / length
+        distance = normal_x * x + normal_y * y
+        nearer = min(ranges[k], ranges[k + 1])
+        if not (nearer > 0.0 and abs(distance) > _EDGE_ON * nearer):
+            normal_x, normal_y, distance = 0.0, 0.0, 0.0
+        row = surfaces[k]
+        row[0], row[1], row[2], row[3], row[4] = x, y, normal_x, normal_y, distance
 
 
-def _surfaces(a: Tensor, b: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Lines of ``a`` ``(n, rays - 1, 3)`` (normal and distance; no normal where there is none), and of ``b`` its points
-    ``(n, rays - 1, 2)``, the directions of their surfaces, and whether there are any."""
-    found = []
-    for ranges in (a, b):
-        points = ranges.unsqueeze(-1) * directions
-        along = points[:, 1:] - points[:, :-1]
-        length = along.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        normal = torch.stack((-along[..., 1], along[..., 0]), dim=-1) / length
-        distance = (normal * points[:, :-1]).sum(-1)
-        nearer = torch.minimum(ranges[:, :-1], ranges[:, 1:])
-        surface = (distance.abs() > _EDGE_ON * nearer) & (nearer > 0.0)
-        found.append((points[:, :-1], normal * surface.unsqueeze(-1), distance * surface, surface))
-    (_, normal, distance, _), (points, normals, _, there) = found
-    return torch.cat((normal, distance.unsqueeze(-1)), dim=-1), points, normals, there
+@njit(cache=True, error_model="numpy")
+def _register(
+    a: Array,
+    b: Array,
+    poses: Array,
+    log_std: Array,
+    cos: Array,
+    sin: Array,
+    settings: tuple[float, float, float, float, float],
+    steps: int,
+) -> None:
+    """Register pairs; what is better than ``poses`` ``(n, 3)`` and ``log_std`` ``(n, 2)`` replaces them.
+
+    ``settings``: noise of a range (m), its share of the range, widest and last tolerance, half of the field of view
+    (rad).
+    """
+    noise, noise_share, widest, last_tolerance, half = settings
+    rays = a.shape[1]
+    increment = 2.0 * half / (rays - 1)
+    of_a, of_b = np.empty((rays - 1, 5)), np.empty((rays - 1, 5))
+    pose, prior = np.empty(3), np.empty(3)
+    information, gradient, jacobian = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for pair in range(len(a)):
+        _surfaces(a[pair], cos, sin, of_a)
+        _surfaces(b[pair], cos, sin, of_b)
+        start = poses[pair]
+        away = (math.exp(2.0 * log_std[pair, 0]), math.exp(2.0 * log_std[pair, 1]))
+        squares = 0.0
+        for k in range(rays):
+            squares += b[pair, k] * b[pair, k]
+        # How far the points may be from where the start has them.
+        farthest = math.sqrt(away[0] + away[1] * squares / rays)
+        for c in range(3):
+            pose[c], prior[c] = start[c], 1.0 / away[c // 2]
+        solved, share = True, 0.0
+        for step in range(steps):
+            turn_x, turn_y = math.cos(pose[2]), math.sin(pose[2])
+            tolerance = 2.0 * 0.25**step * min(farthest, 0.5 * widest)
+            information[:] = 0.0
+            for c in range(3):
+                moved = start[c] - pose[c] if c < 2 else wrap(start[c] - pose[c])
+                information[c, c], gradient[c] = prior[c], prior[c] * moved
+            weights, both = 0.0, 0
+            for k in range(rays - 1):
+                x, y, normal_x, normal_y, there = of_b[k]
+                if there == 0.0:
+                    continue
+                turned_x, turned_y = turn_x * x - turn_y * y, turn_y * x + turn_x * y
+                seen_x, seen_y = turned_x + pose[0], turned_y + pose[1]
+                place = (half - math.atan2(seen_y, seen_x)) / increment
+                if not (place >= 0.0 and place < rays - 1):
+                    continue
+                _, _, line_x, line_y, line = of_a[min(int(place), rays - 2)]
+                if line == 0.0:
+                    continue
+                both += 1
+                if (
+                    line_x * (turn_x * normal_x - turn_y * normal_y) + line_y * (turn_y * normal_x + turn_x * normal_y)
+                    <= _ALIKE
+                ):
+                    continue
+                variance = noise * noise + (x * x + y * y) * noise_share * noise_share
+                distance = line_x * seen_x + line_y * seen_y - line
+                off = distance / max(tolerance, last_tolerance * math.sqrt(variance))
+                weight = 1.0 / (1.0 + off * off) ** 2
+                weights += weight
+                jacobian[0], jacobian[1], jacobian[2] = line_x, line_y, line_y * turned_x - line_x * turned_y
+                for r in range(3):
+                    weighted = weight / variance * jacobian[r]
+                    gradient[r] -= weighted * distance
+                    for c in range(3):
+                        information[r, c] += weighted * jacobian[c]
+            share = weights / max(float(both), _SEEN_BY_BOTH * rays)
+            solved = solved and _move(information, gradient, pose)
+        if solved and share >= _FEWEST:
+            _take_where_better(start, prior, pose, information, log_std[pair])
 
 
-def _where_better(
-    start: Tensor, log_std: Tensor, prior: Tensor, pose: Tensor, information: Tensor, share: Tensor
-) -> tuple[Tensor, Tensor]:
-    moved = se2.wrapped(pose - start)
-    covariance, singular = torch.linalg.inv_ex(information)
-    variance = covariance.diagonal(dim1=-2, dim2=-1)
-    after = torch.stack((variance[:, :2].mean(-1), variance[:, 2]), dim=-1).log() * 0.5
-    good = (share >= _FEWEST) & ((moved.square() * prior).sum(-1) <= _FARTHEST) & after.isfinite().all(-1)
-    good &= singular == 0
-    good = (good & pose.isfinite().all(-1)).unsqueeze(-1)
-    return torch.where(good, pose, start), torch.where(good, after, log_std)
+@njit(cache=True, error_model="numpy")
+def _move(information: Array, gradient: Array, pose: Array) -> bool:
+    """Add the solution to a pose; returns whether there is one."""
+    change = _inverse(information) @ gradient
+    if not np.isfinite(change).all():
+        return False
+    pose += change
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _inverse(m: Array) -> Array:
+    """Of a symmetric matrix ``(3, 3)``; infinite or no number where there is none."""
+    a, b, c = (
+        m[1, 1] * m[2, 2] - m[1, 2] ** 2,
+        m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2],
+        m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1],
+    )
+    d, e, f = m[0, 0] * m[2, 2] - m[0, 2] ** 2, m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2], m[0, 0] * m[1, 1] - m[0, 1] ** 2
+    return np.array(((a, b, c), (b, d, e), (c, e, f))) / (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c)
+
+
+@njit(cache=True, error_model="numpy")
+def _take_where_better(start: Array, prior: Array, pose: Array, information: Array, log_std: Array) -> None:
+    moved = 0.0
+    for c in range(3):
+        moved += prior[c] * (pose[c] - start[c] if c < 2 else wrap(pose[c] - start[c])) ** 2
+    covariance = _inverse(information)
+    position = 0.5 * math.log(0.5 * (covariance[0, 0] + covariance[1, 1]))
+    heading = 0.5 * math.log(covariance[2, 2])
+    good = moved <= _FARTHEST and math.isfinite(position) and math.isfinite(heading) and np.isfinite(pose).all()
+    if good:
+        start[0], start[1], start[2] = pose[0], pose[1], wrap(pose[2])
+        log_std[0], log_std[1] = position, heading

@@ -14,6 +14,7 @@ import torch
 from numba import njit
 from torch import Tensor, nn
 
+from ngo_estimator.geometry.planar_motion import wrap
 from ngo_estimator.optimizer.block_cholesky import Array
 from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER
 from ngo_estimator.optimizer.loop_closure import Loops
@@ -136,11 +137,6 @@ def _layers(gate: RobustLoopGate) -> tuple[Array, ...]:
 
 
 @njit(cache=True)
-def _wrap(angle: float) -> float:
-    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
-
-
-@njit(cache=True)
 def _chained(relative: Array, poses: Array) -> None:
     """Poses ``(n + 1, 3)`` of relative ones ``(n, 3)``, the origin in front; yaw is not wrapped."""
     x, y, yaw = 0.0, 0.0, 0.0
@@ -177,7 +173,7 @@ def _residuals(
         x, y = poses[b, 0], poses[b, 1]
         residuals[k, 0] = poses[a, 0] + cos * measured[k, 0] - sin * measured[k, 1] - x
         residuals[k, 1] = poses[a, 1] + sin * measured[k, 0] + cos * measured[k, 1] - y
-        residuals[k, 2] = _wrap(poses[a, 2] + measured[k, 2] - poses[b, 2])
+        residuals[k, 2] = wrap(poses[a, 2] + measured[k, 2] - poses[b, 2])
         turn = prefix[b, 2] - prefix[a, 2]
         across_x = x * (x * turn - 2.0 * (prefix[b, 3] - prefix[a, 3])) + prefix[b, 5] - prefix[a, 5]
         across_y = y * (y * turn - 2.0 * (prefix[b, 4] - prefix[a, 4])) + prefix[b, 6] - prefix[a, 6]
@@ -340,4 +336,4 @@ def _deviate(poses: Array, change: Array, deviation: Array) -> None:
         new_x, new_y = x + change[k + 1, 0] - change[k, 0], y + change[k + 1, 1] - change[k, 1]
         deviation[k, 0] += new_cos * new_x + new_sin * new_y - cos * x - sin * y
         deviation[k, 1] += new_cos * new_y - new_sin * new_x - cos * y + sin * x
-        deviation[k, 2] += _wrap(change[k + 1, 2] - change[k, 2])
+        deviation[k, 2] += wrap(change[k + 1, 2] - change[k, 2])
