@@ -14,6 +14,7 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
 from ngo_estimator.online.kept_loops import KeptLoops
@@ -33,6 +34,9 @@ _FRESH = 2
 
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
+
+_LONG = 2
+"""Iterations that take as long as a search for loops."""
 
 _BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features")
 """Names of the newest rows: three of each step, the others of each block; without a network there are no features."""
@@ -83,8 +87,8 @@ class MetaGraph:
     The network runs for each ``network_every``-th block; between, what it gave is taken again.
     """
 
-    PARTS = 6
-    """Parts of an update before its iterations."""
+    WORK = 9
+    """Of taking in a block and preparing its optimisation, in units of an iteration."""
 
     def __init__(
         self,
@@ -166,10 +170,10 @@ class MetaGraph:
         """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block."""
         self.optimized, self.fault = False, ""
         log_std = 0.5 * np.log(variance)
-        self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
+        step = relative.astype(np.float64)
+        self._pose = compose(self._pose, step)
         self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
-        last = torch.from_numpy(self.odometry.values[-1])
-        self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        self.odometry.append(compose(self.odometry.values[-1], step))
         self._relative.append(relative)
         self._log_std.append(log_std)
         self._motion.append(motion)
@@ -199,13 +203,13 @@ class MetaGraph:
         self._steps.append(in_block[0, 0, -1])
         self._std.append(std)
         self._optimized_std.append(std)
-        relative = se2.between(*torch.from_numpy(self.odometry.values[[-1 - self._block, -1]]))
-        self._nodes.append(se2.compose(torch.from_numpy(self._nodes.values[-1]), relative).numpy())
+        relative = between(*self.odometry.values[[-1 - self._block, -1]])
+        self._nodes.append(compose(self._nodes.values[-1], relative))
         self._work = self._all_work()
 
     def _all_work(self) -> list[Callable[[int], None]]:
-        """What is to be done for a new block before it is optimised, in parts of about equal time."""
-        return [self._aggregate, self._find_again, self._find_places, self._find_shared, self._make_room]
+        """What is to be done for a new block before it is optimised, each as long as ``_LONG`` iterations."""
+        return [self._aggregate, self._find_again, self._find_places, self._find_shared]
 
     def _do(self, part: Callable[[int], None]) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""
@@ -219,6 +223,7 @@ class MetaGraph:
         """Do all that is left of taking in the newest block."""
         while self._work:
             self._do(self._work.pop(0))
+        self._make_room()
 
     @property
     def _fresh(self) -> bool:
@@ -244,7 +249,7 @@ class MetaGraph:
         if self._loops is not None and len(self._keys) and len(found):
             self._loops.limit_drift(found, self._drift(found))
 
-    def _make_room(self, block: int) -> None:
+    def _make_room(self) -> None:
         """Let the window slide."""
         while self.blocks - self._first > self._window:
             self._slide()
@@ -361,6 +366,7 @@ class MetaGraph:
 
     @torch.inference_mode()
     def _prepare(self) -> None:
+        self._make_room()
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
@@ -389,24 +395,28 @@ class MetaGraph:
         return None if new >= min(self._network_every, 1 + seen // 8) else known.for_blocks(self._first, self.blocks)
 
     @torch.inference_mode()
-    def advance(self, parts: int) -> bool:
-        """Do so many parts of what has begun; returns whether it is done, and every node at its new pose.
+    def advance(self, iterations: int) -> bool:
+        """Run so many iterations of what has begun, or what takes as long and comes before them.
 
-        The parts are those of taking in the newest block, the preparation, and each iteration.
+        Returns:
+            Whether it is done, and every node at its new pose.
         """
         if not self._begun:
             raise RuntimeError("no optimisation has begun")
         began = time.perf_counter()
-        for _ in range(parts):
+        while iterations > 0:
             if self._work:
                 self._do(self._work.pop(0))
-            elif self._running is None:
+                iterations -= _LONG
+                continue
+            if self._running is None:
                 self._prepare()
             elif self._running.left:
                 self._running.result = next(self._running.iterations)
                 self._running.left -= 1
             else:
                 break
+            iterations -= 1
         self._begun_s += time.perf_counter() - began
         running = self._running
         if running is None or running.left or running.result is None:
@@ -488,8 +498,8 @@ class MetaGraph:
             covariance: that of the last node in the map ``(3, 3)``.
         """
         whole = self.blocks * self._block
-        odometry = torch.from_numpy(self.odometry.values[whole:])
-        poses = se2.compose(torch.from_numpy(self._nodes.values[-1]), se2.between(odometry[0], odometry)).numpy()
+        odometry, node = self.odometry.values[whole:], self._nodes.values[-1]
+        poses = [compose(node, between(odometry[0], row)) for row in odometry]
         steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
         for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
             covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))

@@ -40,8 +40,8 @@ class OnlineTrajectory(CorrectedTrajectory):
     move with these. Loops are closed with key frames. So the cost of a step does not depend on the trajectory's length.
 
     All of an update is done at the step that completes a meta-pose. With ``iterations_per_step`` it is spread over the
-    steps after it in parts: features, three searches for loops, the preparation, and iterations. Attention and
-    convolutions are run for each eighth meta-pose then, as what they give hardly changes from one to the next.
+    steps before the next one: features, three searches for loops, and iterations. Attention and convolutions are run
+    for each eighth meta-pose then, as what they give hardly changes from one to the next.
     """
 
     _graph: MetaGraph
@@ -75,10 +75,11 @@ class OnlineTrajectory(CorrectedTrajectory):
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
         self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
-        # Parts of an update: an update must be done when the next one begins, a block later.
-        parts = MetaGraph.PARTS + optimizer.config.iterations
+        work = MetaGraph.WORK + optimizer.config.iterations
         self._network_every = _NETWORK_EVERY if iterations_per_step else 1
-        super().__init__(max(iterations_per_step, -(-parts // block)) if iterations_per_step else parts)
+        # An update must be done when the next one begins, a block later.
+        least = -(-work // max(1, block - 1))
+        super().__init__(max(iterations_per_step, least) if iterations_per_step else work)
 
     @classmethod
     def load(

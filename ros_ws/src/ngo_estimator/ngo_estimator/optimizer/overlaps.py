@@ -139,15 +139,20 @@ def _seen_again(
     half, noise, noise_share = settings
     turn_x, turn_y = math.cos(relative[2]), math.sin(relative[2])
     meets, count = 0, 0
+    farthest = a.max()
+    farthest += 0.5 * _DRIFT_M + _AGREEING * (noise + noise_share * farthest)
     for ray in range(0, len(b), _EVERY):
         count += 1
         if not b[ray] > 0.0:
             continue
         x, y = b[ray] * cos[ray], b[ray] * sin[ray]
         seen_x, seen_y = turn_x * x - turn_y * y + relative[0], turn_y * x + turn_x * y + relative[1]
+        distance = math.sqrt(seen_x * seen_x + seen_y * seen_y)
+        if not distance < farthest:
+            continue
         at = round((half - math.atan2(seen_y, seen_x)) * (len(a) - 1) / (2.0 * half))
         if at < 0 or at > len(a) - 1 or not a[at] > 0.0:
             continue
         tolerance = 0.5 * _DRIFT_M + _AGREEING * (noise + noise_share * a[at])
-        meets += abs(math.sqrt(seen_x * seen_x + seen_y * seen_y) - a[at]) < tolerance
+        meets += abs(distance - a[at]) < tolerance
     return meets / count
