@@ -63,9 +63,12 @@ def measured_peak() -> Peak:
 
 
 @contextlib.contextmanager
-def counted() -> Iterator[Work]:
-    """Count what torch and the sparse factorisation do meanwhile; what else is compiled is small beside it."""
-    work = Work()
+def counted(work: Work | None = None) -> Iterator[Work]:
+    """Count what torch and the sparse factorisation do meanwhile; what else is compiled is small beside it.
+
+    It is added to ``work``, where that is given.
+    """
+    work = Work() if work is None else work
     factorise, solve = block_cholesky.factorise, block_cholesky.solve
 
     def factorised(starts: Any, rows: Any, *blocks: Any) -> Any:
