@@ -87,9 +87,6 @@ class MetaGraph:
     The network runs for each ``network_every``-th block; between, what it gave is taken again.
     """
 
-    WORK = 9
-    """Of taking in a block and preparing its optimisation, in units of an iteration."""
-
     def __init__(
         self,
         optimizer: NeuralGraphOptimizer,
@@ -209,7 +206,15 @@ class MetaGraph:
 
     def _all_work(self) -> list[Callable[[int], None]]:
         """What is to be done for a new block before it is optimised, each as long as ``_LONG`` iterations."""
-        return [self._aggregate, self._find_again, self._find_places, self._find_shared]
+        looks_for_overlaps = self._optimizer.config.loops and self._optimizer.config.search.overlaps > 0
+        overlaps = [self._find_again], [self._find_shared]
+        again, shared = overlaps if looks_for_overlaps else ([], [])
+        return [self._aggregate, *again, self._find_places, *shared]
+
+    @property
+    def work(self) -> int:
+        """How much an update is, in iterations: taking in a block, preparing its optimisation, and that."""
+        return _LONG * len(self._all_work()) + 1 + self._optimizer.config.iterations
 
     def _do(self, part: Callable[[int], None]) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""

@@ -75,8 +75,8 @@ class OnlineTrajectory(CorrectedTrajectory):
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
         self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
-        work = MetaGraph.WORK + optimizer.config.iterations
         self._network_every = _NETWORK_EVERY if iterations_per_step else 1
+        work = self._new_graph().work
         # An update must be done when the next one begins, a block later.
         least = -(-work // max(1, block - 1))
         super().__init__(max(iterations_per_step, least) if iterations_per_step else work)
