@@ -44,7 +44,8 @@ class CompiledClosing:
         correction_std: Tensor,
     ) -> None:
         self._gate, self._steps, self._find_overlaps = gate, steps, find_overlaps
-        self._layers = _layers(gate)
+        self._layers, self._head = [_of(layer) for layer in gate.layers if isinstance(layer, nn.Linear)], _of(gate.head)
+        self._noise_2 = np.stack((gate.noise.double().numpy(), gate.components.double().numpy()))
         self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
         self._poses = np.zeros((len(self._std) + 1, 3))
@@ -88,7 +89,14 @@ class CompiledClosing:
         _chained(adjusted + deviation, self._poses)
         _residuals(self._poses, step_std, self._nodes, self._measured, self._most_drift, self._residuals, expected)
         annealing = RobustLoopGate.ANNEALING**iteration
-        _gated(self._constants, self._residuals, expected, annealing, self._layers, self._weights, self._information)
+        inputs = np.empty((count, _GATE_INPUTS), np.float32)
+        squared = np.empty(count)
+        _gate_inputs(self._constants, self._residuals, expected, annealing, self._noise_2, inputs, squared)
+        hidden = inputs
+        for weight, bias in self._layers:
+            hidden = np.maximum(hidden @ weight + bias, 0.0)
+        belief = hidden @ self._head[0] + self._head[1]
+        _gates(self._constants, belief, squared, self._noise_2, self._weights, self._information)
         channels = np.empty((self._steps.blocks, CHANNELS), np.float32)
         _channels(self._poses, deviation, self._nodes, self._residuals, self._weights, self._unit, channels)
         return torch.from_numpy(channels).unsqueeze(0)
@@ -127,13 +135,9 @@ class CompiledClosing:
         )
 
 
-def _layers(gate: RobustLoopGate) -> tuple[Array, ...]:
-    """Weights (inputs first) and biases of the gate's three layers, and its noise."""
-    parts: list[Array] = []
-    for layer in (*gate.layers, gate.head):
-        if isinstance(layer, nn.Linear):
-            parts += [layer.weight.detach().double().numpy().T.copy(), layer.bias.detach().double().numpy()]
-    return (*parts, gate.noise.double().numpy(), gate.components.double().numpy())
+def _of(layer: nn.Linear) -> tuple[Array, Array]:
+    """Weights, inputs first, and biases of a layer."""
+    return layer.weight.detach().float().numpy().T.copy(), layer.bias.detach().float().numpy()
 
 
 @njit(cache=True)
@@ -183,51 +187,39 @@ def _residuals(
 
 
 @njit(cache=True, error_model="numpy")
-def _gated(
-    constants: Array,
-    residuals: Array,
-    expected: Array,
-    annealing: float,
-    layers: tuple[Array, ...],
-    gates: Array,
-    information: Array,
+def _gate_inputs(
+    constants: Array, residuals: Array, expected: Array, annealing: float, noise: Array, inputs: Array, squared: Array
 ) -> None:
-    """As ``RobustLoopGate``; ``constants`` ``(n, 11)``: description, logarithms of length and scales, logit, valid."""
-    weight_1, bias_1, weight_2, bias_2, weight_3, bias_3, noise, components = layers
-    inputs, variance = np.empty(_GATE_INPUTS), np.empty(2)
-    first, second = np.empty(len(bias_1)), np.empty(len(bias_2))
+    """What ``RobustLoopGate`` sees ``(n, 11)``, and squared residuals ``(n,)`` in deviations.
+
+    ``constants`` ``(n, 11)``: description, logarithms of length and scales, logit, valid; ``noise`` ``(2, 2)``: that of
+    the gate, and its components.
+    """
     for k in range(len(constants)):
         errors = (residuals[k, 0] ** 2 + residuals[k, 1] ** 2, residuals[k, 2] ** 2)
         drifts = (annealing * (expected[k, 0] + expected[k, 1]), annealing * expected[k, 2])
-        inputs[:6] = constants[k, :6]
-        inputs[6] = constants[k, 6] / 3.0
-        squared = 0.0
+        for c in range(6):
+            inputs[k, c] = constants[k, c]
+        inputs[k, 6] = constants[k, 6] / 3.0
+        total = 0.0
         for c in range(2):
-            variance[c] = math.exp(2.0 * constants[k, 7 + c]) * noise[c]
-            both = variance[c] * components[c]
-            inputs[7 + c] = math.log1p(errors[c] / both) / 3.0
-            squared += errors[c] / (both + drifts[c])
-        inputs[9], inputs[10] = math.log1p(squared), annealing
-        first[:], second[:] = bias_1, bias_2
-        for i in range(len(inputs)):
-            for h in range(len(first)):
-                first[h] += inputs[i] * weight_1[i, h]
-        for i in range(len(first)):
-            if first[i] > 0.0:
-                for h in range(len(second)):
-                    second[h] += first[i] * weight_2[i, h]
-        belief, scale_0, scale_1 = bias_3
-        for i in range(len(second)):
-            if second[i] > 0.0:
-                belief += second[i] * weight_3[i, 0]
-                scale_0 += second[i] * weight_3[i, 1]
-                scale_1 += second[i] * weight_3[i, 2]
-        kernel = (1.0 + squared / _KERNEL_WIDTH) ** 2
-        gate = constants[k, 10] / ((1.0 + math.exp(-(constants[k, 9] + 2.0) - 4.0 * belief)) * kernel)
+            both = math.exp(2.0 * constants[k, 7 + c]) * noise[0, c] * noise[1, c]
+            inputs[k, 7 + c] = math.log1p(errors[c] / both) / 3.0
+            total += errors[c] / (both + drifts[c])
+        squared[k], inputs[k, 9], inputs[k, 10] = total, math.log1p(total), annealing
+
+
+@njit(cache=True, error_model="numpy")
+def _gates(constants: Array, belief: Array, squared: Array, noise: Array, gates: Array, information: Array) -> None:
+    """Gates ``(n,)`` and information ``(n, 3)`` of what the layers of ``RobustLoopGate`` say ``(n, 3)``."""
+    for k in range(len(constants)):
+        kernel = (1.0 + squared[k] / _KERNEL_WIDTH) ** 2
+        gate = constants[k, 10] / ((1.0 + math.exp(-(constants[k, 9] + 2.0) - 4.0 * belief[k, 0])) * kernel)
         gates[k] = gate
-        position = gate * math.exp(4.0 * math.tanh(scale_0 / 2.0)) / variance[0]
-        information[k, 0], information[k, 1] = position, position
-        information[k, 2] = gate * math.exp(4.0 * math.tanh(scale_1 / 2.0)) / variance[1]
+        for c in range(2):
+            variance = math.exp(2.0 * constants[k, 7 + c]) * noise[0, c]
+            information[k, 1 + c] = gate * math.exp(4.0 * math.tanh(belief[k, 1 + c] / 2.0)) / variance
+        information[k, 0] = information[k, 1]
 
 
 @njit(cache=True, error_model="numpy")
@@ -304,25 +296,32 @@ def _add_loops(
     right: Array,
 ) -> None:
     """Add the factors of ``pair_factors``."""
-    hessian, gradient = np.zeros((6, 6)), np.empty(6)
     for k in range(len(nodes)):
         a, b = nodes[k]
         # What the start's heading does to the residual.
         lever = (poses[b, 1] - poses[a, 1], poses[a, 0] - poses[b, 0], -1.0)
-        turned, squares = 0.0, 0.0
+        at, to, between = ranks[k, 0], ranks[k, 1], place[k]
         for c in range(3):
             weight = information[k, c]
-            hessian[c, c], hessian[3 + c, 3 + c] = weight, weight
-            hessian[c, 3 + c], hessian[3 + c, c] = -weight, -weight
-            gradient[c], gradient[3 + c] = -weight * residuals[k, c], weight * residuals[k, c]
-            turned += weight * lever[c] * residuals[k, c]
-            squares += weight * lever[c] ** 2
-        for c in range(2):
-            moment = information[k, c] * lever[c]
-            hessian[c, 2], hessian[2, c] = -moment, -moment
-            hessian[3 + c, 2], hessian[2, 3 + c] = moment, moment
-        hessian[2, 2], gradient[2] = squares, turned
-        add_factor(hessian, gradient, ranks[k], place[k], diagonal, lower, right)
+            pull, moment = weight * residuals[k, c], weight * lever[c]
+            if at >= 0:
+                right[at, 2, 0] += moment * residuals[k, c]
+                diagonal[at, 2, 2] += moment * lever[c]
+                if c < 2:
+                    right[at, c, 0] -= pull
+                    diagonal[at, c, c] += weight
+                    diagonal[at, 2, c] -= moment
+                    diagonal[at, c, 2] -= moment
+            if to >= 0:
+                right[to, c, 0] += pull
+                diagonal[to, c, c] += weight
+            if between >= 0:
+                if c < 2:
+                    lower[between, c, c] -= weight
+                if at > to:
+                    lower[between, 2, c] += moment
+                else:
+                    lower[between, c, 2] += moment
 
 
 @njit(cache=True)
