@@ -13,8 +13,8 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.drives import CACHE, Drive, drive_of, episodes, stamp_ns
-from benchmarks.peers import SETTINGS, Incremental, LevenbergMarquardt, Problem, xyyaw
-from benchmarks.roofline import counted, measured_peak
+from benchmarks.peers import INCREMENTAL, SETTINGS, Incremental, LevenbergMarquardt, Problem, xyyaw
+from benchmarks.roofline import Work, counted, measured_peak
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.odometry.local_odometry import LocalOdometry
@@ -43,43 +43,49 @@ class Times:
         self.cpu_ms.append(1e3 * (time.process_time() - cpu))
         return result
 
-    def median(self) -> dict[str, float]:
-        """Of both."""
-        return {"ms": float(np.median(self.wall_ms)), "cpu_ms": float(np.median(self.cpu_ms))}
+    def mean(self, last: int) -> dict[str, float]:
+        """Of the last of both: the network runs for each eighth meta-pose, which a median would not see."""
+        return {"ms": float(np.mean(self.wall_ms[-last:])), "cpu_ms": float(np.mean(self.cpu_ms[-last:]))}
 
 
 class Watched:
-    """An online core of which the last problem, and how long each optimisation took, are known."""
+    """An online core as the node runs it, of which the last problem, and how long each optimisation took, are known.
 
-    def __init__(self, world_name: str, window: int) -> None:
+    An optimisation is its preparation, its iterations and what takes over the result; candidates, registrations and
+    features come before it.
+    """
+
+    def __init__(self, world_name: str, window: int, iterations_per_step: int = 1) -> None:
         weights = WEIGHTS / world_name
         optimizer, _ = load_optimizer(weights, world_name)
-        self.core = OnlineTrajectory(optimizer, load_place(weights, world_name)[0].pair_head, window)
+        pair_head = load_place(weights, world_name)[0].pair_head
+        self.core = OnlineTrajectory(optimizer, pair_head, window, iterations_per_step=iterations_per_step)
         self.block = self.core.block
         self.optimisations = Times()
         self._given: tuple[MetaSteps, Loops] | None = None
-        self._begun = Times()
+        self._spent, self._searched = Times(), Times()
         iterate, graph = optimizer.iterate, self.core._graph
-        begin, advance = graph.begin, graph.advance
+        advance, do = graph.advance, graph._do
 
         def remembered(steps: MetaSteps, loops: Loops | None = None, *others: Any) -> Any:
             assert loops is not None, "expected an optimizer with loops"
             self._given = (steps, loops)
             return iterate(steps, loops, *others)
 
-        def beginning() -> None:
-            self._begun = Times()
-            self._begun.take(begin)
+        def searching(part: Callable[[int], None]) -> None:
+            self._searched.take(do, part)
 
         def advancing(iterations: int) -> bool:
-            done = self._begun.take(advance, iterations)
+            done = self._spent.take(advance, iterations)
             if done:
-                self.optimisations.wall_ms.append(sum(self._begun.wall_ms))
-                self.optimisations.cpu_ms.append(sum(self._begun.cpu_ms))
+                for kind in ("wall_ms", "cpu_ms"):
+                    all_of_it, search = (sum(getattr(times, kind)) for times in (self._spent, self._searched))
+                    getattr(self.optimisations, kind).append(all_of_it - search)
+                self._spent, self._searched = Times(), Times()
             return done
 
         vars(optimizer)["iterate"] = remembered
-        vars(graph).update(begin=beginning, advance=advancing)
+        vars(graph).update(advance=advancing, _do=searching)
 
     def problem(self) -> Problem:
         """What the optimizer was given last."""
@@ -93,12 +99,13 @@ def core_speed(world_name: str, seed: int, window: int, live: int, repeats: int,
     ``core_ms`` lists, for each of the ``live`` steps, what the core and the path take in this process.
     """
     torch.set_num_threads(1)
-    drive = drive_of(world_name, seed, window + live, cache)
     watched = Watched(world_name, window)
     block, core = watched.block, watched.core
-    blocks = window // block
-    incremental, lm, believed, isam, updates = Incremental(), Times(), Times(), Times(), Times()
-    paths, steps = Times(), Times()
+    # The last meta-pose of the window is optimised while the next one comes; behind all a meta-pose is counted.
+    drive = drive_of(world_name, seed, window + live + 2 * block, cache)
+    lm, believed, steps, paths = Times(), Times(), Times(), Times()
+    incremental = {name: Incremental(skip) for name, skip in INCREMENTAL.items()}
+    isam = {name: Times() for name in INCREMENTAL}
     writer = PathWriter("map")
     result: dict[str, Any] = {}
 
@@ -107,46 +114,50 @@ def core_speed(world_name: str, seed: int, window: int, live: int, repeats: int,
         assert trajectory is not None
         return writer.write(int(trajectory.stamps_ns[-1]), trajectory.stamps_ns, trajectory.poses_xyyaw)
 
-    for number, step in enumerate(tqdm(drive.steps(), f"{world_name} core", window + live), 1):
-        if number > window:
+    updates, work = Times(), Work()
+    for number, step in enumerate(tqdm(drive.steps(), f"{world_name} core", len(drive)), 1):
+        if number > window + block + live:
+            with counted(work):
+                core.update(step)
+            continue
+        if number > window + block:
             steps.take(core.update, step)
             paths.take(path)
             continue
-        if number < window:
-            (updates if number % block == 0 else Times()).take(core.update, step)
-        else:
-            with counted() as work:
-                core.update(step)
-            # Under the counter nothing runs at its own pace.
-            del watched.optimisations.wall_ms[-1], watched.optimisations.cpu_ms[-1]
-        if number % block == 0:
-            problem = watched.problem()
-            estimate = isam.take(incremental.update, *incremental.prepare(problem))
-            incremental.keep(estimate)
-            if number // block > blocks - repeats:
-                batch = lm.take(LevenbergMarquardt(problem).solve)
-                likely = problem.where(problem.logit >= SETTINGS.min_logit)
-                believed.take(LevenbergMarquardt(likely).solve)
-        if number == window:
+        optimized = updates.take(core.update, step).optimized
+        if not optimized or number > window + block - 1:
+            continue
+        problem = watched.problem()
+        blocks = len(problem.relative)
+        estimates = {}
+        for name, peer in incremental.items():
+            estimates[name] = isam[name].take(peer.update, *peer.prepare(problem))
+            peer.keep(estimates[name])
+        if blocks > window // block - repeats:
+            batch = lm.take(LevenbergMarquardt(problem).solve)
+            likely = problem.where(problem.logit >= SETTINGS.min_logit)
+            believed.take(LevenbergMarquardt(likely).solve)
+        if blocks == window // block:
             ours = core.trajectory()
             assert ours is not None
             result["rmse_m"] = {
-                "odometry": _rmse_m(drive.odometry()[block - 1 : window : block], drive, block),
-                "ours": _rmse_m(ours.poses_xyyaw[block::block], drive, block),
-                "gtsam_lm": _rmse_m(xyyaw(batch)[1:], drive, block),
-                "isam2": _rmse_m(xyyaw(estimate)[1:], drive, block),
+                "odometry": rmse_m(drive.odometry()[block - 1 : window : block], drive, block),
+                "ours": rmse_m(ours.poses_xyyaw[block : window + 1 : block], drive, block),
+                "gtsam_lm": rmse_m(xyyaw(batch)[1:], drive, block),
+                **{name: rmse_m(xyyaw(estimate)[1:], drive, block) for name, estimate in estimates.items()},
             }
             result["loops"] = len(problem.nodes)
-            peak = measured_peak()
-            result["work"] = {**asdict(work), "flops": work.flops, "bound_ms": work.bound_ms(peak), **vars(peak)}
-    for times in (watched.optimisations, updates, isam):
-        # Of the window; iSAM2 took part in the last one, which was counted and not timed, too.
-        last = blocks if times is isam else blocks - 1
-        times.wall_ms, times.cpu_ms = (values[last - repeats : last] for values in (times.wall_ms, times.cpu_ms))
-    result |= {"optimize": watched.optimisations.median(), "update": updates.median()}
-    result |= {"gtsam_lm": lm.median(), "gtsam_lm_believed": believed.median(), "isam2": isam.median()}
+            result |= {"optimize": watched.optimisations.mean(repeats)}
+            # All of the steps that the last meta-poses took, the one for the next excepted.
+            each = updates.mean(repeats * block)
+            result["update"] = {name: block * value for name, value in each.items()}
+    result |= {name: times.mean(repeats) for name, times in isam.items()}
+    result |= {"gtsam_lm": lm.mean(repeats), "gtsam_lm_believed": believed.mean(repeats)}
     result["core_ms"] = (np.array(steps.wall_ms) + np.array(paths.wall_ms)).tolist()
+    result["core_cpu_ms"] = (np.array(steps.cpu_ms) + np.array(paths.cpu_ms)).tolist()
     result["path_ms"] = float(np.median(paths.wall_ms)) if live else 0.0
+    peak = measured_peak()
+    result["work"] = {**asdict(work), "flops": work.flops, "bound_ms": work.bound_ms(peak), **vars(peak)}
     return result
 
 
@@ -162,7 +173,7 @@ def local_core_ms(world_name: str, seed: int, frames: int) -> list[float]:
     return times.wall_ms
 
 
-def _rmse_m(nodes: np.ndarray, drive: Drive, block: int) -> float:
+def rmse_m(nodes: np.ndarray, drive: Drive, block: int) -> float:
     """Error of the positions ``(blocks, 3)`` after each meta-pose."""
     error = nodes[:, :2] - drive.truth[block - 1 : len(nodes) * block : block, :2]
     return float(np.sqrt((error**2).sum(axis=1).mean()))

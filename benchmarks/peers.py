@@ -17,6 +17,9 @@ from training.baselines.pose_graph import PoseGraphSettings
 SETTINGS = PoseGraphSettings()
 """How far odometry and loops are believed, and the robust kernel: those of the classical baseline."""
 
+INCREMENTAL = {"isam2": 1, "isam2_default": 10}
+"""Settings of iSAM2, by name: how many updates there are from one relinearisation to the next."""
+
 _KERNELS = {
     "none": None,
     "huber": gtsam.noiseModel.mEstimator.Huber,
@@ -84,11 +87,14 @@ class LevenbergMarquardt:
 
 
 class Incremental:
-    """iSAM2, updated meta-pose by meta-pose with the loops that are new; all of it is relinearised where it moved."""
+    """iSAM2, updated meta-pose by meta-pose with the loops that are new.
 
-    def __init__(self) -> None:
+    Each ``skip``-th update relinearises all that moved far enough.
+    """
+
+    def __init__(self, skip: int = 1) -> None:
         parameters = gtsam.ISAM2Params()
-        parameters.relinearizeSkip = 1
+        parameters.relinearizeSkip = skip
         self._isam = gtsam.ISAM2(parameters)
         self._last = np.zeros(3)
         self._seen: set[tuple[int, int]] = set()
@@ -117,6 +123,10 @@ class Incremental:
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         """The solution with what ``prepare`` gave."""
         self._isam.update(graph, values)
+        return self._isam.calculateEstimate()
+
+    def estimate(self) -> gtsam.Values:
+        """The solution as it is."""
         return self._isam.calculateEstimate()
 
     def keep(self, estimate: gtsam.Values) -> None:

@@ -10,13 +10,12 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-import scipy.sparse.linalg
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from ngo_estimator.optimizer import normal_equations
+from ngo_estimator.optimizer import block_cholesky
 
 _SIDE = 1024
 _COPY_BYTES = 2**26
@@ -64,39 +63,30 @@ def measured_peak() -> Peak:
 
 
 @contextlib.contextmanager
-def counted() -> Iterator[Work]:
-    """Count what torch and SuperLU do meanwhile; what numpy does is small beside it and not seen."""
-    work = Work()
+def counted(work: Work | None = None) -> Iterator[Work]:
+    """Count what torch and the sparse factorisation do meanwhile; what else is compiled is small beside it.
 
-    def factorised(matrix: Any, *arguments: Any, **options: Any) -> Any:
-        factor = splu(matrix, *arguments, **options)
-        work.sparse += _factorisation_flops(factor)
-        work.bytes += 12.0 * (matrix.nnz + factor.L.nnz + factor.U.nnz)  # a value and an index each
-        return _Factor(factor, work)
+    It is added to ``work``, where that is given.
+    """
+    work = Work() if work is None else work
+    factorise, solve = block_cholesky.factorise, block_cholesky.solve
 
-    splu = scipy.sparse.linalg.splu
+    def factorised(starts: Any, rows: Any, *blocks: Any) -> Any:
+        work.sparse += _factorisation_flops(np.diff(starts))
+        work.bytes += 2 * sum(array.nbytes for array in blocks)
+        return factorise(starts, rows, *blocks)
+
+    def solved(starts: Any, rows: Any, diagonal: Any, lower: Any, right: Any) -> None:
+        # A product and a sum an entry, forward and back.
+        work.sparse += 4.0 * (diagonal.size + lower.size) * right.shape[2]
+        work.bytes += 2 * (diagonal.nbytes + lower.nbytes)
+        solve(starts, rows, diagonal, lower, right)
+
     flops = FlopCounterMode(display=False)
-    with mock.patch.object(normal_equations, "splu", factorised), _Traffic(work), flops:
+    patched = mock.patch.multiple(block_cholesky, factorise=factorised, solve=solved)
+    with patched, _Traffic(work), flops:
         yield work
     work.products += flops.get_total_flops()
-
-
-class _Factor:
-    """A factorisation that counts how often it is used."""
-
-    def __init__(self, factor: Any, work: Work) -> None:
-        self._factor, self._work = factor, work
-
-    def solve(self, right: np.ndarray, *arguments: Any) -> np.ndarray:
-        """Solve for one or several right sides."""
-        entries = self._factor.L.nnz + self._factor.U.nnz
-        self._work.sparse += 2.0 * entries * (right.size // len(right))
-        self._work.bytes += 12.0 * entries
-        solution: np.ndarray = self._factor.solve(right, *arguments)
-        return solution
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._factor, name)
 
 
 class _Traffic(TorchDispatchMode):
@@ -119,11 +109,10 @@ class _Traffic(TorchDispatchMode):
         return result
 
 
-def _factorisation_flops(factor: Any) -> float:
-    """Of eliminating each column: a division an entry of L below the diagonal, a product and a sum a pair with U."""
-    below = np.diff(factor.L.tocsc().indptr) - 1.0
-    right = np.diff(factor.U.tocsr().indptr) - 1.0
-    return float((below + 2.0 * below * right).sum())
+def _factorisation_flops(heights: np.ndarray) -> float:
+    """Of eliminating columns of so many blocks: a division an entry below, a product and a sum for half the pairs."""
+    below = (3.0 * heights[:, None] + np.array([2.0, 1.0, 0.0])).ravel()
+    return float((below + below * (below + 1.0)).sum())
 
 
 def _fastest(action: Any) -> float:

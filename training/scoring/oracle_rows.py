@@ -5,7 +5,7 @@ the networks have seen.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
+from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines.graph_settings import load_settings
 from training.baselines.loop_factors import LoopFactors, smoothed_odometry
@@ -147,8 +147,11 @@ class InformedOptimizer(NeuralGraphOptimizer):
         self.eval().requires_grad_(False)
         self._truth = truth
 
-    def iterate(self, steps: MetaSteps, loops: Loops | None = None) -> Iterator[OptimizedMetaPoses]:
-        return super().iterate(steps, None if loops is None else exact_loops(loops, self._truth, self.block))
+    def iterate(
+        self, steps: MetaSteps, loops: Loops | None = None, corrections: Sequence[Correction] | None = None
+    ) -> Iterator[OptimizedMetaPoses]:
+        exact = None if loops is None else exact_loops(loops, self._truth, self.block)
+        return super().iterate(steps, exact, corrections)
 
     def overlaps(self, steps: MetaSteps, loops: Loops, poses: Tensor) -> Loops | None:
         found = super().overlaps(steps, loops, poses)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy.sparse import csc_matrix
 
 from benchmarks.roofline import Peak, Work, counted, measured_peak
-from ngo_estimator.optimizer import normal_equations
+from ngo_estimator.optimizer.block_cholesky import BlockCholesky, BlockStructure
 
 
 def test_products_and_elementwise_operations_are_counted() -> None:
@@ -26,13 +25,13 @@ def test_views_move_nothing() -> None:
 
 
 def test_eliminating_a_full_matrix_takes_the_known_number_of_operations() -> None:
-    size = 12
-    matrix = csc_matrix(np.eye(size) * size + 1.0)
+    count = 4
+    structure = BlockStructure(np.stack(np.triu_indices(count, 1), axis=1), count)
+    diagonal, lower = np.tile(9.0 * np.eye(3), (count, 1, 1)), np.full((structure.blocks, 3, 3), 0.1)
     with counted() as work:
-        factor = normal_equations.splu(matrix)
-        assert factor.solve(matrix @ np.arange(size)) == pytest.approx(np.arange(size))
-    elimination = sum(below + 2 * below**2 for below in range(size))
-    assert work.sparse == elimination + 2 * (size * size + size)
+        BlockCholesky(structure, diagonal, lower).solve(np.ones((count, 3, 1)))
+    elimination = sum(below + below * (below + 1) for below in range(3 * count))
+    assert work.sparse == elimination + 4 * 9 * (count + structure.blocks)
 
 
 def test_the_least_time_is_the_longer_one_of_computing_and_moving() -> None:

@@ -84,8 +84,9 @@ def test_huge_variances_and_unusual_codes_break_nothing(
     ],
 )
 def test_what_fails_once_is_said_once_and_costs_nothing_else(
-    maze2d: OnlineTrajectory, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, complaint: str
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, complaint: str
 ) -> None:
+    core = request.getfixturevalue("maze3d" if name == "find_overlaps" else "maze2d")
     whole, calls = getattr(owner, name), 0
 
     def fails_once(*arguments: Any, **named: Any) -> Any:
@@ -96,7 +97,7 @@ def test_what_fails_once_is_said_once_and_costs_nothing_else(
         return whole(*arguments, **named)
 
     monkeypatch.setattr(owner, name, fails_once)
-    updates = take(maze2d, drive(maze2d, 64))
+    updates = take(core, drive(core, 64))
     assert calls > 3 and [update.fault for update in updates if update.fault] == [complaint]
     assert updates[-1].frames == 65 and any(update.optimized for update in updates[56:])
 

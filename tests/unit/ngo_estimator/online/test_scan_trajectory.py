@@ -336,7 +336,7 @@ def test_a_fault_of_numerics_costs_an_optimisation_alone(monkeypatch: pytest.Mon
                 elif where == "no numbers":
                     broken.setattr(NormalEquations, "covariance", lambda *_: np.full((3, 3), np.nan))
                 else:
-                    broken.setattr(NormalEquations, "step" if where == "iterate" else "covariance", fails)
+                    broken.setattr(NormalEquations, "solution" if where == "iterate" else "covariance", fails)
             before = trajectory.trajectory()
             update = trajectory.update(step)
             faults += bool(update.fault)

@@ -248,16 +248,6 @@ def test_gradients_of_whole_information_are_those_of_finite_differences() -> Non
     assert torch.autograd.gradcheck(step, inputs)
 
 
-def test_correlated_steps_have_the_inverse_of_their_covariance_as_information() -> None:
-    covariance = torch.linalg.inv(whole_information(4))
-    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    correlation = covariance / (std.unsqueeze(-1) * std.unsqueeze(-2))
-    expected = torch.linalg.inv(covariance)
-    torch.testing.assert_close(step_information(std, correlation), expected, rtol=1e-9, atol=1e-9)
-    identity = torch.eye(3, dtype=DOUBLE).expand(1, 4, 3, 3)
-    torch.testing.assert_close(step_information(std, identity), torch.diag_embed(step_information(std)))
-
-
 @pytest.mark.parametrize("shape", [(1, 4, 1), (1, 4, 3, 1), (1, 3, 3), (1, 3, 3, 3)])
 def test_information_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
     _, (_, pairs) = random_graph()

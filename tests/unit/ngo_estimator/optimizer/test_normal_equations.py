@@ -20,7 +20,7 @@ def equations(factors: list[Factors]) -> NormalEquations:
 def test_steps_and_covariances_are_the_dense_ones(seed: int) -> None:
     _, factors = random_graph(seed)
     sparse = equations(factors)
-    assert torch.allclose(sparse.step(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
+    assert torch.allclose(sparse.solution(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
     for node in (1, 5, BLOCKS):
         expected = node_covariance(factors, BLOCKS + 1, node)[0].numpy()
         np.testing.assert_allclose(sparse.covariance([node]), expected, rtol=1e-8, atol=1e-14)
@@ -31,7 +31,7 @@ def test_whole_information_is_solved_as_by_the_dense_solver(seed: int) -> None:
     _, factors = random_graph(seed)
     factors = with_whole_information(factors)
     sparse = equations(factors)
-    assert torch.allclose(sparse.step(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
+    assert torch.allclose(sparse.solution(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
     expected = node_covariance(factors, BLOCKS + 1, BLOCKS)[0].numpy()
     np.testing.assert_allclose(sparse.covariance([BLOCKS]), expected, rtol=1e-8, atol=1e-14)
 
@@ -55,7 +55,7 @@ def test_one_structure_serves_all_steps_of_an_optimisation() -> None:
             factors[0],
             Factors(factors[1].nodes, factors[1].jacobian, factors[1].residual, gain * factors[1].information),
         ]
-        step = NormalEquations(weaker, structure).step()
+        step = NormalEquations(weaker, structure).solution()
         assert torch.allclose(step, gauss_newton_step(weaker, BLOCKS + 1), rtol=1e-8, atol=1e-12)
 
 

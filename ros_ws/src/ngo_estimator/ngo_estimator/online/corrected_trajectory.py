@@ -5,12 +5,11 @@ from abc import ABC, abstractmethod
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-import torch
 
 from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.online.bridge import bridged
 from ngo_estimator.online.map_localisation import MapLocalisation
 from ngo_estimator.online.map_origin import MapOrigin
@@ -306,7 +305,7 @@ class CorrectedTrajectory(ABC):
     def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
         graph = self._graph
         pose, covariance = graph.newest()
-        map_from_odom = se2.compose(torch.from_numpy(pose), se2.inverse(torch.from_numpy(self._odom))).numpy()
+        map_from_odom = compose(pose, between(self._odom, np.zeros(3)))
         return TrajectoryUpdate(
             stamp_ns=int(self._log.stamps_ns.values[-1]),
             pose_xyyaw=_read_only(pose.copy()),

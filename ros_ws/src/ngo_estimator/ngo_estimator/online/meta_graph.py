@@ -4,7 +4,7 @@ Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 t
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +14,14 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
-from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses
+from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 from ngo_estimator.optimizer.registered_odometry import registered_steps
@@ -33,6 +34,9 @@ _FRESH = 2
 
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
+
+_LONG = 2
+"""Iterations that take as long as a search for loops."""
 
 _BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features")
 """Names of the newest rows: three of each step, the others of each block; without a network there are no features."""
@@ -50,15 +54,46 @@ class _Running:
     keys: np.ndarray
     first: int
     numbers: np.ndarray
+    runs_network: bool
     result: OptimizedMetaPoses | None = None
-    took_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Corrections:
+    """What the network gave when it ran last, ``(iterations, blocks, 3)``, for the blocks from number ``first`` on."""
+
+    first: int
+    adjustment: np.ndarray
+    stiffness: np.ndarray
+
+    @classmethod
+    def of(cls, first: int, given: Sequence[Correction]) -> "_Corrections":
+        """Of all iterations of one optimisation."""
+        arrays = (torch.cat(parts).numpy() for parts in zip(*given, strict=True))
+        return cls(first, *arrays)
+
+    def for_blocks(self, first: int, last: int) -> list[Correction]:
+        """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
+        stiffness, adjustment = self.stiffness[:, first - self.first :], self.adjustment[:, first - self.first :]
+        new = ((0, 0), (0, last - first - stiffness.shape[1]), (0, 0))
+        rows = np.pad(adjustment, new), np.pad(stiffness, new, mode="edge")
+        pairs = zip(*(torch.from_numpy(array).unsqueeze(1) for array in rows), strict=True)
+        return [Correction(*pair) for pair in pairs]
 
 
 class MetaGraph:
-    """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it."""
+    """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
+
+    The network runs for each ``network_every``-th block; between, what it gave is taken again.
+    """
 
     def __init__(
-        self, optimizer: NeuralGraphOptimizer, pair_head: PairHead | None, window: int, key_frames: int
+        self,
+        optimizer: NeuralGraphOptimizer,
+        pair_head: PairHead | None,
+        window: int,
+        key_frames: int,
+        network_every: int = 1,
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
@@ -96,7 +131,12 @@ class MetaGraph:
         self.loop_frames = np.zeros((0, 2), np.int64)
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._work: list[Callable[[int], None]] = []  # what is left of taking in the newest block
+        self._begun = False
         self._running: _Running | None = None
+        self._network_every = network_every
+        self._corrections: _Corrections | None = None
+        self._begun_s = 0.0
         self.optimized, self.fault = False, ""
         """Whether an optimisation ended, and what failed, since the newest frame came."""
         self.took_s = 0.0
@@ -133,10 +173,10 @@ class MetaGraph:
         """
         self.optimized, self.fault = False, ""
         log_std = 0.5 * np.log(variance)
-        self._pose = se2.compose(torch.from_numpy(self._pose), torch.from_numpy(relative.astype(np.float64))).numpy()
+        step = relative.astype(np.float64)
+        self._pose = compose(self._pose, step)
         self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
-        last = torch.from_numpy(self.odometry.values[-1])
-        self.odometry.append(se2.compose(last, torch.from_numpy(relative.astype(np.float64))).numpy())
+        self.odometry.append(compose(self.odometry.values[-1], step))
         if joins:
             self._joins.append(len(self.odometry) - 1)
         self._relative.append(relative)
@@ -146,11 +186,10 @@ class MetaGraph:
             self._loops.append(code)
         if (len(self.odometry) - 1) % self._block:
             return False
-        if self._running is not None:  # what comes now changes the nodes that it is about
-            try:
-                self.advance(self._running.left)
-            except Exception as error:  # it may cost an optimisation, and nothing else
-                self.fail(error)
+        try:
+            self.finish()  # what comes now changes the nodes that it is about
+        except Exception as error:  # it may cost an optimisation, and nothing else
+            self.fail(error)
         self._complete_block()
         return True
 
@@ -169,31 +208,66 @@ class MetaGraph:
         self._steps.append(in_block[0, 0, -1])
         self._std.append(std)
         self._optimized_std.append(std)
-        relative = se2.between(*torch.from_numpy(self.odometry.values[[-1 - self._block, -1]]))
-        self._nodes.append(se2.compose(torch.from_numpy(self._nodes.values[-1]), relative).numpy())
-        if self._optimizer.config.network or self._optimizer.config.smoother is not None:
-            self._aggregate(block)
+        relative = between(*self.odometry.values[[-1 - self._block, -1]])
+        self._nodes.append(compose(self._nodes.values[-1], relative))
+        self._work = self._all_work()
+
+    def _all_work(self) -> list[Callable[[int], None]]:
+        """What is to be done for a new block before it is optimised, each as long as ``_LONG`` iterations."""
+        looks_for_overlaps = self._optimizer.config.loops and self._optimizer.config.search.overlaps > 0
+        overlaps = [self._find_again], [self._find_shared]
+        again, shared = overlaps if looks_for_overlaps else ([], [])
+        return [self._aggregate, *again, self._find_places, *shared]
+
+    @property
+    def work(self) -> int:
+        """How much an update is, in iterations: taking in a block, preparing its optimisation, and that."""
+        return _LONG * len(self._all_work()) + 1 + self._optimizer.config.iterations
+
+    def _do(self, part: Callable[[int], None]) -> None:
+        """Do a part; what fails may cost loops or features, and nothing else."""
         try:
-            self._find_loops(block)
-        except Exception as error:  # as above: it may cost loops, and nothing else
-            self.fail(error, "the search for loops")
+            part(self.blocks - 1)
+        except Exception as error:  # numerics of a library, or a fault of ours
+            self.fault = _said(error, "the search for loops" if "find" in part.__name__ else "taking in a meta-pose")
+
+    @torch.inference_mode()
+    def _settle(self) -> None:
+        """Do all that is left of taking in the newest block."""
+        while self._work:
+            self._do(self._work.pop(0))
+        self._make_room()
+
+    @property
+    def _fresh(self) -> bool:
+        """Whether poses say what frames share."""
+        return self.blocks - self._result_last <= _FRESH
+
+    def _find_again(self, block: int) -> None:
+        """Look once more for overlaps of a slightly older block."""
+        if self._loops is not None and self._fresh and block - _AGAIN >= self._first:
+            self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
+
+    def _find_places(self, block: int) -> None:
+        """Look for loops of the newest block."""
+        if self._loops is not None:
+            self._limit_drift(self._loops.find(block, self._first, self._keys))
+
+    def _find_shared(self, block: int) -> None:
+        """Look for overlaps of the newest block."""
+        if self._loops is not None and self._fresh:
+            self._limit_drift(self._loops.find_overlaps(block, self._first, self._nodes.values, self._keys))
+
+    def _limit_drift(self, found: KeptLoops) -> None:
+        if self._loops is not None and len(self._keys) and len(found):
+            self._loops.limit_drift(found, self._drift(found))
+
+    def _make_room(self) -> None:
+        """Let the window slide."""
         while self.blocks - self._first > self._window:
             self._slide()
         if self._keys.crowded:
             self._thin()
-
-    def _find_loops(self, block: int) -> None:
-        """Look for loops of the newest block, whose number is ``block``, and for overlaps of a slightly older one."""
-        if self._loops is None:
-            return
-        fresh = self.blocks - self._result_last <= _FRESH
-        if fresh and block - _AGAIN >= self._first:
-            self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
-        found = self._loops.find(block, self._first, self._keys)
-        if fresh:
-            found = found.and_also(self._loops.find_overlaps(block, self._first, self._nodes.values, self._keys))
-        if len(self._keys):
-            self._loops.limit_drift(found, self._drift(found))
 
     def _register(self, first: int) -> None:
         """Measure the newest block again, which begins with the step of number ``first``."""
@@ -215,10 +289,13 @@ class MetaGraph:
 
     def _aggregate(self, block: int) -> None:
         """Features and smoothed odometry of the blocks that the newest one changes, and of itself."""
+        if not self._optimizer.config.network and self._optimizer.config.smoother is None:
+            return
         changed = max(0, block - self._context)
         start = max(0, changed - self._context)
         rows = (self._relative, self._log_std, self._motion)
-        inputs = [torch.from_numpy(r.slice(start * self._block)).unsqueeze(0) for r in rows]
+        ends = start * self._block, (block + 1) * self._block
+        inputs = [torch.from_numpy(r.slice(*ends)).unsqueeze(0) for r in rows]
         steps = self._optimizer.aggregate(*inputs)
         if steps.features is not None:
             self._features.replace(changed, steps.features[0, changed - start :].numpy())
@@ -296,47 +373,74 @@ class MetaGraph:
     @property
     def running(self) -> bool:
         """Whether an optimisation has begun that is not done."""
-        return self._running is not None
+        return self._begun
 
-    @torch.inference_mode()
     def begin(self) -> None:
         """Begin to optimise all nodes of the window and the key frames before it."""
-        began = time.perf_counter()
+        self._begun, self._begun_s = True, 0.0
+
+    @torch.inference_mode()
+    def _prepare(self) -> None:
+        self._make_room()
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
-        features = (
-            torch.from_numpy(self._features.slice(first)).unsqueeze(0) if self._optimizer.config.network else None
-        )
+        corrections = self._remembered()
+        features = None
+        if self._optimizer.config.network and corrections is None:
+            features = torch.from_numpy(self._features.slice(first)).unsqueeze(0)
         steps = MetaSteps(
             torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, self.blocks - first
         )
         loops, numbers = None, np.zeros(0, np.int64)
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
-        self._running = _Running(
-            self._optimizer.iterate(steps, loops), self._optimizer.config.iterations, keys, first, numbers
-        )
-        self._running.took_s = time.perf_counter() - began
+        iterations = self._optimizer.iterate(steps, loops, corrections)
+        runs_network = self._optimizer.config.network and corrections is None
+        self._running = _Running(iterations, self._optimizer.config.iterations, keys, first, numbers, runs_network)
+
+    def _remembered(self) -> list[Correction] | None:
+        """What the network gave lately; None where it is time to run it, or where there is none."""
+        known = self._corrections
+        if known is None:
+            return None
+        seen = known.stiffness.shape[1]
+        new = self.blocks - known.first - seen
+        # A short trajectory changes a lot with each block.
+        return None if new >= min(self._network_every, 1 + seen // 8) else known.for_blocks(self._first, self.blocks)
 
     @torch.inference_mode()
     def advance(self, iterations: int) -> bool:
-        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose."""
-        running = self._running
-        if running is None:
+        """Run so many iterations of what has begun, or what takes as long and comes before them.
+
+        Returns:
+            Whether it is done, and every node at its new pose.
+        """
+        if not self._begun:
             raise RuntimeError("no optimisation has begun")
         began = time.perf_counter()
-        for _ in range(min(iterations, running.left)):
-            running.result = next(running.iterations)
-            running.left -= 1
-        running.took_s += time.perf_counter() - began
-        if running.left or running.result is None:
+        while iterations > 0:
+            if self._work:
+                self._do(self._work.pop(0))
+                iterations -= _LONG
+                continue
+            if self._running is None:
+                self._prepare()
+            elif self._running.left:
+                self._running.result = next(self._running.iterations)
+                self._running.left -= 1
+            else:
+                break
+            iterations -= 1
+        self._begun_s += time.perf_counter() - began
+        running = self._running
+        if running is None or running.left or running.result is None:
             return False
         end = self._scale * running.result.end_covariance()[0].numpy()
         poses = running.result.meta_relative[-1]
         if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
-        self._running, self.took_s = None, running.took_s
+        self._running, self._begun, self.took_s = None, False, self._begun_s
         self._apply(running, running.result)
         self._pose, self._covariance = self._newest(end)
         self.optimized = True
@@ -348,8 +452,9 @@ class MetaGraph:
         return self.running
 
     def finish(self) -> bool:
-        """Run what is left of an optimisation that has begun; returns whether there was one."""
-        return self._running is not None and self.advance(self._running.left)
+        """Do what is left of an optimisation that has begun; returns whether there was one."""
+        self._settle()
+        return self._begun and self.advance(1 + self._optimizer.config.iterations)
 
     def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> None:
         keys, first = running.keys, running.first
@@ -366,15 +471,18 @@ class MetaGraph:
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._end, self._information = self._scale * result.end_covariance()[0].numpy(), result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
+        if running.runs_network and self._network_every > 1:
+            self._corrections = _Corrections.of(first, result.corrections)
 
     def abandon(self) -> None:
-        """Leave undone what has begun."""
-        self._running = None
+        """Leave undone what has begun; the newest block is taken in all the same."""
+        self._running, self._begun = None, False
+        self._settle()
 
     def fail(self, error: Exception, work: str = "an optimisation") -> None:
         """Leave undone what has begun, and keep why: every node is where it was."""
-        self.fault = f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
         self.abandon()
+        self.fault = _said(error, work)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
@@ -418,8 +526,8 @@ class MetaGraph:
             covariance: that of the last node in the map ``(3, 3)``.
         """
         whole = self.blocks * self._block
-        odometry = torch.from_numpy(self.odometry.values[whole:])
-        poses = se2.compose(torch.from_numpy(self._nodes.values[-1]), se2.between(odometry[0], odometry)).numpy()
+        odometry, node = self.odometry.values[whole:], self._nodes.values[-1]
+        poses = [compose(node, between(odometry[0], row)) for row in odometry]
         steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
         for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
             covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))
@@ -432,10 +540,12 @@ class MetaGraph:
     def state(self) -> Arrays:
         """All that later steps depend on, for ``restore``.
 
-        Of an optimisation in progress that is the number of its iterations: nothing that it began with has changed.
+        Of an optimisation in progress that is the number of its parts: nothing that its iterations began with has
+        changed.
         """
         running, code = self._running, self._origin_code
-        done = -1 if running is None else self._optimizer.config.iterations - running.left
+        iterated = 0 if running is None else 1 + self._optimizer.config.iterations - running.left
+        known = self._corrections
         arrays = {
             "odometry": self.odometry.values,
             "pose": self._pose,
@@ -455,11 +565,16 @@ class MetaGraph:
             "loop_weights": self.loop_weights,
             "joins": self._joins.values,
             "origin_code": np.zeros(0, np.float32) if code is None else code,
-            "iterations": np.array(done),
+            "begun": np.array(self._begun),
+            "parts_left": np.array(len(self._work)),
+            "iterated": np.array(iterated),
             **under("keys", self._keys.state()),
         }
         for name, rows in self._buffers().items():
             arrays |= under(name, rows.state())
+        if known is not None:
+            own = {"first": np.array(known.first), "adjustment": known.adjustment, "stiffness": known.stiffness}
+            arrays |= under("corrections", own)
         if self._information is not None:
             arrays |= under("information", self._information.state())
         return arrays if self._loops is None else arrays | under("loops", self._loops.state())
@@ -498,11 +613,27 @@ class MetaGraph:
         if self._loops is not None:
             self._loops.restore(part(arrays, "loops"))
         self._check()
-        done = taken_integer(arrays, "iterations", -1)
-        require(done < self._optimizer.config.iterations, f"an optimisation has run {done} iterations already")
-        if done >= 0:
-            self.begin()
-            self.advance(done)
+        corrections = part(arrays, "corrections")
+        if corrections:
+            self._corrections = self._restored_corrections(corrections)
+        work, left = self._all_work(), taken_integer(arrays, "parts_left")
+        iterated = taken_integer(arrays, "iterated")
+        require(left <= len(work), f"{left} parts of an update are left")
+        require(iterated <= self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
+        self._work = work[len(work) - left :]
+        self._begun = bool(taken(arrays, "begun", np.bool_))
+        require(self._begun or not iterated, "an optimisation has not begun, and iterated")
+        require(not (left and iterated), "an optimisation has iterated before its time")
+        if iterated:
+            self.advance(iterated)
+
+    def _restored_corrections(self, arrays: Arrays) -> _Corrections:
+        first, iterations = taken_integer(arrays, "first"), self._optimizer.config.iterations
+        adjustment = taken(arrays, "adjustment", np.float32, iterations, -1, 3)
+        stiffness = taken(arrays, "stiffness", np.float32, *adjustment.shape[:2], -1)
+        last = first + adjustment.shape[1]
+        require(first <= self._first < last <= self.blocks, f"corrections of the blocks {first} to {last} are given")
+        return _Corrections(first, adjustment, stiffness)
 
     def _check(self) -> None:
         """Raise ``StateError`` where the parts of a restored state do not belong together."""
@@ -521,3 +652,7 @@ class MetaGraph:
             and bool((self._joins.values > 0).all() and (self._joins.values <= frames).all()),
             "nodes or key frames are named that are not there",
         )
+
+
+def _said(error: Exception, work: str) -> str:
+    return f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"

@@ -25,6 +25,9 @@ from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 _VARIANCES = (1e-12, 1e4)
 """What lies below or above is exact or unknown, and float32 has no room for it."""
 
+_NETWORK_EVERY = 8
+"""Meta-poses from one run of attention and convolutions to the next, where work is spread over steps."""
+
 
 class OnlineTrajectory(CorrectedTrajectory):
     """Keeps the trajectory and re-optimises it whenever a meta-pose is complete.
@@ -36,8 +39,9 @@ class OnlineTrajectory(CorrectedTrajectory):
     At most ``key_frames`` of the poses before the window are optimised with it, and a few more for a while. All others
     move with these. Loops are closed with key frames. So the cost of a step does not depend on the trajectory's length.
 
-    All iterations of an optimisation are run at the step that completes a meta-pose. With ``iterations_per_step`` they
-    are spread over the steps after it: the same result, a few steps later.
+    All of an update is done at the step that completes a meta-pose. With ``iterations_per_step`` it is spread over the
+    steps before the next one: features, three searches for loops, and iterations. Attention and convolutions are run
+    for each eighth meta-pose then, as what they give hardly changes from one to the next.
     """
 
     _graph: MetaGraph
@@ -71,9 +75,11 @@ class OnlineTrajectory(CorrectedTrajectory):
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
         self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
-        iterations = optimizer.config.iterations
-        # An optimisation must be done when the next one begins, a block later.
-        super().__init__(max(iterations_per_step, -(-iterations // block)) if iterations_per_step else iterations)
+        self._network_every = _NETWORK_EVERY if iterations_per_step else 1
+        work = self._new_graph().work
+        # An update must be done when the next one begins, a block later.
+        least = -(-work // max(1, block - 1))
+        super().__init__(max(iterations_per_step, least) if iterations_per_step else work)
 
     @classmethod
     def load(
@@ -122,7 +128,8 @@ class OnlineTrajectory(CorrectedTrajectory):
         }
 
     def _new_graph(self) -> MetaGraph:
-        return MetaGraph(self._optimizer, self._pair_head, self._window // self._block, self._key_frames)
+        blocks = self._window // self._block
+        return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, self._network_every)
 
     def _checked(self, step: RelativeStep) -> RelativeStep:
         check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_length)

@@ -48,18 +48,9 @@ class Factors:
         return jacobian * information.unsqueeze(-1)
 
 
-def step_information(step_std: Tensor, correlation: Tensor | None = None) -> Tensor:
-    """Information of steps: ``(batch, n, 3)`` without a correlation, ``(batch, n, 3, 3)`` with one.
-
-    Args:
-        step_std: standard deviations ``(batch, n, 3)``.
-        correlation: correlation matrices ``(batch, n, 3, 3)``, positive definite.
-    """
-    if correlation is None:
-        return step_std.square().reciprocal()
-    scale = step_std.reciprocal()
-    inverse: Tensor = torch.linalg.inv(correlation.to(step_std.dtype))
-    return scale.unsqueeze(-1) * inverse * scale.unsqueeze(-2)
+def step_information(step_std: Tensor) -> Tensor:
+    """Information ``(batch, n, 3)`` of steps with standard deviations of this shape."""
+    return step_std.square().reciprocal()
 
 
 def chain_factors(poses: Tensor, deviation: Tensor, information: Tensor) -> Factors:

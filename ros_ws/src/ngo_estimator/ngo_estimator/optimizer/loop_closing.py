@@ -17,7 +17,6 @@ from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances, spread_over_span
 from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
-from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -55,7 +54,7 @@ class NoLoopClosing:
 
 
 class LoopClosing:
-    """Closes the loops of one optimisation, iteration by iteration.
+    """Closes the loops of one optimisation, iteration by iteration, so that gradients can be asked for.
 
     Args:
         gate: how much each loop is trusted.
@@ -76,7 +75,6 @@ class LoopClosing:
     ) -> None:
         self._gate, self._steps, self._loops, self._find_overlaps = gate, steps, loops, find_overlaps
         self._odometry_noise, self._correction_std = odometry_noise, correction_std
-        self._structure = _sparse_structure(loops, steps.relative)
         self._gated: _GatedLoops
         self._closed: ClosedLoops | None = None
 
@@ -95,7 +93,6 @@ class LoopClosing:
         """
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._loops = self._loops.and_also(overlaps)
-            self._structure = _sparse_structure(self._loops, self._steps.relative)
         loops, poses = self._loops, state.poses
         residuals = loop_residuals(loops, poses)
         expected = odometry_variances(loops.start, loops.end + 1, poses, state.step_std.square()).to(poses.dtype)
@@ -117,16 +114,15 @@ class LoopClosing:
         step_std = torch.cat((base_std[:, :keys], own), dim=1)
         # Sums over hundreds of poses need more digits than float32 has.
         poses = gated.poses.double()
-        odometry = step_information(step_std.double(), self._steps.correlation)
+        odometry = step_information(step_std.double())
         factors = [
             chain_factors(poses, state.deviation.double(), odometry),
             pair_factors(gated.loops.nodes, poses, gated.residuals.double(), gated.information.double()),
         ]
-        equations = None if self._structure is None else NormalEquations(factors, self._structure)
-        change = gauss_newton_step(factors, poses.shape[1]) if equations is None else equations.step()
+        change = gauss_newton_step(factors, poses.shape[1])
         after, before = se2.g2r(torch.cat((poses + change, poses))[:, 1:]).chunk(2)
         deviation = state.deviation + se2.wrapped(after - before).to(state.deviation.dtype)
-        self._closed = ClosedLoops(gated.loops, gated.weights, gated.information, equations)
+        self._closed = ClosedLoops(gated.loops, gated.weights, gated.information, None)
         return replace(state, deviation=deviation, step_std=step_std)
 
     def _channels(self, state: GraphState, residuals: Tensor, weights: Tensor) -> Tensor:
@@ -138,13 +134,3 @@ class LoopClosing:
         bent = torch.cat((local, state.deviation[:, keys:]), dim=-1)
         # At first, residuals of many standard deviations are usual: the convolutions see their logarithm.
         return torch.cat((torch.asinh(bent / self._correction_std.repeat(2)), torch.log1p(support)), dim=-1)
-
-
-def _sparse_structure(loops: Loops, relative: Tensor) -> GraphStructure | None:
-    """Structure of a single graph without gradients; None for all others, which the dense solver takes."""
-    if torch.is_grad_enabled() or relative.shape[0] != 1 or relative.device.type != "cpu":
-        return None
-    blocks = relative.shape[1]
-    index = torch.arange(blocks)
-    nodes = torch.cat((torch.stack((index, index + 1), dim=-1), loops.nodes[0]))
-    return GraphStructure(nodes.numpy(), blocks + 1)

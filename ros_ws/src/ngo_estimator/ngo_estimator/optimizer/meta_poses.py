@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.gauss_newton import chain_factors, node_covariance, pair_factors, step_information
 from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.normal_equations import NormalEquations
+from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,6 @@ class MetaSteps:
     before. The last ``blocks`` of them are blocks of steps, with ``features`` ``(batch, blocks, width)`` if the
     optimizer has a network. The poses in front of these are key frames: each leads to the next one, over any number of
     steps. ``in_blocks`` ``(batch, blocks, block, 3)`` are the poses within blocks; overlaps need them.
-    ``correlation`` ``(batch, poses, 3, 3)`` are the correlation matrices of the relative meta-poses; None stands for
-    independent errors of x, y and yaw.
     """
 
     relative: Tensor
@@ -31,7 +30,6 @@ class MetaSteps:
     features: Tensor | None
     blocks: int
     in_blocks: Tensor | None = None
-    correlation: Tensor | None = None
 
     @property
     def key_frames(self) -> int:
@@ -83,7 +81,14 @@ class ClosedLoops:
     loops: Loops
     weights: Tensor
     information: Tensor
-    equations: NormalEquations | None
+    equations: FactorisedInformation | None
+
+
+class Correction(NamedTuple):
+    """What the network gives in one iteration: adjustments ``(batch, blocks, 3)``, and the stiffness of this shape."""
+
+    adjustment: Tensor
+    stiffness: Tensor
 
 
 @dataclass(frozen=True)
@@ -91,14 +96,14 @@ class OptimizedMetaPoses:
     """The optimizer's result for a batch of meta-steps.
 
     ``meta_relative``: one ``(batch, poses, 3)`` for each iteration, first to last. ``step_std`` ``(batch, poses, 3)``:
-    the deviations with which the odometry is believed, ``correlation`` as in ``MetaSteps``. ``closed``: the loops of
-    the last iteration, None for an optimizer without loops.
+    the deviations with which the odometry is believed. ``closed``: the loops of the last iteration, None for an
+    optimizer without loops. ``corrections``: what the network gave in each iteration.
     """
 
     meta_relative: list[Tensor]
     step_std: Tensor
-    correlation: Tensor | None
     closed: ClosedLoops | None
+    corrections: list[Correction] = field(default_factory=list)
 
     @property
     def loops(self) -> Loops | None:
@@ -116,7 +121,7 @@ class OptimizedMetaPoses:
         return None if self.closed is None else self.closed.information
 
     @property
-    def equations(self) -> NormalEquations | None:
+    def equations(self) -> FactorisedInformation | None:
         """The normal equations of the last Gauss-Newton step, where no gradient was asked for."""
         return None if self.closed is None else self.closed.equations
 
@@ -126,7 +131,7 @@ class OptimizedMetaPoses:
             # They are linearised before the last step. That step was small, and all else is the same.
             return torch.from_numpy(self.equations.covariance([self.step_std.shape[1]])).unsqueeze(0)
         poses = with_origin(se2.r2g(self.meta_relative[-1].double()))
-        information = step_information(self.step_std.double(), self.correlation)
+        information = step_information(self.step_std.double())
         factors = [chain_factors(poses, torch.zeros_like(poses[:, 1:]), information)]
         if self.closed is not None:
             residual = torch.zeros_like(self.closed.information)
@@ -138,7 +143,7 @@ class OptimizedMetaPoses:
 class OptimizedTrajectory(OptimizedMetaPoses):
     """The same with ``poses`` ``(batch, steps, 3)``: corrected global poses of all frames after the origin."""
 
-    poses: Tensor
+    poses: Tensor = field(kw_only=True)
 
 
 def with_origin(poses: Tensor) -> Tensor:

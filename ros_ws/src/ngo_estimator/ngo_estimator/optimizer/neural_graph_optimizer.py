@@ -1,7 +1,9 @@
 """The Neural Graph Optimizer (paper, section "Neural Graph Optimization"), with and without loop closures."""
 
+from __future__ import annotations
+
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -16,11 +18,18 @@ from ngo_estimator.networks.pose_aggregation import (
     frame_poses,
     poses_in_blocks,
 )
-from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork
+from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
+from ngo_estimator.optimizer.compiled_closing import CompiledClosing, fits
 from ngo_estimator.optimizer.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
-from ngo_estimator.optimizer.meta_poses import GraphState, MetaSteps, OptimizedMetaPoses, OptimizedTrajectory
+from ngo_estimator.optimizer.meta_poses import (
+    Correction,
+    GraphState,
+    MetaSteps,
+    OptimizedMetaPoses,
+    OptimizedTrajectory,
+)
 from ngo_estimator.optimizer.overlaps import find_overlaps
 from ngo_estimator.optimizer.registered_odometry import registered_steps
 
@@ -88,7 +97,7 @@ class NeuralGraphOptimizerConfig:
         return self.search.registrations if self.loops else 0
 
     @classmethod
-    def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> "NeuralGraphOptimizerConfig":
+    def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> NeuralGraphOptimizerConfig:
         """Nine plain convolutions of kernel 3 over features and attention; no place codes and no loops."""
         form: dict[str, object] = {
             "attention": "sum",
@@ -126,7 +135,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
 
-    def with_smoother(self, smoother: OdometrySmoother | None) -> "NeuralGraphOptimizer":
+    def with_smoother(self, smoother: OdometrySmoother | None) -> NeuralGraphOptimizer:
         """The same optimizer with a copy of another smoother, or with none."""
         config = replace(self.config, smoother=None if smoother is None else smoother.config)
         values = {name: value for name, value in self.state_dict().items() if not name.startswith("smoother.")}
@@ -136,7 +145,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
         changed.load_state_dict(values)
         return changed
 
-    def with_registrations(self, registrations: int) -> "NeuralGraphOptimizer":
+    def with_registrations(self, registrations: int) -> NeuralGraphOptimizer:
         """The same optimizer with another number of registration iterations; with 0 it looks for no overlaps."""
         overlaps = self.config.search.overlaps if registrations else 0
         search = replace(self.config.search, registrations=registrations, overlaps=overlaps)
@@ -196,8 +205,14 @@ class NeuralGraphOptimizer(AttentionNetwork):
         *_, last = self.iterate(steps, loops)
         return last
 
-    def iterate(self, steps: MetaSteps, loops: Loops | None = None) -> Iterator[OptimizedMetaPoses]:
+    def iterate(
+        self, steps: MetaSteps, loops: Loops | None = None, corrections: Sequence[Correction] | None = None
+    ) -> Iterator[OptimizedMetaPoses]:
         """Run the M iterations one by one, and yield the result of ``optimize`` after each.
+
+        Args:
+            corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
+                running it.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -205,17 +220,30 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
-        similarity = None if loops is None else loops.embeddings @ loops.embeddings.mT
-        phases = self.phases(steps.blocks, similarity, self.correction_std) if self.config.network else _NoNetwork(self)
+        phases = self._phases(steps, loops, corrections)
         closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops)
         state, results = GraphState.initial(steps), []
+        made: list[Correction] = []
         for iteration in range(self.config.iterations):
             seen = closing.look(state, iteration)
             attended = phases.attend(state)
+            before = state.adjusted
             state, stiffness = phases.optimise(state, attended, seen)
+            if self.config.network:
+                made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
             state = closing.close(state, stiffness)
-            results.append(state.relative)
-            yield OptimizedMetaPoses(list(results), state.step_std, steps.correlation, closing.closed)
+            results.append(state.relative.to(steps.relative.dtype))
+            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made)
+
+    def _phases(
+        self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
+    ) -> AttentionPhases | _NoNetwork | _Remembered:
+        if not self.config.network:
+            return _NoNetwork(self)
+        if corrections is not None:
+            return _Remembered(corrections)
+        similarity = None if loops is None else loops.embeddings @ loops.embeddings.mT
+        return self.phases(steps.blocks, similarity, self.correction_std)
 
     def overlaps(self, steps: MetaSteps, loops: Loops, poses: Tensor) -> Loops | None:
         """Further loops under corrected poses ``(batch, poses + 1, 3)``; None if they are not to be looked for."""
@@ -224,9 +252,10 @@ class NeuralGraphOptimizer(AttentionNetwork):
             return None
         return find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
 
-    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
+    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing | CompiledClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
-        return LoopClosing(self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std)
+        kind = CompiledClosing if fits(steps) else LoopClosing
+        return kind(self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std)
 
 
 class _NoNetwork:
@@ -242,3 +271,21 @@ class _NoNetwork:
     def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
         """The state as it is, and the stiffness ``(3,)``."""
         return state, self._stiffness
+
+
+class _Remembered:
+    """Stands for both phases where the network is not run: what it gave in another optimisation."""
+
+    def __init__(self, corrections: Sequence[Correction]) -> None:
+        self._corrections = iter(corrections)
+
+    def attend(self, state: GraphState) -> Tensor:
+        """No attention vectors."""
+        return state.features
+
+    def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
+        """The state with the adjustments of the next iteration, and its stiffness."""
+        adjustment, stiffness = next(self._corrections)
+        adjusted = state.adjusted.clone()
+        adjusted[:, -adjustment.shape[1] :] += adjustment
+        return replace(state, adjusted=adjusted), stiffness

@@ -1,32 +1,18 @@
 """Sparse normal equations of one pose graph; the optimizer solves these when nobody needs a gradient.
 
-The factors of some hundred poses fill a few per cent of the matrix. SuperLU, with an ordering of minimum degree,
-factorises it several times faster than a dense Cholesky factorisation.
+The factors of some hundred poses fill a few per cent of the matrix.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+from numba import njit
 from torch import Tensor
 
 from ngo_estimator.data.state_arrays import Arrays, require, taken
+from ngo_estimator.optimizer.block_cholesky import Array, BlockCholesky, BlockStructure
 from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
-
-# Pivots stay on the diagonal. No relaxed supernodes: they fill columns that have little in common, and are many times
-# slower in graphs of thousands of poses.
-_SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "options": {"SymmetricMode": True}}
-
-_LEAST_REUSED = 400_000
-"""Numbers in a factor from which on its use for another matrix is faster than to factorise that."""
-
-_MOST_REFINEMENTS = 30
-"""So many steps of conjugate gradients take about as long as to factorise."""
-
-_TOLERANCE = 1e-6
-"""Of a solution by another matrix's factor: its residual against the right hand side."""
 
 
 class GraphStructure:
@@ -36,142 +22,120 @@ class GraphStructure:
         nodes: of all factors ``(factors, 2)``, each 0 to ``count - 1``; the pose of node 0 is known.
     """
 
-    def __init__(self, nodes: np.ndarray, count: int) -> None:
+    def __init__(self, nodes: Array, count: int) -> None:
         self.count = count
-        unknown = count - 1
         pairs = nodes - 1
-        self.rank = _order_of_elimination(pairs[(pairs >= 0).all(1)], unknown)
-        """Place of each node but node 0 in the order of elimination ``(count - 1,)``."""
-        ranks = self.rank[pairs]
-        row, column = ranks[:, [0, 0, 1, 1]].ravel(), ranks[:, [0, 1, 0, 1]].ravel()
-        known = (pairs[:, [0, 0, 1, 1]] < 0).ravel() | (pairs[:, [0, 1, 0, 1]] < 0).ravel()
-        diagonal = np.arange(unknown)
-        keys = np.concatenate((column * unknown + row, diagonal * unknown + diagonal))
-        blocks, block = np.unique(keys[np.append(~known, np.ones(unknown, bool))], return_inverse=True)
-        # Node 0 is known: its blocks are summed behind all others, and not used.
-        self._block = torch.full((len(row),), len(blocks))
-        self._block[torch.from_numpy(~known)] = torch.from_numpy(block[: len(block) - unknown])
-        block_column, block_row = blocks // unknown, blocks % unknown
-        height = np.bincount(block_column, minlength=unknown)
-        first = np.concatenate(([0], np.cumsum(height)))
-        rank = np.arange(len(blocks)) - first[block_column]
-        # A column of blocks is three columns of the matrix, each with three rows of every block.
-        i, k = np.arange(3)[:, None], np.arange(3)[None, :]
-        inside = 3 * rank[:, None, None] + i + 3 * height[block_column][:, None, None] * k
-        self._place = 9 * first[block_column][:, None, None] + inside
-        self._indices = np.empty(9 * len(blocks), np.int32)
-        self._indices[self._place] = np.broadcast_to(3 * block_row[:, None, None] + i, self._place.shape)
-        starts = 9 * first[:-1, None] + 3 * height[:, None] * np.arange(3)
-        self._indptr = np.append(starts.ravel(), 9 * len(blocks)).astype(np.int32)
-        self._is_diagonal = block_column == block_row
+        both = (pairs >= 0).all(1)
+        self.blocks = BlockStructure(pairs[both], count - 1)
+        """Those of the information matrix, whose row ``k`` is node ``k + 1``."""
+        self.ranks = np.where(pairs >= 0, self.blocks.rank[pairs], -1)
+        """Places of the factors' nodes in the order of elimination ``(factors, 2)``; -1 for node 0."""
+        self.place = np.full(len(nodes), -1)
+        """Index of the block that joins a factor's nodes ``(factors,)``; -1 where one of them is node 0."""
+        self.place[both], _ = self.blocks.places(self.blocks.pairs)
 
-    def matrix(self, hessian: Tensor) -> csc_matrix:
-        """The factors' ``(factors, 6, 6)`` summed, without node 0, in an order that leaves few entries to eliminate."""
-        parts = hessian.unflatten(-1, (2, 3)).unflatten(-3, (2, 3)).transpose(2, 3).reshape(-1, 9)
-        summed = torch.zeros(len(self._is_diagonal) + 1, 9, dtype=torch.float64).index_add_(0, self._block, parts)
-        blocks = summed[:-1].numpy()
-        blocks[self._is_diagonal, ::4] *= 1.0 + RELATIVE_JITTER
-        data = np.empty(9 * len(blocks))
-        data[self._place] = blocks.reshape(-1, 3, 3)
-        size = 3 * (self.count - 1)
-        return csc_matrix((data, self._indices, self._indptr), shape=(size, size))
-
-
-def _order_of_elimination(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Place of each node ``(count,)`` in an ordering of minimum degree, found on single numbers instead of blocks."""
-    degree = np.bincount(pairs.ravel(), minlength=count) + 1.0
-    values = np.concatenate((np.full(2 * len(pairs), -1.0), degree))
-    diagonal = np.arange(count)
-    rows, columns = (np.concatenate((pairs[:, k], pairs[:, 1 - k], diagonal)) for k in (0, 1))
-    matrix = csc_matrix((values, (rows, columns)), shape=(count, count))
-    order: np.ndarray = splu(matrix, permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC).perm_c
-    return order.astype(np.int64)
+    def empty(self) -> tuple[Array, Array, Array]:
+        """Zeros for the blocks of a matrix, on the diagonal and below, and for a right hand side ``(nodes, 3, 1)``."""
+        unknown = self.count - 1
+        return np.zeros((unknown, 3, 3)), np.zeros((self.blocks.blocks, 3, 3)), np.zeros((unknown, 3, 1))
 
 
 class FactorisedInformation:
     """The factorised information matrix of the poses of one graph, node 0 excepted, which is known.
 
     Args:
-        rank: place of each pose in the order of elimination ``(poses,)``.
-        matrix: ``(3 poses, 3 poses)``, in this order.
-        near: the same poses in the same order, with a matrix that differs little. Where factors are large, its factor
-            serves: conjugate gradients solve what the difference leaves.
+        structure: of the matrix.
+        diagonal, lower: its blocks, as ``BlockCholesky`` takes them; they stay as they are.
+
+    Raises:
+        ArithmeticError: the matrix is not positive definite, as where a pose has no factor at all.
     """
 
-    def __init__(self, rank: np.ndarray, matrix: csc_matrix, near: "FactorisedInformation | None" = None) -> None:
-        self._rank, self._matrix = rank, matrix
-        self._exact = False
-        if near is None or near._factor.nnz < _LEAST_REUSED:
-            self._factorise()
-        else:
-            self._factor = near._factor
+    def __init__(self, structure: BlockStructure, diagonal: Array, lower: Array) -> None:
+        self._structure, self._diagonal, self._lower = structure, diagonal, lower
+        diagonal = diagonal.copy()
+        diagonal[:, [0, 1, 2], [0, 1, 2]] *= 1.0 + RELATIVE_JITTER
+        self._factor = BlockCholesky(structure, diagonal, lower.copy())
 
-    def _factorise(self) -> None:
-        self._factor: SuperLU = splu(self._matrix, permc_spec="NATURAL", **_SYMMETRIC)
-        self._exact = True
+    def step(self, right: Array) -> Array:
+        """Changes ``(nodes + 1, 3)`` of all poses, node 0 staying where it is.
 
-    def _solved(self, right: np.ndarray) -> np.ndarray:
-        """Solution ``(rows,)`` of the equations with the right hand side ``(rows,)``."""
-        solution: np.ndarray
-        if not self._exact:
-            known = LinearOperator(self._matrix.shape, self._factor.solve, dtype=np.float64)
-            solution, failed = cg(self._matrix, right, rtol=_TOLERANCE, maxiter=_MOST_REFINEMENTS, M=known)
-            if not failed:
-                return solution
-            self._factorise()
-        solution = self._factor.solve(right)
-        return solution
+        Args:
+            right: right hand side ``(nodes, 3, 1)`` in the order of elimination; it is used up.
+        """
+        self._factor.solve_ordered(right)
+        step = np.zeros((len(right) + 1, 3))
+        step[1:] = right[self._structure.rank, :, 0]
+        return step
 
-    def rows(self, nodes: np.ndarray) -> np.ndarray:
-        """Rows of the matrix ``(n, 3)`` that belong to nodes ``(n,)``, none of them node 0."""
-        rows: np.ndarray = 3 * self._rank[nodes - 1][:, None] + np.arange(3)
-        return rows
-
-    def covariance(self, nodes: Sequence[int]) -> np.ndarray:
+    def covariance(self, nodes: Sequence[int] | Array) -> Array:
         """Joint covariance ``(3 n, 3 n)`` of the poses of ``n`` different nodes, node 0 excepted, in the map."""
-        wanted = self.rows(np.asarray(nodes)).ravel()
-        right = np.zeros((self._matrix.shape[0], len(wanted)))
-        right[wanted, np.arange(len(wanted))] = 1.0
-        if not self._exact:
-            self._factorise()
-        covariance: np.ndarray = self._factor.solve(right)[wanted]
+        rows = np.asarray(nodes) - 1
+        size = 3 * len(rows)
+        right = np.zeros((self._structure.count, 3, size))
+        right[rows] = np.eye(size).reshape(len(rows), 3, size)
+        covariance: Array = self._factor.solve(right)[rows].reshape(size, size)
         return 0.5 * (covariance + covariance.T)
 
     def state(self) -> Arrays:
         """The matrix, for ``from_state``."""
-        matrix = self._matrix
-        return {"rank": self._rank, "data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+        pairs = np.unique(np.sort(self._structure.pairs, axis=1), axis=0)
+        return {"pairs": pairs, "diagonal": self._diagonal, "lower": self._lower}
 
     @classmethod
     def from_state(cls, arrays: Arrays) -> "FactorisedInformation":
         """The same again, to the last bit; raises ``StateError``."""
-        rank, data = taken(arrays, "rank", np.int64, -1), taken(arrays, "data", np.float64, -1)
-        size = 3 * len(rank)
-        indices, indptr = taken(arrays, "indices", np.int32, len(data)), taken(arrays, "indptr", np.int32, size + 1)
-        require(np.array_equal(np.sort(rank), np.arange(len(rank))), "the order of elimination is no permutation")
-        matrix = csc_matrix((data, indices, indptr), shape=(size, size))
-        matrix.check_format()
-        return FactorisedInformation(rank, matrix)
+        pairs, diagonal = taken(arrays, "pairs", np.int64, -1, 2), taken(arrays, "diagonal", np.float64, -1, 3, 3)
+        require(bool(((pairs >= 0) & (pairs < len(diagonal))).all()), "blocks are named that are not there")
+        once = np.array_equal(pairs, np.unique(np.sort(pairs, axis=1), axis=0))
+        require(once, "blocks are named twice, or in another order")
+        structure = BlockStructure(pairs, len(diagonal))
+        return FactorisedInformation(structure, diagonal, taken(arrays, "lower", np.float64, structure.blocks, 3, 3))
 
 
 class NormalEquations(FactorisedInformation):
     """The factorised normal equations of one graph, at the poses where its factors were linearised."""
 
-    def __init__(
-        self, factors: Sequence[Factors], structure: GraphStructure, near: FactorisedInformation | None = None
-    ) -> None:
-        """Sum the factors of a batch of one; raises ``RuntimeError`` where a pose has no factor at all."""
-        nodes, hessian, gradient = (blocks[0] for blocks in normal_blocks(factors))
-        self._right = torch.zeros(structure.count, 3, dtype=torch.float64)
-        self._right.index_add_(0, nodes.flatten(), gradient.reshape(-1, 3))
-        super().__init__(structure.rank, structure.matrix(hessian), near)
+    def __init__(self, factors: Sequence[Factors], structure: GraphStructure) -> None:
+        """Sum the factors of a batch of one; raises ``ArithmeticError`` where a pose has no factor at all."""
+        _, hessian, gradient = (blocks[0].numpy() for blocks in normal_blocks(factors))
+        diagonal, lower, self._right = structure.empty()
+        _add_all(structure.ranks, structure.place, hessian, gradient, diagonal, lower, self._right)
+        super().__init__(structure.blocks, diagonal, lower)
 
-    def step(self) -> Tensor:
+    def solution(self) -> Tensor:
         """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""
-        count = len(self._right)
-        rows = self.rows(np.arange(1, count))
-        right = np.empty(rows.size)
-        right[rows] = self._right[1:].numpy()
-        step = np.zeros((count, 3))
-        step[1:] = self._solved(right)[rows]
-        return torch.from_numpy(step).unsqueeze(0)
+        return torch.from_numpy(self.step(self._right.copy())).unsqueeze(0)
+
+
+@njit(cache=True)
+def add_factor(
+    hessian: Array, gradient: Array, ranks: Array, place: int, diagonal: Array, lower: Array, right: Array
+) -> None:
+    """Add a factor to the blocks of ``GraphStructure.empty``.
+
+    Args:
+        hessian: ``(6, 6)``; gradient: ``(6,)``.
+        ranks: ``(2,)``, and ``place``: of this factor, as in the structure.
+    """
+    a, b = ranks
+    for which in range(2):
+        at, first = (b, 3) if which else (a, 0)
+        if at >= 0:
+            for r in range(3):
+                right[at, r, 0] += gradient[first + r]
+                for c in range(3):
+                    diagonal[at, r, c] += hessian[first + r, first + c]
+    if place >= 0:
+        row, column = (0, 3) if a > b else (3, 0)
+        for r in range(3):
+            for c in range(3):
+                lower[place, r, c] += hessian[row + r, column + c]
+
+
+@njit(cache=True)
+def _add_all(
+    ranks: Array, place: Array, hessian: Array, gradient: Array, diagonal: Array, lower: Array, right: Array
+) -> None:
+    for k in range(len(ranks)):
+        add_factor(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)

@@ -7,11 +7,14 @@ as scan matching back ends do (Hess et al. 2016).
 
 import math
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans
+from ngo_estimator.optimizer.block_cholesky import Array
 from ngo_estimator.optimizer.gauss_newton import pick
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere, frame_odometry
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, PairViews, measure_overlaps
@@ -101,18 +104,55 @@ def shared_views(config: RegistrationConfig, a: Tensor, b: Tensor, relative: Ten
         a, b: ranges ``(n, rays)`` in m, 0 where nothing is known; relative: pose of ``b`` in the frame of ``a``
             ``(n, 3)``.
     """
-    return torch.minimum(_seen_again(config, a, b, relative), _seen_again(config, b, a, se2.inverse(relative)))
-
-
-def _seen_again(config: RegistrationConfig, a: Tensor, b: Tensor, relative: Tensor) -> Tensor:
+    angles = config.angles_rad.numpy().astype(np.float64)
+    first, second, poses = (x.detach().float().cpu().contiguous().numpy() for x in (a, b, relative))
     half = math.radians(config.field_of_view_deg) / 2.0
-    some = config.angles_rad.to(b)[::_EVERY]
-    ranges = b[:, ::_EVERY]
-    points = ranges.unsqueeze(-1) * torch.stack((some.cos(), some.sin()), dim=-1)
-    seen = se2.rotate(relative[:, 2:], points) + relative[:, None, :2]
-    at = ((half - torch.atan2(seen[..., 1], seen[..., 0])) * (config.rays - 1) / (2.0 * half)).round()
-    inside = (at >= 0.0) & (at <= config.rays - 1) & (ranges > 0.0)
-    there = a.gather(1, at.clamp(0, config.rays - 1).long())
-    tolerance = 0.5 * _DRIFT_M + _AGREEING * (config.noise_m + config.noise_share * there)
-    meets = inside & (there > 0.0) & ((seen.norm(dim=-1) - there).abs() < tolerance)
-    return meets.to(b.dtype).mean(-1)
+    share = np.empty(len(relative), np.float32)
+    settings = (half, config.noise_m, config.noise_share)
+    _share_views(first, second, poses, np.cos(angles), np.sin(angles), settings, share)
+    return torch.from_numpy(share).to(relative)
+
+
+@njit(cache=True, error_model="numpy")
+def _share_views(
+    a: Array, b: Array, relative: Array, cos: Array, sin: Array, settings: tuple[float, float, float], share: Array
+) -> None:
+    for k in range(len(relative)):
+        x, y, yaw = relative[k]
+        share[k] = _seen_again(a[k], b[k], (x, y, yaw), cos, sin, settings)
+        if share[k] > 0.0:
+            turn_x, turn_y = math.cos(yaw), math.sin(yaw)
+            inverse = (-turn_x * x - turn_y * y, turn_y * x - turn_x * y, -yaw)
+            share[k] = min(share[k], _seen_again(b[k], a[k], inverse, cos, sin, settings))
+
+
+@njit(cache=True, error_model="numpy")
+def _seen_again(
+    a: Array,
+    b: Array,
+    relative: tuple[float, float, float],
+    cos: Array,
+    sin: Array,
+    settings: tuple[float, float, float],
+) -> float:
+    """Share of some rays of ``b`` that end where ``a`` sees a wall."""
+    half, noise, noise_share = settings
+    turn_x, turn_y = math.cos(relative[2]), math.sin(relative[2])
+    meets, count = 0, 0
+    farthest = a.max()
+    farthest += 0.5 * _DRIFT_M + _AGREEING * (noise + noise_share * farthest)
+    for ray in range(0, len(b), _EVERY):
+        count += 1
+        if not b[ray] > 0.0:
+            continue
+        x, y = b[ray] * cos[ray], b[ray] * sin[ray]
+        seen_x, seen_y = turn_x * x - turn_y * y + relative[0], turn_y * x + turn_x * y + relative[1]
+        distance = math.sqrt(seen_x * seen_x + seen_y * seen_y)
+        if not distance < farthest:
+            continue
+        at = round((half - math.atan2(seen_y, seen_x)) * (len(a) - 1) / (2.0 * half))
+        if at < 0 or at > len(a) - 1 or not a[at] > 0.0:
+            continue
+        tolerance = 0.5 * _DRIFT_M + _AGREEING * (noise + noise_share * a[at])
+        meets += abs(distance - a[at]) < tolerance
+    return meets / count

@@ -86,7 +86,6 @@ class ScanPoseGraph:
         """What the loops weigh ``(n,)``, zero to one."""
         self.converged = False
         self._structure = GraphStructure(np.concatenate((steps.nodes, loops.nodes)), len(poses))
-        self._equations: NormalEquations | None = None  # of the last iteration
         self._cost = self._total(self.poses)
 
     def iterate(self) -> None:
@@ -96,8 +95,7 @@ class ScanPoseGraph:
             self._steps.factors(self.poses, self._kernel_weights(self._steps)),
             self._loops.factors(self.poses, self.weights),
         ]
-        self._equations = NormalEquations(factors, self._structure, self._equations)
-        step = self._equations.step()[0].numpy()
+        step = NormalEquations(factors, self._structure).solution()[0].numpy()
         for _ in range(_HALVINGS):
             poses = self.poses + step
             cost = self._total(poses)

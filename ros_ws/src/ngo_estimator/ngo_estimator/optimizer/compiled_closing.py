@@ -1,0 +1,338 @@
+"""Loop closing of one trajectory where nobody asks for a gradient: as ``loop_closing``, compiled, in float64.
+
+Tensors of some hundred rows cost more in calls than in arithmetic. Here an iteration is two calls.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor, nn
+
+from ngo_estimator.geometry.planar_motion import wrap
+from ngo_estimator.optimizer.block_cholesky import Array
+from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER
+from ngo_estimator.optimizer.loop_closure import Loops
+from ngo_estimator.optimizer.loop_gates import RobustLoopGate
+from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
+from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure, add_factor
+
+_GATE_INPUTS = 11
+_KERNEL_WIDTH = RobustLoopGate.WIDTH
+
+
+def fits(steps: MetaSteps) -> bool:
+    """Whether ``CompiledClosing`` takes these: a single trajectory on the CPU, and no gradient."""
+    return not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu"
+
+
+class CompiledClosing:
+    """As ``LoopClosing``, for what ``fits``; arguments as there."""
+
+    def __init__(
+        self,
+        gate: RobustLoopGate,
+        steps: MetaSteps,
+        loops: Loops,
+        find_overlaps: Callable[[Tensor], Loops | None],
+        odometry_noise: Tensor,
+        correction_std: Tensor,
+    ) -> None:
+        self._gate, self._steps, self._find_overlaps = gate, steps, find_overlaps
+        self._layers, self._head = [_of(layer) for layer in gate.layers if isinstance(layer, nn.Linear)], _of(gate.head)
+        self._noise_2 = np.stack((gate.noise.double().numpy(), gate.components.double().numpy()))
+        self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
+        self._std = steps.std[0].double().numpy()
+        self._poses = np.zeros((len(self._std) + 1, 3))
+        self._take(loops)
+        self._closed: ClosedLoops | None = None
+
+    def _take(self, loops: Loops) -> None:
+        self._loops = loops
+        nodes, blocks = loops.nodes[0].numpy(), len(self._std)
+        index = np.arange(blocks)
+        self._structure = GraphStructure(np.concatenate((np.stack((index, index + 1), axis=1), nodes)), blocks + 1)
+        self._nodes = nodes
+        self._measured = loops.measured[0].double().numpy()
+        limits = loops.most_drift
+        self._most_drift = np.full((len(nodes), 3), np.inf) if limits is None else limits[0].double().numpy()
+        constants = (
+            loops.description[0],
+            loops.log_length[0].unsqueeze(-1),
+            loops.log_scale[0],
+            loops.logit[0].unsqueeze(-1),
+            loops.valid[0].unsqueeze(-1),
+        )
+        self._constants = torch.cat([part.double() for part in constants], dim=-1).numpy()
+
+    @property
+    def closed(self) -> ClosedLoops:
+        """The loops of the last ``close``; raises ``RuntimeError`` before it."""
+        if self._closed is None:
+            raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
+        return self._closed
+
+    def look(self, state: GraphState, iteration: int) -> Tensor:
+        """As ``LoopClosing.look``."""
+        if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
+            self._take(self._loops.and_also(overlaps))
+        arrays = (state.adjusted, state.deviation, state.step_std)
+        adjusted, deviation, step_std = (array[0].double().numpy() for array in arrays)
+        count = len(self._nodes)
+        self._residuals, self._weights, self._information = np.empty((count, 3)), np.empty(count), np.empty((count, 3))
+        expected = np.empty((count, 3))
+        _chained(adjusted + deviation, self._poses)
+        _residuals(self._poses, step_std, self._nodes, self._measured, self._most_drift, self._residuals, expected)
+        annealing = RobustLoopGate.ANNEALING**iteration
+        inputs = np.empty((count, _GATE_INPUTS), np.float32)
+        squared = np.empty(count)
+        _gate_inputs(self._constants, self._residuals, expected, annealing, self._noise_2, inputs, squared)
+        hidden = inputs
+        for weight, bias in self._layers:
+            hidden = np.maximum(hidden @ weight + bias, 0.0)
+        belief = hidden @ self._head[0] + self._head[1]
+        _gates(self._constants, belief, squared, self._noise_2, self._weights, self._information)
+        channels = np.empty((self._steps.blocks, CHANNELS), np.float32)
+        _channels(self._poses, deviation, self._nodes, self._residuals, self._weights, self._unit, channels)
+        return torch.from_numpy(channels).unsqueeze(0)
+
+    def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
+        """As ``LoopClosing.close``."""
+        keys = self._steps.key_frames
+        step_std, deviation = self._std.copy(), state.deviation[0].double().numpy().copy()
+        factor = np.exp(3.0 * np.tanh(stiffness.double().numpy() / 3.0))
+        step_std[keys:] *= (factor[0] if factor.ndim == 3 else factor) * self._noise
+        structure = self._structure
+        diagonal, lower, right = structure.empty()
+        _add_chain(self._poses, deviation, step_std, structure.ranks, structure.place, diagonal, lower, right)
+        _add_loops(
+            self._poses,
+            self._nodes,
+            self._residuals,
+            self._information,
+            structure.ranks[len(self._std) :],
+            structure.place[len(self._std) :],
+            diagonal,
+            lower,
+            right,
+        )
+        equations = FactorisedInformation(structure.blocks, diagonal, lower)
+        _deviate(self._poses, equations.step(right), deviation)
+        kind = state.deviation.dtype
+        weights, information = (
+            torch.from_numpy(values).unsqueeze(0).to(kind) for values in (self._weights, self._information)
+        )
+        self._closed = ClosedLoops(self._loops, weights, information, equations)
+        return replace(
+            state,
+            deviation=torch.from_numpy(deviation).unsqueeze(0),
+            step_std=torch.from_numpy(step_std).unsqueeze(0),
+        )
+
+
+def _of(layer: nn.Linear) -> tuple[Array, Array]:
+    """Weights, inputs first, and biases of a layer."""
+    return layer.weight.detach().float().numpy().T.copy(), layer.bias.detach().float().numpy()
+
+
+@njit(cache=True)
+def _chained(relative: Array, poses: Array) -> None:
+    """Poses ``(n + 1, 3)`` of relative ones ``(n, 3)``, the origin in front; yaw is not wrapped."""
+    x, y, yaw = 0.0, 0.0, 0.0
+    poses[0] = 0.0
+    for k in range(len(relative)):
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        x += cos * relative[k, 0] - sin * relative[k, 1]
+        y += sin * relative[k, 0] + cos * relative[k, 1]
+        yaw += relative[k, 2]
+        poses[k + 1, 0], poses[k + 1, 1], poses[k + 1, 2] = x, y, yaw
+
+
+@njit(cache=True, error_model="numpy")
+def _residuals(
+    poses: Array, step_std: Array, nodes: Array, measured: Array, most_drift: Array, residuals: Array, expected: Array
+) -> None:
+    """As ``loop_residuals`` and ``odometry_variances``, limited by ``most_drift``."""
+    prefix = np.zeros((len(poses), 7))
+    for k in range(len(step_std)):
+        along_x = math.cos(poses[k, 2]) ** 2
+        first, second, turn = step_std[k, 0] ** 2, step_std[k, 1] ** 2, step_std[k, 2] ** 2
+        x, y = poses[k + 1, 0], poses[k + 1, 1]
+        in_x = along_x * first + (1.0 - along_x) * second
+        prefix[k + 1, 0] = prefix[k, 0] + in_x
+        prefix[k + 1, 1] = prefix[k, 1] + first + second - in_x
+        prefix[k + 1, 2] = prefix[k, 2] + turn
+        prefix[k + 1, 3] = prefix[k, 3] + turn * x
+        prefix[k + 1, 4] = prefix[k, 4] + turn * y
+        prefix[k + 1, 5] = prefix[k, 5] + turn * x * x
+        prefix[k + 1, 6] = prefix[k, 6] + turn * y * y
+    for k in range(len(nodes)):
+        a, b = nodes[k]
+        cos, sin = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+        x, y = poses[b, 0], poses[b, 1]
+        residuals[k, 0] = poses[a, 0] + cos * measured[k, 0] - sin * measured[k, 1] - x
+        residuals[k, 1] = poses[a, 1] + sin * measured[k, 0] + cos * measured[k, 1] - y
+        residuals[k, 2] = wrap(poses[a, 2] + measured[k, 2] - poses[b, 2])
+        turn = prefix[b, 2] - prefix[a, 2]
+        across_x = x * (x * turn - 2.0 * (prefix[b, 3] - prefix[a, 3])) + prefix[b, 5] - prefix[a, 5]
+        across_y = y * (y * turn - 2.0 * (prefix[b, 4] - prefix[a, 4])) + prefix[b, 6] - prefix[a, 6]
+        expected[k, 0] = min(max(prefix[b, 0] - prefix[a, 0] + across_y, 0.0), most_drift[k, 0])
+        expected[k, 1] = min(max(prefix[b, 1] - prefix[a, 1] + across_x, 0.0), most_drift[k, 1])
+        expected[k, 2] = min(max(turn, 0.0), most_drift[k, 2])
+
+
+@njit(cache=True, error_model="numpy")
+def _gate_inputs(
+    constants: Array, residuals: Array, expected: Array, annealing: float, noise: Array, inputs: Array, squared: Array
+) -> None:
+    """What ``RobustLoopGate`` sees ``(n, 11)``, and squared residuals ``(n,)`` in deviations.
+
+    ``constants`` ``(n, 11)``: description, logarithms of length and scales, logit, valid; ``noise`` ``(2, 2)``: that of
+    the gate, and its components.
+    """
+    for k in range(len(constants)):
+        errors = (residuals[k, 0] ** 2 + residuals[k, 1] ** 2, residuals[k, 2] ** 2)
+        drifts = (annealing * (expected[k, 0] + expected[k, 1]), annealing * expected[k, 2])
+        for c in range(6):
+            inputs[k, c] = constants[k, c]
+        inputs[k, 6] = constants[k, 6] / 3.0
+        total = 0.0
+        for c in range(2):
+            both = math.exp(2.0 * constants[k, 7 + c]) * noise[0, c] * noise[1, c]
+            inputs[k, 7 + c] = math.log1p(errors[c] / both) / 3.0
+            total += errors[c] / (both + drifts[c])
+        squared[k], inputs[k, 9], inputs[k, 10] = total, math.log1p(total), annealing
+
+
+@njit(cache=True, error_model="numpy")
+def _gates(constants: Array, belief: Array, squared: Array, noise: Array, gates: Array, information: Array) -> None:
+    """Gates ``(n,)`` and information ``(n, 3)`` of what the layers of ``RobustLoopGate`` say ``(n, 3)``."""
+    for k in range(len(constants)):
+        kernel = (1.0 + squared[k] / _KERNEL_WIDTH) ** 2
+        gate = constants[k, 10] / ((1.0 + math.exp(-(constants[k, 9] + 2.0) - 4.0 * belief[k, 0])) * kernel)
+        gates[k] = gate
+        for c in range(2):
+            variance = math.exp(2.0 * constants[k, 7 + c]) * noise[0, c]
+            information[k, 1 + c] = gate * math.exp(4.0 * math.tanh(belief[k, 1 + c] / 2.0)) / variance
+        information[k, 0] = information[k, 1]
+
+
+@njit(cache=True, error_model="numpy")
+def _channels(
+    poses: Array, deviation: Array, nodes: Array, residuals: Array, weights: Array, unit: Array, channels: Array
+) -> None:
+    """The loops for the convolutions: as ``spread_over_span`` and ``LoopClosing`` make them."""
+    edges = np.zeros((len(poses), 4))
+    for k in range(len(nodes)):
+        a, b = nodes[k]
+        for c in range(4):
+            value = weights[k] if c == 3 else weights[k] * residuals[k, c] / (b - a)
+            edges[a, c] += value
+            edges[b, c] -= value
+    keys = len(deviation) - len(channels)
+    total = np.zeros(4)
+    for k in range(len(deviation)):
+        total += edges[k]
+        if k < keys:
+            continue
+        support = max(total[3], 0.0)
+        x, y, yaw = total[0] / (support + 1e-3), total[1] / (support + 1e-3), total[2] / (support + 1e-3)
+        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        row = channels[k - keys]
+        row[0] = math.asinh((cos * x + sin * y) / unit[0])
+        row[1] = math.asinh((cos * y - sin * x) / unit[1])
+        row[2] = math.asinh(yaw / unit[2])
+        for c in range(3):
+            row[3 + c] = math.asinh(deviation[k, c] / unit[c])
+        row[6] = math.log1p(support)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_chain(
+    poses: Array,
+    deviation: Array,
+    step_std: Array,
+    ranks: Array,
+    place: Array,
+    diagonal: Array,
+    lower: Array,
+    right: Array,
+) -> None:
+    """Add the factors of ``chain_factors``."""
+    jacobian, hessian, gradient = np.zeros((3, 6)), np.empty((6, 6)), np.empty(6)
+    for k in range(len(deviation)):
+        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        x, y = poses[k + 1, 0] - poses[k, 0], poses[k + 1, 1] - poses[k, 1]
+        jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = -cos, -sin, cos * y - sin * x
+        jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = sin, -cos, -cos * x - sin * y
+        jacobian[0, 3], jacobian[0, 4], jacobian[1, 3], jacobian[1, 4] = cos, sin, -sin, cos
+        jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
+        hessian[:], gradient[:] = 0.0, 0.0
+        for r in range(3):
+            information = 1.0 / step_std[k, r] ** 2
+            for i in range(6):
+                weighted = information * jacobian[r, i]
+                gradient[i] -= weighted * deviation[k, r]
+                for j in range(6):
+                    hessian[i, j] += weighted * jacobian[r, j]
+        add_factor(hessian, gradient, ranks[k], place[k], diagonal, lower, right)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_loops(
+    poses: Array,
+    nodes: Array,
+    residuals: Array,
+    information: Array,
+    ranks: Array,
+    place: Array,
+    diagonal: Array,
+    lower: Array,
+    right: Array,
+) -> None:
+    """Add the factors of ``pair_factors``."""
+    for k in range(len(nodes)):
+        a, b = nodes[k]
+        # What the start's heading does to the residual.
+        lever = (poses[b, 1] - poses[a, 1], poses[a, 0] - poses[b, 0], -1.0)
+        at, to, between = ranks[k, 0], ranks[k, 1], place[k]
+        for c in range(3):
+            weight = information[k, c]
+            pull, moment = weight * residuals[k, c], weight * lever[c]
+            if at >= 0:
+                right[at, 2, 0] += moment * residuals[k, c]
+                diagonal[at, 2, 2] += moment * lever[c]
+                if c < 2:
+                    right[at, c, 0] -= pull
+                    diagonal[at, c, c] += weight
+                    diagonal[at, 2, c] -= moment
+                    diagonal[at, c, 2] -= moment
+            if to >= 0:
+                right[to, c, 0] += pull
+                diagonal[to, c, c] += weight
+            if between >= 0:
+                if c < 2:
+                    lower[between, c, c] -= weight
+                if at > to:
+                    lower[between, 2, c] += moment
+                else:
+                    lower[between, c, 2] += moment
+
+
+@njit(cache=True)
+def _deviate(poses: Array, change: Array, deviation: Array) -> None:
+    """Add to deviations ``(n, 3)`` what a change of the poses ``(n + 1, 3)`` changes in the steps between them."""
+    for k in range(len(deviation)):
+        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        x, y = poses[k + 1, 0] - poses[k, 0], poses[k + 1, 1] - poses[k, 1]
+        yaw = poses[k, 2] + change[k, 2]
+        new_cos, new_sin = math.cos(yaw), math.sin(yaw)
+        new_x, new_y = x + change[k + 1, 0] - change[k, 0], y + change[k + 1, 1] - change[k, 1]
+        deviation[k, 0] += new_cos * new_x + new_sin * new_y - cos * x - sin * y
+        deviation[k, 1] += new_cos * new_y - new_sin * new_x - cos * y + sin * x
+        deviation[k, 2] += wrap(change[k + 1, 2] - change[k, 2])
