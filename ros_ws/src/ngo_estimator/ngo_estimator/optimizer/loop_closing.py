@@ -18,6 +18,7 @@ from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances, spread_over_span
 from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
 from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
+from ngo_estimator.optimizer.odometry_test import without_contradictions
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -74,7 +75,8 @@ class LoopClosing:
         odometry_noise: Tensor,
         correction_std: Tensor,
     ) -> None:
-        self._gate, self._steps, self._loops, self._find_overlaps = gate, steps, loops, find_overlaps
+        self._gate, self._steps, self._find_overlaps = gate, steps, find_overlaps
+        self._loops = without_contradictions(loops, steps)
         self._odometry_noise, self._correction_std = odometry_noise, correction_std
         self._structure = _sparse_structure(loops, steps.relative)
         self._gated: _GatedLoops
@@ -94,7 +96,7 @@ class LoopClosing:
             The loops for the convolutions ``(batch, blocks, CHANNELS)``.
         """
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
-            self._loops = self._loops.and_also(overlaps)
+            self._loops = self._loops.and_also(without_contradictions(overlaps, self._steps))
             self._structure = _sparse_structure(self._loops, self._steps.relative)
         loops, poses = self._loops, state.poses
         residuals = loop_residuals(loops, poses)
