@@ -91,8 +91,11 @@ class OnlineLoops:
         return (self._block, config.embedding_size), (self._block + 2 * MARGIN, config.code_length)
 
     def append(self, place_code: np.ndarray) -> None:
-        """Take the place code of the next frame."""
+        """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
         self._codes.append(place_code)
+        if not place_code.any():  # like nothing, not even like other such codes
+            self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
+            return
         with torch.inference_mode():
             self._embeddings.append(self._pair_head.embed(torch.from_numpy(self._codes.slice(len(self._codes) - 1))[0]))
 
@@ -111,6 +114,8 @@ class OnlineLoops:
         """
         end, last = block + 1, block * self._block + self._block - 1
         embedding = self._embeddings.slice(last)[0]
+        if not embedding.any():
+            return KeptLoops.none()
         offsets = VIEWS[: self._search.views]
         in_window = np.arange(first, end - self._search.min_separation)
         frames = []
@@ -139,6 +144,7 @@ class OnlineLoops:
 
     def _most_similar(self, similarity: np.ndarray, blocks: np.ndarray, count: int) -> list[tuple[int, int, float]]:
         """Index in ``blocks``, frame of the block and value of the best of ``similarity`` ``(n, frames)``."""
+        similarity = np.where(similarity == 0.0, -np.inf, similarity)  # frames that close no loops
         best = torch.from_numpy(similarity.max(axis=1))
         apart = self._search.min_apart
         values, at = each_from_elsewhere(best, min(count, len(best)), apart, -torch.inf, torch.from_numpy(blocks))

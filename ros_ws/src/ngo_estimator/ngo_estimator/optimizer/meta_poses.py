@@ -23,7 +23,7 @@ class MetaSteps:
     optimizer has a network. The poses in front of these are key frames: each leads to the next one, over any number of
     steps. ``in_blocks`` ``(batch, blocks, block, 3)`` are the poses within blocks; overlaps need them.
     ``correlation`` ``(batch, poses, 3, 3)`` are the correlation matrices of the relative meta-poses; None stands for
-    independent errors of x, y and yaw.
+    independent errors of x, y and yaw. ``fixed`` ``(batch, blocks)``: blocks that networks leave as they are.
     """
 
     relative: Tensor
@@ -32,6 +32,7 @@ class MetaSteps:
     blocks: int
     in_blocks: Tensor | None = None
     correlation: Tensor | None = None
+    fixed: Tensor | None = None
 
     @property
     def key_frames(self) -> int:

@@ -212,7 +212,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
         for iteration in range(self.config.iterations):
             seen = closing.look(state, iteration)
             attended = phases.attend(state)
-            state, stiffness = phases.optimise(state, attended, seen)
+            optimised, stiffness = phases.optimise(state, attended, seen)
+            state, stiffness = _without_fixed(state, optimised, stiffness, steps)
             state = closing.close(state, stiffness)
             results.append(state.relative)
             yield OptimizedMetaPoses(list(results), state.step_std, steps.correlation, closing.closed)
@@ -227,6 +228,18 @@ class NeuralGraphOptimizer(AttentionNetwork):
     def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
         return LoopClosing(self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std)
+
+
+def _without_fixed(
+    before: GraphState, after: GraphState, stiffness: Tensor, steps: MetaSteps
+) -> tuple[GraphState, Tensor]:
+    """The state and stiffness after the phases, without adjustments of the blocks that are ``fixed``."""
+    if steps.fixed is None:
+        return after, stiffness
+    fixed = steps.fixed.unsqueeze(-1)
+    whole = nn.functional.pad(fixed, (0, 0, steps.key_frames, 0))
+    adjusted = torch.where(whole, before.adjusted, after.adjusted)
+    return replace(after, adjusted=adjusted), torch.where(fixed, torch.zeros_like(stiffness), stiffness)
 
 
 class _NoNetwork:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from torch import Tensor
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops

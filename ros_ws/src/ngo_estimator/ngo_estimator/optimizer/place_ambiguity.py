@@ -1,4 +1,4 @@
-"""Frames that look like every place tell no place: a white wall, a dead camera, weights that know nothing of this world."""
+"""Frames that look like every place tell none: a white wall, a dead camera, weights that know nothing of this world."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ In validation mazes a frame looks like 8 places at most, and like a fifth of all
 
 
 def places_by_odometry(positions: Tensor, size_m: float) -> Tensor:
-    """Number of the square of ``size_m`` that each position ``(..., frames, 2)`` lies in, from 0 on ``(..., frames)``."""
+    """Numbers ``(..., frames)``, from 0 on, of the squares of ``size_m`` that positions ``(..., frames, 2)`` lie in."""
     squares = torch.floor(positions / size_m).long()
     keys = squares[..., 0] * 2**20 + squares[..., 1]
     numbers = [torch.unique(row, return_inverse=True)[1] for row in keys.reshape(-1, keys.shape[-1])]
