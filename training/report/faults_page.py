@@ -16,7 +16,8 @@ _INTRODUCTION = """# Results: faults of the sensor, and worlds that the networks
 
 Written by `{command}` at revision {revision}, {split} split. {drives} drives of {frames} frames in each row, each in a
 maze of its own or with a seed of its own. A fault begins after a quarter of the drive and stays.
-[Faults](reference/faults.md) says how nodes tell them. Everything was chosen on validation mazes and on other Doom maps.
+[Faults](reference/faults.md) says how nodes tell them. Everything was chosen on validation mazes and other Doom
+maps.
 
 - **Within 3 deviations**: share of the poses, as they were published, whose x, y and heading are each within three of
   their own deviations of the truth. The bar is 95 %.
