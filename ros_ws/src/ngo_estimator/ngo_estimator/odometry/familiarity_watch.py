@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,8 +42,9 @@ class FamiliarityWatch:
     """The familiarity of one stream of observations.
 
     The distances of an observation are averaged over the last ones. Where one of them passes its limit, the step lies
-    between the network's and that of the actions or wheels. Errors of such a stretch go together: their deviations add
-    up, not their variances.
+    between the network's and that of the actions or wheels. Where a picture changes less than usual, so does the robot
+    move: what is told counts less. Errors of such a stretch go together: their deviations add up, not their variances.
+    The first step also answers for those before it, which were taken for familiar.
     """
 
     def __init__(self, familiarity: Familiarity, encoder: PlaceEncoder) -> None:
@@ -57,6 +59,7 @@ class FamiliarityWatch:
         self._mean = np.zeros(len(self._limits))
         self._count = 0
         self._together = np.zeros(3)
+        self._apart: deque[np.ndarray] = deque(maxlen=self._config.memory)
         self._actions = [NO_ACTION] * HISTORY
 
     def forget_actions(self) -> None:
@@ -99,10 +102,13 @@ class FamiliarityWatch:
             unlikeness = max(unlikeness, _OF_REPEATED)
         if unlikeness <= UNFAMILIAR:
             self._together[:] = 0.0
+            self._apart.append(other - own)
             return Judged(own, own_variance, unlikeness, repeated)
-        share = self._share
+        slower = 1.0 if repeated else min(1.0, changed / config.usual_change)
+        share = np.where(self._share < 1.0, slower * self._share, self._share)
         apart = (1.0 - share) * (np.abs(other - own) if config.is_told else self._told_std)
-        shared = config.disagreement * apart
+        shared = config.disagreement * apart + (np.abs(np.sum(self._apart, axis=0)) if self._apart else 0.0)
+        self._apart.clear()
         more = shared * (2.0 * self._together + shared)
         self._together += shared
         mixed = share**2 * self._told_std**2 + (1.0 - share) ** 2 * own_variance
