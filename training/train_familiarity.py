@@ -222,8 +222,8 @@ def distances_of(familiarity: Familiarity, seen: Seen) -> np.ndarray:
 def running_mean(distances: np.ndarray, memory: int) -> np.ndarray:
     """The mean of distances ``(n, 4)`` as ``FamiliarityWatch`` keeps it."""
     mean, found = np.zeros(distances.shape[1]), []
-    for count, row in enumerate(distances, start=1):
-        mean = mean + (row - mean) / min(count, memory)
+    for row in distances:
+        mean = mean + (row - mean) / memory
         found.append(mean)
     return np.stack(found)
 

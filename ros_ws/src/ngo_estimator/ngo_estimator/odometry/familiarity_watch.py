@@ -41,10 +41,11 @@ class Judged:
 class FamiliarityWatch:
     """The familiarity of one stream of observations.
 
-    The distances of an observation are averaged over the last ones. Where one of them passes its limit, the step lies
-    between the network's and that of the actions or wheels. Where a picture changes less than usual, so does the robot
-    move: what is told counts less. Errors of such a stretch go together: their deviations add up, not their variances.
-    The first step also answers for those before it, which were taken for familiar.
+    The distances of an observation are averaged over the last ones, and those before the first count as none. Where one
+    of them passes its limit, the step lies between the network's and that of the actions or wheels. Where a picture
+    changes less than usual, so does the robot move: what is told counts less. Errors of such a stretch go together:
+    their deviations add up, not their variances. The first step also answers for those before it, which were taken for
+    familiar.
     """
 
     def __init__(self, familiarity: Familiarity, encoder: PlaceEncoder) -> None:
@@ -57,7 +58,6 @@ class FamiliarityWatch:
     def reset(self) -> None:
         """Forget all observations."""
         self._mean = np.zeros(len(self._limits))
-        self._count = 0
         self._together = np.zeros(3)
         self._apart: deque[np.ndarray] = deque(maxlen=self._config.memory)
         self._actions = [NO_ACTION] * HISTORY
@@ -95,8 +95,7 @@ class FamiliarityWatch:
         config, own, own_variance = self._config, relative.double().numpy(), variance.double().numpy()
         moving = config.is_told and bool((np.abs(other) > _MOVING * self._told_std).any())
         repeated = moving and changed < _REPEATED * config.usual_change
-        self._count = min(self._count + 1, config.memory)
-        self._mean += (distances - self._mean) / self._count
+        self._mean += (distances - self._mean) / config.memory
         unlikeness = float((self._mean / self._limits).max())
         if repeated:
             unlikeness = max(unlikeness, _OF_REPEATED)
