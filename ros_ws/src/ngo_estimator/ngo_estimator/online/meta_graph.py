@@ -233,12 +233,13 @@ class MetaGraph:
             in_blocks = poses_in_blocks(inputs[0], self._block)
             own = in_blocks[..., -1, :], block_variances(in_blocks, inputs[1]).sqrt()
             stays = torch.from_numpy(fixed).unsqueeze(-1)
-            for rows, smoothed, raw in zip((self._steps, self._std), (steps.relative, steps.std), own, strict=True):
-                rows.replace(changed, torch.where(stays, raw[0], smoothed[0])[changed - start :].numpy())
+            kept = self._steps, self._std
+            for buffer, smoothed, raw in zip(kept, (steps.relative, steps.std), own, strict=True):
+                buffer.replace(changed, torch.where(stays, raw[0], smoothed[0])[changed - start :].numpy())
 
     def _near_unfamiliar(self, start: int) -> np.ndarray:
         """Which blocks from number ``start`` on lie so near to an unfamiliar frame that networks would see it."""
-        unfamiliar = ~self._familiar.slice(start * self._block).reshape(-1, self._block).all(axis=1)
+        unfamiliar = np.atleast_1d(~self._familiar.slice(start * self._block).reshape(-1, self._block).all(axis=1))
         reach = np.arange(-self._context, self._context + 1)
         near = (np.flatnonzero(unfamiliar)[:, None] + reach).ravel()
         found = np.zeros(len(unfamiliar), np.bool_)
@@ -434,8 +435,10 @@ class MetaGraph:
         return poses[-1], covariance
 
     def _buffers(self) -> dict[str, SlidingRows]:
-        rows = self._relative, self._log_std, self._motion, self._steps, self._std, self._optimized_std, self._features
-        rows = *rows, self._familiar, self._fixed
+        rows = (
+            self._relative, self._log_std, self._motion, self._steps, self._std, self._optimized_std, self._features,
+            self._familiar, self._fixed,
+        )  # fmt: skip
         return dict(zip(_BUFFERS, rows, strict=True))
 
     def state(self) -> Arrays:
