@@ -164,8 +164,8 @@ def see(networks: Networks, config: FamiliarityConfig, drive: SensedDrive) -> Se
         relative, _, motion = networks.local(earlier, later, *some)
         told = told_vector(config, *some, len(at))
         parts.append((look(networks.place.encoder, later), motion, told, relative, change(earlier, later)))
-    columns = (torch.cat(column) for column in zip(*parts, strict=True))
-    return Seen(*columns, relative_poses(drive.poses_xyyaw))
+    looks, motions, told_steps, relatives, changes = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Seen(looks, motions, told_steps, relatives, changes, relative_poses(drive.poses_xyyaw))
 
 
 def fit(config: FamiliarityConfig, seen: list[Seen], held_out: list[Seen]) -> Familiarity:
@@ -180,9 +180,8 @@ def fit(config: FamiliarityConfig, seen: list[Seen], held_out: list[Seen]) -> Fa
     share = torch.where(residual < _CLEAR * spread, 1.0, 0.5) * config.is_told
     std = torch.maximum(residual, told_std([(familiarity.told_motion(one.told), one.truth) for one in seen]))
     usual = float(torch.cat([one.change for one in seen]).median())
-    changes = {"told_std": std, "told_share": share}
     config = dataclasses.replace(
-        config, usual_change=max(usual, 1e-9), **{k: tuple(v.tolist()) for k, v in changes.items()}
+        config, usual_change=max(usual, 1e-9), told_std=tuple(std.tolist()), told_share=tuple(share.tolist())
     )
     familiarity = with_config(familiarity, config)
     averaged = [running_mean(distances_of(familiarity, one), config.memory) for one in held_out]
