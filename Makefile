@@ -41,9 +41,9 @@ demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 
 # ARGS goes to every script of the chain (topics, --holdout, --reduction), TRAIN_ARGS to those that train networks alone
 # (--precision, --accelerator, --devices, --strategy, --seed, --epochs).
 train: build ## every network: WORLD=maze3d|maze2d, or DATA="a.mcap b.mcap" NAME=my_robot ARGS="--image /scan"; TRAIN_ARGS="--precision 32-true"
-	@$(OPEN) && for script in train_local train_place featurise $(if $(filter maze3d-,$(WORLD)-$(DATA)),train_smoother) \
+	@$(OPEN) && for script in train_local train_place train_familiarity featurise $(if $(filter maze3d-,$(WORLD)-$(DATA)),train_smoother) \
 		train_optimizer evaluate; do \
-		case $$script in train_*) own="$(TRAIN_ARGS)" ;; *) own= ;; esac; \
+		case $$script in train_familiarity) own= ;; train_*) own="$(TRAIN_ARGS)" ;; *) own= ;; esac; \
 		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) $$own || exit; done
 
 results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d|scan|doom

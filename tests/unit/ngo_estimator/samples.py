@@ -71,7 +71,8 @@ def trajectory_inputs(batch: int, steps: int, seed: int = 0) -> tuple[Tensor, Te
     generator = torch.Generator().manual_seed(seed)
     std = torch.tensor([0.1, 0.02, 0.05])
     relative = torch.randn(batch, steps, 3, generator=generator) * std + torch.tensor([0.12, 0.0, 0.02])
-    log_std = 0.3 * torch.randn(batch, steps, 3, generator=generator) + (0.1 * std).log()
+    # Loops of an untrained pair head do not contradict it.
+    log_std = 0.3 * torch.randn(batch, steps, 3, generator=generator) + std.log()
     motion = torch.rand(batch, steps, 6, generator=generator)
     return relative, log_std, motion, torch.randn(batch, steps, 12, generator=generator)
 

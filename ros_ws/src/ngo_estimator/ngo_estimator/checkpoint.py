@@ -14,6 +14,7 @@ from torch import nn
 from ngo_common.files import read_file, write_together
 from ngo_estimator.data.configuration import config_from_dict
 from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
@@ -29,6 +30,7 @@ LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "neural_graph_optimizer",
 )
 STEP_DEVIATION = "step_deviation"
+FAMILIARITY = "familiarity"
 RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
 """Settings of earlier versions, by the kind of network, with the only value that still means the same."""
 WORLD_IMAGES = {
@@ -176,6 +178,21 @@ def load_optimizer(weights: Path, world: str | None = None) -> tuple[NeuralGraph
     """The Neural Graph Optimizer in the folder ``weights``."""
     path = weights / f"{OPTIMIZER}.safetensors"
     return load_network(path, OPTIMIZER, NeuralGraphOptimizer, NeuralGraphOptimizerConfig, world)
+
+
+def load_familiarity(weights: Path, world: str | None = None) -> Familiarity | None:
+    """What tells unlike input, from the folder ``weights``; None where it was not fitted.
+
+    Raises ``CheckpointError`` also if it was fitted to other networks than those beside it.
+    """
+    path = weights / f"{FAMILIARITY}.safetensors"
+    if not path.exists():
+        return None
+    familiarity, description = load_network(path, FAMILIARITY, Familiarity, FamiliarityConfig, world)
+    for kind in (LOCAL, PLACE):
+        if description.get(f"{kind}_sha256") != load_description(weights / f"{kind}.safetensors", kind)["sha256"]:
+            raise CheckpointError(f"{path}: was fitted to another {kind} than the one beside it; fit it again")
+    return familiarity
 
 
 def load_step_deviation(weights: Path, world: str | None = None) -> StepDeviation:

@@ -219,6 +219,8 @@ def test_a_certain_loop_is_closed() -> None:
     class Certain(nn.Module):
         """Knows that code k and code k + 40 show one pose."""
 
+        config = small_pair_head().config
+
         def embed(self, codes: torch.Tensor) -> torch.Tensor:
             return nn.functional.normalize(codes, dim=-1)
 

@@ -19,7 +19,7 @@ from ngo_recordings.images import ScanGeometry
 from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_recordings import messages as m
 from tests.unit.training import drives
-from training import evaluate, featurise, train_local, train_optimizer, train_place, train_smoother
+from training import evaluate, featurise, train_familiarity, train_local, train_optimizer, train_place, train_smoother
 from training.common import runs
 from training.recordings import recording_source
 from training.recordings.recording_source import RecordedArguments, TrainedLocal, open_recorded, trained_local
@@ -250,6 +250,7 @@ def test_recordings_that_changed_since_are_refused(files: list[Path], tmp_path: 
 
 SCRIPTS: list[tuple[ModuleType, dict[str, str]]] = [
     (train_place, {"out": "weights", "runs": "runs"}),
+    (train_familiarity, {"weights": "weights", "out": "runs"}),
     (featurise, {"weights": "weights", "out": "runs"}),
     (train_smoother, {"weights": "weights", "out": "weights", "runs": "runs"}),
     (train_optimizer, {"weights": "weights", "out": "weights", "runs": "runs"}),
@@ -263,7 +264,7 @@ def test_every_script_of_a_training_compares(
 ) -> None:
     given = RecordedArguments(data=tuple(files[:2]), topics=TopicArguments(image="/image"))
     local_of(given, tmp_path)
-    if script is featurise:
+    if script in (featurise, train_familiarity):
         write_untrained(tmp_path / "place", given.name, ImageFormat(*drives.SHAPE, "uint8"))
         for path in (tmp_path / "place").glob("place_encoder.*"):
             path.rename(tmp_path / "weights" / given.name / path.name)

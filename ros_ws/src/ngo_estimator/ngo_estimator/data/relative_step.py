@@ -18,6 +18,9 @@ LARGEST_ODOMETRY = 1e9
 LARGEST_SCAN = 20_000
 """Most points, and most rays, of a key scan: it bounds the time and memory that a message may cost."""
 
+UNFAMILIAR = 1.0
+"""Unlikeness beyond which a frame is unlike what the networks learned from."""
+
 
 class RejectedStep(ValueError):
     """A relative pose that cannot be used; the trajectory is as it was before."""
@@ -57,6 +60,7 @@ class RelativeStep:
     older one. Only the first step after a start has it: later ones would repeat it. ``key`` is there if the step ends
     at a key scan of a lidar. ``origin_scan``, the lidar's first scan, is in the first step after a start.
     ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one.
+    ``unlikeness`` of the newer frame: over 1 it is unlike what the networks learned from, 0 where nobody knows.
     """
 
     stamp_ns: int
@@ -71,6 +75,7 @@ class RelativeStep:
     key: KeyScanStep | None = field(default=None, kw_only=True)
     origin_scan: KeyScan | None = field(default=None, kw_only=True)
     robot_odom_xyyaw: np.ndarray | None = field(default=None, kw_only=True)
+    unlikeness: float = field(default=0.0, kw_only=True)
 
     @property
     def tf_odom_xyyaw(self) -> np.ndarray:
@@ -96,6 +101,8 @@ def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | 
     for name, (value, shape) in vectors.items():
         _check_values(name, value, shape, LARGEST_ODOMETRY if name == "odom_xyyaw" else LARGEST_VALUE)
     _check_covariance("covariance", step.covariance)
+    if not 0.0 <= step.unlikeness < np.inf:
+        raise RejectedStep(f"unlikeness is {step.unlikeness}; expected a finite number of at least 0")
     if step.from_stamp_ns >= step.stamp_ns:
         raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")
     if step.robot_odom_xyyaw is not None:

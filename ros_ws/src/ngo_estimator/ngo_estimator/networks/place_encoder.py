@@ -132,9 +132,13 @@ class PlaceEncoder(nn.Module):
 
     def see(self, images: Tensor) -> tuple[Tensor, SeenRanges | None]:
         """What is learned of observations: the first ``code_size`` numbers of their codes, and ranges of pictures."""
-        early = self.convolutions.early(to_network(images, self.config.image))
+        early = self.early(images)
         code = self.code(self.convolutions.late(early)).float()
         return code, self.ranges(early) if self.config.sees_ranges else None
+
+    def early(self, images: Tensor) -> Tensor:
+        """Early features ``(batch, channels, ...)`` of observations."""
+        return self.convolutions.early(to_network(images, self.config.image))
 
     def keep_ranges(self) -> None:
         """Let no training change how the ranges of pictures are seen."""

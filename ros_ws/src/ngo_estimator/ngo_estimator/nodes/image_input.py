@@ -13,13 +13,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from ngo_common.nodes.process import StartError
-from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.sensors import sensor_array, sensor_topic
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
+from ngo_estimator.odometry.familiarity_watch import NOT_FITTED
 from ngo_estimator.odometry.frame_pairing import FramePairing
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 
@@ -56,6 +57,10 @@ class ImageInput:
             int(settings.twist_tolerance_s * 1e9),
         )
         self._missed = self._newly_missed = 0
+        self._unlikeness, self._largest_unlikeness = 0.0, 0.0
+        self._unfamiliar = self._repeated = self._newly_unfamiliar = self._newly_repeated = 0
+        if not self._core.tells_unlike_input:
+            node.get_logger().info(NOT_FITTED)
 
     @property
     def description(self) -> str:
@@ -111,6 +116,7 @@ class ImageInput:
             if estimate is not None:
                 self._missed += estimate.missed_frames
                 self._newly_missed += estimate.missed_frames
+                self._count_unlike(estimate.unlikeness, estimate.repeated)
             self._publish(estimate)
         if self._pairing.dropped > dropped:
             told = [f"action on '{self._settings.action_topic}'"] if self._core.uses_action else []
@@ -123,6 +129,13 @@ class ImageInput:
                 f"the {self._sensor}s' stamps jumped back: their source restarted, so the odometry starts anew"
             )
 
+    def _count_unlike(self, unlikeness: float, repeated: bool) -> None:
+        self._unlikeness = unlikeness
+        self._largest_unlikeness = max(self._largest_unlikeness, unlikeness)
+        unfamiliar = unlikeness > UNFAMILIAR
+        self._unfamiliar, self._newly_unfamiliar = self._unfamiliar + unfamiliar, self._newly_unfamiliar + unfamiliar
+        self._repeated, self._newly_repeated = self._repeated + repeated, self._newly_repeated + repeated
+
     def reset(self) -> str:
         """Start anew with the next frame; returns what that means, in words."""
         self._core.reset()
@@ -131,16 +144,33 @@ class ImageInput:
 
     def details(self) -> dict[str, str]:
         """Values for diagnostics."""
+        unlike = {
+            "unlikeness (over 1: unfamiliar)": f"{self._unlikeness:.3g}",
+            "largest unlikeness": f"{self._largest_unlikeness:.3g}",
+            "unfamiliar frames": str(self._unfamiliar),
+            "repeated frames": str(self._repeated),
+        }
         waiting = f"{self._sensor}s waiting for {'velocities' if self._core.uses_twist else 'actions'}"
         return {
             waiting: str(self._pairing.waiting),
             "missed frames": str(self._missed),
             "restarts": str(self._core.restarts),
+            **(unlike if self._core.tells_unlike_input else {}),
         }
 
     def problems(self) -> list[str]:
         """A line for each thing that was wrong since the last call."""
-        if not self._newly_missed:
-            return []
-        missed, self._newly_missed = self._newly_missed, 0
-        return [f"{missed} frames missing between images, bridged with a larger covariance"]
+        lines = []
+        if self._newly_missed:
+            lines.append(f"{self._newly_missed} frames missing between images, bridged with a larger covariance")
+        if self._newly_repeated:
+            lines.append(
+                f"{self._newly_repeated} {self._sensor}s repeat the one before while the robot is told to move"
+            )
+        if others := self._newly_unfamiliar - self._newly_repeated:
+            lines.append(
+                f"{others} {self._sensor}s are unlike what the networks learned from (unlikeness up to "
+                f"{self._largest_unlikeness:.3g}, 1 is the limit): the covariance grows"
+            )
+        self._newly_missed = self._newly_repeated = self._newly_unfamiliar = 0
+        return lines

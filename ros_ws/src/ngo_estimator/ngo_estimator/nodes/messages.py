@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import th
 
 _NS = 1_000_000_000
 _LOOP_WIDTH_M = 0.03
+_LARGEST_UNLIKENESS = 1e6  # of what float32 holds
 
 
 def to_ns(time: Time) -> int:
@@ -68,6 +69,7 @@ def relative_pose_message(estimate: "RelativeStep", base_frame: str) -> Relative
         odom_yaw=odom_yaw,
         motion_feature=array("f", estimate.motion_feature.tobytes()),
         place_code=array("f", estimate.place_code.tobytes()),
+        unlikeness=min(float(estimate.unlikeness), _LARGEST_UNLIKENESS),
         from_place_code=array("f", b"" if estimate.from_place_code is None else estimate.from_place_code.tobytes()),
         key_scan=[] if estimate.key is None else [_key_scan_message(estimate.key.scan, estimate.key)],
         origin_scan=[] if estimate.origin_scan is None else [_key_scan_message(estimate.origin_scan, None)],
@@ -126,6 +128,7 @@ def relative_step(message: RelativePose) -> "RelativeStep":
         odom_xyyaw=np.array([message.odom_x, message.odom_y, message.odom_yaw]),
         motion_feature=np.array(message.motion_feature, np.float32),
         place_code=np.array(message.place_code, np.float32),
+        unlikeness=float(message.unlikeness),
         from_place_code=np.array(message.from_place_code, np.float32) if message.from_place_code else None,
         key=_key_scan_step(message.key_scan[0]) if message.key_scan else None,
         origin_scan=_key_scan(message.origin_scan[0]) if message.origin_scan else None,

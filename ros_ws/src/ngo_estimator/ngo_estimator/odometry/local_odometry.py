@@ -6,27 +6,36 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local, load_place
+from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_familiarity, load_local, load_place
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.geometry import se2
+from ngo_estimator.networks.familiarity import Familiarity
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
+from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 
 
 @dataclass(frozen=True)
 class LocalEstimate(RelativeStep):
-    """Motion between two consecutive frames; ``missed_frames`` counts the frames missing between the two."""
+    """Motion between two consecutive frames; ``missed_frames`` counts the frames missing between the two.
+
+    ``repeated``: the newer frame repeats the older one, while actions or wheels tell motion.
+    """
 
     missed_frames: int
+    repeated: bool = False
 
 
 class LocalOdometry:
     """Turns consecutive frames into relative poses, motion features and place codes."""
 
-    def __init__(self, network: LocalPoseNetwork, place: PlaceNetworks, world: str) -> None:
+    def __init__(
+        self, network: LocalPoseNetwork, place: PlaceNetworks, world: str, familiarity: Familiarity | None = None
+    ) -> None:
         self._network = network.eval()
         self._encoder = place.encoder.eval()
+        self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self._encoder)
         self.world = world
         self.restarts = 0
         self.reset()
@@ -41,7 +50,12 @@ class LocalOdometry:
                 f"{weights}: the place encoder takes images {place.config.image.shape}, the local pose network "
                 f"{network.config.image.shape}; expected the same"
             )
-        return cls(network, place, place_description["world"])
+        return cls(network, place, place_description["world"], load_familiarity(weights, description["world"]))
+
+    @property
+    def tells_unlike_input(self) -> bool:
+        """Whether the weights say what input they know; without, ``unlikeness`` is 0 and deviations do not grow."""
+        return self._watch is not None
 
     @property
     def image_format(self) -> ImageFormat:
@@ -81,6 +95,8 @@ class LocalOdometry:
         self._origin_code: np.ndarray | None = None
         self._odom = torch.zeros(3, dtype=torch.float64)
         self._actions = [NO_ACTION] * self._network.config.action_history
+        if self._watch is not None:
+            self._watch.reset()
 
     def update(
         self, stamp_ns: int, image: np.ndarray, action: int | None, twist: np.ndarray | None = None
@@ -135,7 +151,14 @@ class LocalOdometry:
         with torch.inference_mode():
             relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
             code = self._encoder(frame)
-        variance = torch.exp(2.0 * log_std[0].double())
+        variance, unlikeness, repeated = torch.exp(2.0 * log_std[0].double()), 0.0, False
+        if self._watch is not None:
+            if missed:
+                self._watch.forget_actions()
+            step = relative, variance.unsqueeze(0), feature
+            judged = self._watch.judge((self._last_image, frame), (action, twist), step)
+            unlikeness, repeated = judged.unlikeness, judged.repeated
+            relative, variance = torch.from_numpy(judged.relative).unsqueeze(0), torch.from_numpy(judged.variance)
         # A pair further apart than in training: the network's own belief holds no longer, so a typical step for every
         # missing frame is added to it.
         variance = variance + (missed * self._network.relative_std.double()) ** 2
@@ -154,4 +177,6 @@ class LocalOdometry:
             place_code=code[0].numpy(),
             from_place_code=origin_code,
             missed_frames=missed,
+            unlikeness=unlikeness,
+            repeated=repeated,
         )

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ngo_estimator.data.observations import observation
-from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, UNFAMILIAR, RelativeStep
+from ngo_estimator.odometry.familiarity_watch import NOT_FITTED
 from ngo_estimator.odometry.frame_pairing import FramePairing
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
@@ -71,6 +72,8 @@ class RecordingRun:
         """Frames that were not used, by the reason."""
         self.examples: dict[str, str] = {}
         """For each reason the first such frame, in words."""
+        self._unlikeness: list[float] = []
+        self._repeated = 0
         self.gaps = 0
         """Steps that span more than the usual time between two frames."""
 
@@ -81,11 +84,28 @@ class RecordingRun:
     @property
     def facts(self) -> dict[str, Any]:
         """What else is worth keeping of the run."""
-        return {}
+        if not self._local.tells_unlike_input:
+            return {"unlikeness": None}
+        values = np.array(self._unlikeness or [0.0])
+        return {
+            "unlikeness": {"median": float(np.median(values)), "largest": float(values.max())},
+            "unfamiliar_frames": int((values > UNFAMILIAR).sum()),
+            "repeated_frames": self._repeated,
+        }
 
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
-        return []
+        if not self._local.tells_unlike_input:
+            return [NOT_FITTED]
+        values, lines = np.array(self._unlikeness), []
+        if unfamiliar := int((values > UNFAMILIAR).sum()):
+            lines.append(
+                f"{unfamiliar} of {len(values)} frames are unlike what the networks learned from (unlikeness up to "
+                f"{values.max():.3g}, 1 is the limit): deviations grow there, and nothing is corrected by them"
+            )
+        if self._repeated:
+            lines.append(f"{self._repeated} frames repeat the one before while the robot was told to move")
+        return lines
 
     def run(self, frames: Iterable[Frame]) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.
@@ -145,6 +165,8 @@ class RecordingRun:
                     "recording there, or use weights that know this robot"
                 )
             self.gaps += update.gap or local.missed_frames > 0
+            self._unlikeness.append(local.unlikeness)
+            self._repeated += local.repeated
             yield RecordedStep(local, update)
 
     def _reject(self, reason: str, example: str) -> None:

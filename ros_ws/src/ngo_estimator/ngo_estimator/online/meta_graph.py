@@ -5,7 +5,7 @@ Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 t
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -38,8 +38,9 @@ _AGAIN = 8
 _LONG = 2
 """Iterations that take as long as a search for loops."""
 
-_BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features")
-"""Names of the newest rows: three of each step, the others of each block; without a network there are no features."""
+_BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features", "familiar", "fixed")
+"""Names of the newest rows: the first three and ``familiar`` of each step, the others of each block; without a network
+there are no features."""
 
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
@@ -111,6 +112,8 @@ class MetaGraph:
         self._std = SlidingRows((3,), np.float32, blocks_kept)
         self._optimized_std = SlidingRows((3,), np.float64, blocks_kept)
         self._features = SlidingRows((config.width,), np.float32, blocks_kept)
+        self._familiar = SlidingRows((), np.bool_, keep)  # steps
+        self._fixed = SlidingRows((), np.bool_, blocks_kept)  # blocks that networks leave as they are
         self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
         self._nodes = GrowingRows((3,), np.float64)
         self._nodes.append(np.zeros(3))
@@ -165,12 +168,22 @@ class MetaGraph:
         self._origin_code = origin_code
 
     def append(
-        self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, code: np.ndarray, joins: bool = False
+        self,
+        relative: np.ndarray,
+        variance: np.ndarray,
+        motion: np.ndarray,
+        code: np.ndarray,
+        joins: bool = False,
+        familiar: bool = True,
     ) -> bool:
         """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block.
 
         With ``joins`` the step is where another odometry goes on, in another place.
+        A frame that is not ``familiar`` closes no loops, and networks leave the odometry around it as it is. Its
+        variances are honest, so that ``covariance_scale`` is not for them.
         """
+        if not familiar:
+            code, variance = np.zeros_like(code), variance / self._scale
         self.optimized, self.fault = False, ""
         log_std = 0.5 * np.log(variance)
         step = relative.astype(np.float64)
@@ -182,6 +195,7 @@ class MetaGraph:
         self._relative.append(relative)
         self._log_std.append(log_std)
         self._motion.append(motion)
+        self._familiar.append(familiar)
         if self._loops is not None:
             self._loops.append(code)
         if (len(self.odometry) - 1) % self._block:
@@ -210,6 +224,7 @@ class MetaGraph:
         self._optimized_std.append(std)
         relative = between(*self.odometry.values[[-1 - self._block, -1]])
         self._nodes.append(compose(self._nodes.values[-1], relative))
+        self._fixed.append(False)
         self._work = self._all_work()
 
     def _all_work(self) -> list[Callable[[int], None]]:
@@ -275,6 +290,8 @@ class MetaGraph:
             return
         if self._joins.values[-1:].max(initial=0) > first:
             return  # its frames were seen from two places
+        if not self._familiar.slice(first).all():
+            return
         before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
         origin_code = None if before is None else torch.from_numpy(before).unsqueeze(0)
         rows = self._relative.slice(first), self._log_std.slice(first), self._loops.codes(first)
@@ -299,9 +316,24 @@ class MetaGraph:
         steps = self._optimizer.aggregate(*inputs)
         if steps.features is not None:
             self._features.replace(changed, steps.features[0, changed - start :].numpy())
+        fixed = self._near_unfamiliar(start)
+        self._fixed.replace(changed, fixed[changed - start :])
         if self._optimizer.config.smoother is not None:
-            self._steps.replace(changed, steps.relative[0, changed - start :].numpy())
-            self._std.replace(changed, steps.std[0, changed - start :].numpy())
+            in_blocks = poses_in_blocks(inputs[0], self._block)
+            own = in_blocks[..., -1, :], block_variances(in_blocks, inputs[1]).sqrt()
+            stays = torch.from_numpy(fixed).unsqueeze(-1)
+            kept = self._steps, self._std
+            for buffer, smoothed, raw in zip(kept, (steps.relative, steps.std), own, strict=True):
+                buffer.replace(changed, torch.where(stays, raw[0], smoothed[0])[changed - start :].numpy())
+
+    def _near_unfamiliar(self, start: int) -> np.ndarray:
+        """Which blocks from number ``start`` on lie so near to an unfamiliar frame that networks would see it."""
+        unfamiliar = np.atleast_1d(~self._familiar.slice(start * self._block).reshape(-1, self._block).all(axis=1))
+        reach = np.arange(-self._context, self._context + 1)
+        near = (np.flatnonzero(unfamiliar)[:, None] + reach).ravel()
+        found = np.zeros(len(unfamiliar), np.bool_)
+        found[near[(near >= 0) & (near < len(found))]] = True
+        return found
 
     def _slide(self) -> None:
         """Move the window by a block: its first node becomes a key frame."""
@@ -392,6 +424,8 @@ class MetaGraph:
         steps = MetaSteps(
             torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, self.blocks - first
         )
+        if (fixed := self._fixed.slice(first)).any():
+            steps = replace(steps, fixed=torch.from_numpy(fixed.copy()).unsqueeze(0))
         loops, numbers = None, np.zeros(0, np.int64)
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
@@ -534,7 +568,10 @@ class MetaGraph:
         return poses[-1], covariance
 
     def _buffers(self) -> dict[str, SlidingRows]:
-        rows = self._relative, self._log_std, self._motion, self._steps, self._std, self._optimized_std, self._features
+        rows = (
+            self._relative, self._log_std, self._motion, self._steps, self._std, self._optimized_std, self._features,
+            self._familiar, self._fixed,
+        )  # fmt: skip
         return dict(zip(_BUFFERS, rows, strict=True))
 
     def state(self) -> Arrays:

@@ -22,6 +22,7 @@ from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere
 from ngo_estimator.optimizer.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
+from ngo_estimator.optimizer.place_ambiguity import looks_like_everything, places_by_odometry
 
 MARGIN = 4
 """Frames before and behind a block whose codes a key frame keeps, for the views of a loop."""
@@ -90,8 +91,11 @@ class OnlineLoops:
         return (self._block, config.embedding_size), (self._block + 2 * MARGIN, config.code_length)
 
     def append(self, place_code: np.ndarray) -> None:
-        """Take the place code of the next frame."""
+        """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
         self._codes.append(place_code)
+        if not place_code.any():  # like nothing, not even like other such codes
+            self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
+            return
         with torch.inference_mode():
             self._embeddings.append(self._pair_head.embed(torch.from_numpy(self._codes.slice(len(self._codes) - 1))[0]))
 
@@ -103,17 +107,23 @@ class OnlineLoops:
     def find(self, block: int, first: int, keys: KeyFrames) -> KeptLoops:
         """Loops that end behind the newest block, whose number is ``block``; those from key frames last.
 
+        There are none where it looks like everything (``place_ambiguity``).
+
         Args:
             first: number of the first block in the window.
         """
         end, last = block + 1, block * self._block + self._block - 1
         embedding = self._embeddings.slice(last)[0]
+        if not embedding.any():
+            return KeptLoops.none()
         offsets = VIEWS[: self._search.views]
         in_window = np.arange(first, end - self._search.min_separation)
         frames = []
         if len(in_window):
             seen = self._embeddings.slice(first * self._block, (in_window[-1] + 1) * self._block)
             similarity = (seen @ embedding).reshape(-1, self._block)
+            if self._looks_like_everything(similarity.reshape(-1), first * self._block):
+                return KeptLoops.none()
             for index, step, value in self._most_similar(similarity, in_window, self._search.per_pose):
                 node = int(in_window[index])
                 frames.append(self._in_window(node, node * self._block + step, value, last, offsets))
@@ -125,8 +135,16 @@ class OnlineLoops:
         self._kept = self._kept.and_also(found)
         return found
 
+    def _looks_like_everything(self, similarity: np.ndarray, first: int) -> bool:
+        """Whether the newest frame looks like most places, by its similarity to the frames after step ``first`` on."""
+        at = torch.from_numpy(self._odometry.values[first + 1 : first + 1 + len(similarity), :2])
+        places = places_by_odometry(at, 2.0 * self._pair_head.config.offset_scale_m)
+        alike = torch.from_numpy(similarity)
+        return bool(looks_like_everything(alike, places, torch.ones_like(alike, dtype=torch.bool)))
+
     def _most_similar(self, similarity: np.ndarray, blocks: np.ndarray, count: int) -> list[tuple[int, int, float]]:
         """Index in ``blocks``, frame of the block and value of the best of ``similarity`` ``(n, frames)``."""
+        similarity = np.where(similarity == 0.0, -np.inf, similarity)  # frames that close no loops
         best = torch.from_numpy(similarity.max(axis=1))
         apart = self._search.min_apart
         values, at = each_from_elsewhere(best, min(count, len(best)), apart, -torch.inf, torch.from_numpy(blocks))

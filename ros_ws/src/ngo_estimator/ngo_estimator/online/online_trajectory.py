@@ -11,7 +11,7 @@ import numpy as np
 from safetensors.torch import save
 
 from ngo_estimator.checkpoint import CheckpointError, load_optimizer, load_place
-from ngo_estimator.data.relative_step import RelativeStep, check_step
+from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.localisation import Localiser
@@ -142,7 +142,8 @@ class OnlineTrajectory(CorrectedTrajectory):
     def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
         code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
         variance = np.clip(np.diagonal(taken.covariance), *_VARIANCES)
-        return self._graph.append(taken.relative, variance, step.motion_feature, code, taken.joins)
+        familiar = step.unlikeness <= UNFAMILIAR
+        return self._graph.append(taken.relative, variance, step.motion_feature, code, taken.joins, familiar)
 
     def localisation(self, origin: MapOrigin) -> MapLocalisation:
         """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says.

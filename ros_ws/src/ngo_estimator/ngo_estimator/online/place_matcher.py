@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep
 from ngo_estimator.data.row_buffers import SlidingRows
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PairHead
@@ -67,10 +67,10 @@ class PlaceMatcher:
         self._odometry = SlidingRows((3,), np.float64, _KEPT)
 
     def append(self, step: RelativeStep, odometry: np.ndarray) -> bool:
-        """Take the next frame and its pose ``(3,)`` by odometry."""
+        """Take the next frame and its pose ``(3,)`` by odometry; whether it is familiar, and worth a look."""
         self._codes.append(step.place_code)
         self._odometry.append(odometry)
-        return True
+        return step.unlikeness <= UNFAMILIAR
 
     @torch.inference_mode()
     def everywhere(self) -> Sightings:

@@ -18,6 +18,7 @@ from ngo_estimator.geometry.scan_registration import Scans
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.optimizer.gauss_newton import pick
 from ngo_estimator.optimizer.pair_measurement import VIEWS, PairViews, measure_pairs
+from ngo_estimator.optimizer.place_ambiguity import looks_like_everything, places_by_odometry
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Loops:
 
 
 def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: LoopSearch) -> Loops:
-    """For each meta-pose the most similar earlier frames, measured by the pair head.
+    """For each meta-pose the most similar earlier frames, measured by the pair head; none if it looks like everything.
 
     The choice has no gradient, what is measured has.
 
@@ -135,7 +136,8 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     embeddings = pair_head.embed(codes)
     at_ends = embeddings[:, block - 1 :: block]
     with torch.no_grad():
-        similarity, frame, end = _most_similar(at_ends, embeddings, block, search)
+        places = places_by_odometry(frame_odometry(in_blocks)[..., :2], 2.0 * pair_head.config.offset_scale_m)
+        similarity, frame, end = _most_similar(at_ends, embeddings, places, block, search)
         # The pair head is the costly part: it sees only what is most similar, twice as many as can be kept.
         keep = similarity.topk(min(2 * search.most, similarity.shape[1]), dim=-1).indices
         similarity, frame, end = (value.gather(1, keep) for value in (similarity, frame, end))
@@ -173,13 +175,17 @@ def frame_odometry(in_blocks: Tensor) -> Tensor:
 _NONE = -4.0  # similarity that marks fill
 
 
-def _most_similar(at_ends: Tensor, embeddings: Tensor, block: int, search: LoopSearch) -> tuple[Tensor, Tensor, Tensor]:
+def _most_similar(
+    at_ends: Tensor, embeddings: Tensor, places: Tensor, block: int, search: LoopSearch
+) -> tuple[Tensor, Tensor, Tensor]:
     """Similarity, earlier frame and later meta-pose ``(batch, blocks * per_pose)`` of the candidates."""
     batch, blocks = at_ends.shape[:2]
     similarity = (at_ends @ embeddings.mT).unflatten(-1, (blocks, block))
     best, best_step = similarity.max(dim=-1)
     index = torch.arange(blocks, device=at_ends.device)
-    best = best.masked_fill(index[:, None] - index < search.min_separation, _NONE)
+    older = index[:, None] - index >= search.min_separation
+    vague = looks_like_everything(similarity.flatten(2), places, older.repeat_interleave(block, dim=-1))
+    best = best.masked_fill(~older | vague.unsqueeze(-1), _NONE)
     values, chosen = each_from_elsewhere(best, min(search.per_pose, blocks), search.min_apart, _NONE)
     frames = chosen * block + best_step.gather(-1, chosen)
     return values.flatten(1), frames.flatten(1), index.repeat_interleave(chosen.shape[-1]).expand(batch, -1)

@@ -23,6 +23,7 @@ class MetaSteps:
     before. The last ``blocks`` of them are blocks of steps, with ``features`` ``(batch, blocks, width)`` if the
     optimizer has a network. The poses in front of these are key frames: each leads to the next one, over any number of
     steps. ``in_blocks`` ``(batch, blocks, block, 3)`` are the poses within blocks; overlaps need them.
+    ``fixed`` ``(batch, blocks)``: blocks that networks leave as they are.
     """
 
     relative: Tensor
@@ -30,6 +31,7 @@ class MetaSteps:
     features: Tensor | None
     blocks: int
     in_blocks: Tensor | None = None
+    fixed: Tensor | None = None
 
     @property
     def key_frames(self) -> int:

@@ -30,6 +30,7 @@ from ngo_estimator.optimizer.meta_poses import (
     OptimizedMetaPoses,
     OptimizedTrajectory,
 )
+from ngo_estimator.optimizer.odometry_test import without_contradictions
 from ngo_estimator.optimizer.overlaps import find_overlaps
 from ngo_estimator.optimizer.registered_odometry import registered_steps
 
@@ -228,7 +229,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
             seen = closing.look(state, iteration)
             attended = phases.attend(state)
             before = state.adjusted
-            state, stiffness = phases.optimise(state, attended, seen)
+            optimised, stiffness = phases.optimise(state, attended, seen)
+            state, stiffness = _without_fixed(state, optimised, stiffness, steps)
             if self.config.network:
                 made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
             state = closing.close(state, stiffness)
@@ -250,12 +252,26 @@ class NeuralGraphOptimizer(AttentionNetwork):
         search = self.config.search
         if search.overlaps == 0 or loops.scans is None or steps.in_blocks is None:
             return None
-        return find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
+        found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
+        return without_contradictions(found, steps)
 
     def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing | CompiledClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
         kind = CompiledClosing if fits(steps) else LoopClosing
-        return kind(self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std)
+        believed = without_contradictions(loops, steps)
+        return kind(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+
+
+def _without_fixed(
+    before: GraphState, after: GraphState, stiffness: Tensor, steps: MetaSteps
+) -> tuple[GraphState, Tensor]:
+    """The state and stiffness after the phases, without adjustments of the blocks that are ``fixed``."""
+    if steps.fixed is None:
+        return after, stiffness
+    fixed = steps.fixed.unsqueeze(-1)
+    whole = nn.functional.pad(fixed, (0, 0, steps.key_frames, 0))
+    adjusted = torch.where(whole, before.adjusted, after.adjusted)
+    return replace(after, adjusted=adjusted), torch.where(fixed, torch.zeros_like(stiffness), stiffness)
 
 
 class _NoNetwork:

@@ -1,0 +1,114 @@
+"""Watches how familiar observations are, and makes steps and their deviations honest where they are not (no ROS)."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ngo_estimator.data.relative_step import UNFAMILIAR
+from ngo_estimator.networks.familiarity import HISTORY, Familiarity, change, look, told_vector
+from ngo_estimator.networks.local_pose_network import NO_ACTION
+from ngo_estimator.networks.place_encoder import PlaceEncoder
+
+_REPEATED = 1e-3  # change in units of the usual one, below which a frame repeats the one before
+_MOVING = 1.0  # deviations from which what is told is motion
+_OF_REPEATED = 10.0  # unlikeness of a frame that repeats
+
+NOT_FITTED = (
+    "the weights do not say what input they know (no familiarity.safetensors): unlike input is not told, and "
+    "deviations do not grow with it"
+)
+"""A line for weights without ``Familiarity``."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A step as it is believed: ``relative`` and ``variance`` ``(3,)``, of an observation of this ``unlikeness``.
+
+    ``repeated``: the frame repeats the one before while actions or wheels tell motion.
+    """
+
+    relative: np.ndarray
+    variance: np.ndarray
+    unlikeness: float
+    repeated: bool
+
+
+class FamiliarityWatch:
+    """The familiarity of one stream of observations.
+
+    The distances of an observation are averaged over the last ones, and those before the first count as none. Where one
+    of them passes its limit, the step lies between the network's and that of the actions or wheels. Where a picture
+    changes less than usual, so does the robot move: what is told counts less. Errors of such a stretch go together:
+    their deviations add up, not their variances. The first step also answers for those before it, which were taken for
+    familiar.
+    """
+
+    def __init__(self, familiarity: Familiarity, encoder: PlaceEncoder) -> None:
+        self._familiarity, self._encoder = familiarity.eval(), encoder
+        self._config = config = familiarity.config
+        self._limits, self._share = np.array(config.limits), np.array(config.told_share)
+        self._told_std = np.array(config.told_std)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all observations."""
+        self._mean = np.zeros(len(self._limits))
+        self._together = np.zeros(3)
+        self._apart: deque[np.ndarray] = deque(maxlen=self._config.memory)
+        self._actions = [NO_ACTION] * HISTORY
+
+    def forget_actions(self) -> None:
+        """Forget what was told before: frames are missing."""
+        self._actions = [NO_ACTION] * HISTORY
+
+    def judge(
+        self, images: tuple[Tensor, Tensor], told: tuple[int | None, np.ndarray | None], step: tuple[Tensor, ...]
+    ) -> Judged:
+        """Judge a step.
+
+        Args:
+            images: the earlier and the later observation ``(1, height, width, channels)``.
+            told: action and mean velocity ``(3,)`` between them, where the networks take them.
+            step: the network's motion ``(1, 3)``, variance ``(1, 3)`` and motion feature ``(1, motion_size)``.
+        """
+        action, twist = told
+        self._actions = [*self._actions[1:], NO_ACTION if action is None else action]
+        twists = None if twist is None else torch.tensor(np.asarray(twist)[None], dtype=torch.float32)
+        known = told_vector(self._config, torch.tensor([self._actions]), twists, 1)
+        relative, variance, feature = step
+        changed = change(*images)
+        with torch.inference_mode():
+            distances = self._familiarity.distances(
+                look(self._encoder, images[1]), feature.float(), known, relative.float(), changed
+            )[0]
+            other = self._familiarity.told_motion(known)[0].double().numpy()
+        return self._judged(distances.double().numpy(), float(changed), other, relative[0], variance[0])
+
+    def _judged(
+        self, distances: np.ndarray, changed: float, other: np.ndarray, relative: Tensor, variance: Tensor
+    ) -> Judged:
+        config, own, own_variance = self._config, relative.double().numpy(), variance.double().numpy()
+        moving = config.is_told and bool((np.abs(other) > _MOVING * self._told_std).any())
+        repeated = moving and changed < _REPEATED * config.usual_change
+        self._mean += (distances - self._mean) / config.memory
+        unlikeness = float((self._mean / self._limits).max())
+        if repeated:
+            unlikeness = max(unlikeness, _OF_REPEATED)
+        if unlikeness <= UNFAMILIAR:
+            self._together[:] = 0.0
+            self._apart.append(other - own)
+            return Judged(own, own_variance, unlikeness, repeated)
+        slower = 1.0 if repeated else min(1.0, changed / config.usual_change)
+        share = np.where(self._share < 1.0, slower * self._share, self._share)
+        apart = (1.0 - share) * (np.abs(other - own) if config.is_told else self._told_std)
+        shared = config.disagreement * apart + (np.abs(np.sum(self._apart, axis=0)) if self._apart else 0.0)
+        self._apart.clear()
+        more = shared * (2.0 * self._together + shared)
+        self._together += shared
+        mixed = share**2 * self._told_std**2 + (1.0 - share) ** 2 * own_variance
+        return Judged(share * other + (1.0 - share) * own, np.maximum(mixed, own_variance) + more, unlikeness, repeated)

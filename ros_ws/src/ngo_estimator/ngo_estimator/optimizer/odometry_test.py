@@ -1,0 +1,35 @@
+"""Test of loops against the odometry between their poses.
+
+Not in the paper. Gates weigh loops one by one, so that hundreds of wrong ones that agree win over the odometry. This
+test does not count loops.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.optimizer.loop_closure import Loops
+from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances
+from ngo_estimator.optimizer.meta_poses import MetaSteps, with_origin
+
+FARTHEST = 20.0
+"""Deviations of the odometry between two poses, over x, y and yaw, beyond which a loop contradicts it.
+
+Errors of steps are not independent: true loops of validation mazes are up to 16 deviations off (99.9 % are within 11),
+wrong ones dozens to thousands (docs/explanation/findings.md).
+"""
+
+
+def without_contradictions(loops: Loops, steps: MetaSteps) -> Loops:
+    """The loops; those that contradict the odometry between their poses are not valid any more.
+
+    What odometry alone says is tested, before anything is corrected: corrections by wrong loops make room for others.
+    """
+    with torch.no_grad():
+        poses = with_origin(se2.r2g(steps.relative.double()))
+        variance = odometry_variances(loops.start, loops.end + 1, poses, steps.std.double().square())
+        squared = (loop_residuals(loops, poses).square() / variance.clamp(min=1e-12)).sum(-1)
+        return dataclasses.replace(loops, valid=loops.valid & (squared <= FARTHEST**2))

@@ -1,0 +1,40 @@
+"""Frames that look like every place tell none: a white wall, a dead camera, weights that know nothing of this world."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+ALIKE = 0.9
+"""Similarity from which on two frames look the same."""
+
+FEWEST_PLACES, LARGEST_SHARE = 10, 0.3
+"""A frame that looks like at least so many places, and like more than this share of all, tells nothing.
+
+In validation mazes a frame looks like 8 places at most, and like a fifth of all.
+"""
+
+
+def places_by_odometry(positions: Tensor, size_m: float) -> Tensor:
+    """Numbers ``(..., frames)``, from 0 on, of the squares of ``size_m`` that positions ``(..., frames, 2)`` lie in."""
+    squares = torch.floor(positions / size_m).long()
+    keys = squares[..., 0] * 2**20 + squares[..., 1]
+    numbers = [torch.unique(row, return_inverse=True)[1] for row in keys.reshape(-1, keys.shape[-1])]
+    return torch.stack(numbers).reshape(keys.shape)
+
+
+def looks_like_everything(similarity: Tensor, places: Tensor, visited: Tensor) -> Tensor:
+    """Whether a frame looks like so many places that it tells none ``(...)``.
+
+    Args:
+        similarity: to other frames ``(batch, n, frames)``, or ``(frames,)``.
+        places: of these frames, by ``places_by_odometry`` ``(batch, frames)``, or ``(frames,)``.
+        visited: which of the frames are compared, of a shape that expands to that of ``similarity``.
+    """
+    count = int(places.max()) + 1 if places.numel() else 0
+    found = similarity.new_zeros(2, *similarity.shape[:-1], count)
+    index = (places.unsqueeze(-2) if similarity.dim() > places.dim() else places).expand(similarity.shape)
+    for row, which in zip(found, (visited & (similarity > ALIKE), visited), strict=True):
+        row.scatter_reduce_(-1, index, which.expand(similarity.shape).to(row.dtype), "amax")
+    alike, everywhere = found.sum(-1)
+    return (alike >= FEWEST_PLACES) & (alike > LARGEST_SHARE * everywhere)

@@ -1,0 +1,166 @@
+"""Measure how honest deviations are on drives with faults of the sensor, and in worlds that the networks do not know.
+
+    python -m training.faults
+
+A fault begins after a quarter of each drive and stays. Doom's scenarios are driven by the weights of maze3d. The
+command writes ``training/results/faults.json`` and ``docs/results_faults.md``. Run it again to continue after a stop.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ngo_estimator.checkpoint import FAMILIARITY, load_description, load_local, load_place
+from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from training.common import runs
+from training.common.command_line import run_command
+from training.common.curves import write_at_once
+from training.data.episodes import simulate
+from training.data.faults import SensedDrive, faulted
+from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
+from training.report import faults_page
+from training.scoring.honesty import HonestRun, honest_run
+from training.scoring.statistics import mean_interval
+
+CLEAN = "clean"
+FAULTS_OF = {
+    "maze2d": ("frozen", "repeating", "noise", "lost"),
+    "maze3d": ("frozen", "repeating", "noise", "lost", "black"),
+}
+SCENARIOS = {
+    "test": ("my_way_home", "health_gathering", "health_gathering_supreme", "deadly_corridor"),
+    "validation": ("deathmatch", "defend_the_center", "defend_the_line"),
+}
+"""Maps that ViZDoom ships, each the first of a WAD of its name. Everything was chosen on those of validation."""
+
+_DOOM_SEEDS = {"test": 20_000, "validation": 11_000}
+_SEEDS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the measurement."""
+
+    split: Literal["validation", "test"] = "test"
+    """Mazes and scenarios to measure in. Everything is chosen on validation; test is for the final table alone."""
+    mazes: int = 6
+    """Drives of each row, each in a maze of its own."""
+    frames: int = 600
+    """Frames of a drive."""
+    worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")
+    """Worlds to measure."""
+    weights: Path = runs.WEIGHTS
+    """Folder with WORLD/*.safetensors."""
+    out: Path = runs.ROOT / "training" / "results"
+    """Folder that gets faults.json."""
+    docs: Path = runs.ROOT / "docs"
+    """Folder that gets results_faults.md."""
+    runs: Path = runs.ROOT / "runs"
+    """Folder of what was measured."""
+
+    def __post_init__(self) -> None:
+        if self.mazes < 2 or self.frames < 100:
+            raise ValueError(f"mazes, frames are {self.mazes}, {self.frames}; expected at least 2 and at least 100")
+
+
+@dataclass(frozen=True)
+class _Cores:
+    """The estimators of a world, and its local odometry without what tells unlike input."""
+
+    local: LocalOdometry
+    plain: LocalOdometry
+    online: OnlineTrajectory
+    sha256: str
+
+    @classmethod
+    def load(cls, folder: Path, world: str) -> _Cores:
+        plain = LocalOdometry(load_local(folder, world)[0], load_place(folder, world)[0], world)
+        sha256 = load_description(folder / f"{FAMILIARITY}.safetensors", FAMILIARITY)["sha256"]
+        return cls(LocalOdometry.load(folder, world), plain, OnlineTrajectory.load(folder, world=world), sha256)
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Measure, write everything, and return the JSON's content."""
+    torch.set_num_threads(1)
+    tables: dict[str, dict[str, Any]] = {}
+    for world in arguments.worlds:
+        networks = "maze3d" if world == "doom" else world
+        cores = _Cores.load(arguments.weights / networks, networks)
+        tables[world] = {
+            name: _summary(
+                [
+                    _measured(arguments, cores, world, name, number)
+                    for number in tqdm(range(arguments.mazes), desc=f"{world} {name}")
+                ]
+            )
+            for name in (SCENARIOS[arguments.split] if world == "doom" else (CLEAN, *FAULTS_OF[world]))
+        }
+    result = {
+        **runs.record("faults", arguments),
+        "split": arguments.split,
+        "drives": arguments.mazes,
+        "frames": arguments.frames,
+        "tables": tables,
+    }
+    result.pop("arguments")
+    write_at_once(arguments.out / "faults.json", json.dumps(result, indent=2) + "\n")
+    write_at_once(arguments.docs / "results_faults.md", faults_page.page(result))
+    return result
+
+
+def _measured(arguments: Arguments, cores: _Cores, world: str, name: str, number: int) -> dict[str, float]:
+    """What one drive gives, or gave last time."""
+    path = arguments.runs / "faults" / arguments.split / f"{world}_{name}_{number}_{arguments.frames}.json"
+    if path.exists() and (stored := json.loads(path.read_text())).pop("familiarity") == cores.sha256:
+        return dict(stored)
+    drive = _doom_drive(arguments, name, number) if world == "doom" else _maze_drive(arguments, world, name, number)
+    values = dataclasses.asdict(honest_run(cores.local, cores.online, drive))
+    if name == CLEAN:
+        plain: HonestRun = honest_run(cores.plain, cores.online, drive)
+        values["deviation_growth"] = values["deviation_m"] / plain.deviation_m
+        values["odometry_deviation_growth"] = values["odometry_deviation_m"] / plain.odometry_deviation_m
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_at_once(path, json.dumps({**values, "familiarity": cores.sha256}))
+    return values
+
+
+def _maze_drive(arguments: Arguments, name_of_world: str, fault: str, number: int) -> SensedDrive:
+    world, seeds = world_named(name_of_world), _SEEDS[arguments.split]
+    seed = seeds[len(seeds) // 4 + number]  # no table of results takes these
+    drive = SensedDrive.of_episode(world, next(iter(simulate(world, [seed], arguments.frames))))
+    return drive if fault == CLEAN else faulted(drive, fault, arguments.frames // 4, seed)
+
+
+def _doom_drive(arguments: Arguments, scenario: str, number: int) -> SensedDrive:
+    from ngo_sim.episodes import record_episode
+    from ngo_sim.maze3d import Maze3D, Maze3DConfig
+
+    env = Maze3D(Maze3DConfig(wad=f"{scenario}.wad", map="map01"))
+    try:
+        episode = record_episode(env, "explorer", arguments.frames, _DOOM_SEEDS[arguments.split] + number)
+    finally:
+        env.close()
+    return SensedDrive.of_episode(world_named("maze3d"), episode)
+
+
+def _summary(found: list[dict[str, float]]) -> dict[str, Any]:
+    """Means with intervals, and the largest ratio of corrected to odometry."""
+    columns = {key: np.array([one[key] for one in found]) for key in found[0]}
+    ratio = columns["corrected_m"] / np.maximum(columns["odometry_m"], 1e-9)
+    return {
+        **{key: mean_interval(values).as_json() for key, values in columns.items()},
+        "corrected_to_odometry": {"mean": float(ratio.mean()), "largest": float(ratio.max())},
+    }
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)

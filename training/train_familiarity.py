@@ -1,0 +1,273 @@
+"""Fit what tells input that is unlike what the networks learned from.
+
+    python -m training.train_familiarity --world maze2d
+    python -m training.train_familiarity --data drive_1.mcap drive_2.mcap --name my_robot
+
+The networks stay as they are. Statistics of their features, and the motion that actions or wheels tell, are fitted to
+drives that the local network has not seen. Limits are the 99.9th percentiles on other drives. One factor says how much
+deviations grow where input is unfamiliar. It is the smallest with which the truth lies within three deviations for 97 %
+of the poses of drives with faults (frozen, repeating, noisy, lost and black input).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load_place, save_checkpoint
+from ngo_estimator.geometry import se2
+from ngo_estimator.networks.familiarity import (
+    DISTANCES,
+    Familiarity,
+    FamiliarityConfig,
+    change,
+    look,
+    look_size,
+    told_vector,
+)
+from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
+from training.common import runs
+from training.common.command_line import run_command
+from training.data.batches import action_histories, relative_poses, seen_from_first
+from training.data.episodes import simulate
+from training.data.faults import FAULTS, SensedDrive, faulted
+from training.data.features import Networks
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
+from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
+from training.scoring.honesty import estimates_of, odometry_covariances, within
+
+FACTORS = (0.7, 1.0, 1.4, 2.0)
+"""Factors that are tried. Less than the first is not honest on Doom maps that nothing was trained on."""
+
+_WANTED = 0.97
+_WINDOWS = (64, 256)  # steps over which errors of what is told are counted: those that last grow with them
+_CLEAR = 0.1  # of the deviation of steps: what tells a component this well is taken alone
+_CHUNK = 64
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the fit."""
+
+    world: WorldName | None = None
+    """World of the networks."""
+    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
+    """Recordings that the networks were trained on instead."""
+    drives: int = 64
+    """Worlds: drives that are fitted to, each in a maze that the local network has not seen."""
+    limit_drives: int = 32
+    """Worlds: validation drives that give the limits."""
+    fault_drives: int = 4
+    """Drives that get each fault."""
+    frames: int = 400
+    """Frames of a drive."""
+    weights: Path = runs.WEIGHTS
+    """Folder with NAME/*.safetensors, which gets NAME/familiarity.safetensors."""
+    out: Path = runs.ROOT / "runs"
+    """Folder of recordings that were read."""
+
+    def __post_init__(self) -> None:
+        check_source(self.world, self.recordings)
+        if min(self.drives, self.limit_drives, self.fault_drives) < 1 or self.frames < 2 * _WINDOWS[0]:
+            raise ValueError(
+                f"drives, limit_drives, fault_drives, frames are {self.drives}, {self.limit_drives}, "
+                f"{self.fault_drives}, {self.frames}; expected at least 1, 1, 1, {2 * _WINDOWS[0]}"
+            )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the networks make of a drive of ``n`` steps; the names are those of ``Familiarity.distances``."""
+
+    looks: Tensor
+    motions: Tensor
+    told: Tensor
+    relative: Tensor
+    change: Tensor
+    truth: Tensor
+
+
+def main(arguments: Arguments) -> Familiarity:
+    """Fit, write ``familiarity.safetensors`` and its JSON, and return it."""
+    name = arguments.world or arguments.recordings.name
+    folder = arguments.weights / name
+    (local, about_local), (place, about_place) = load_local(folder, name), load_place(folder, name)
+    networks = Networks(local, place)
+    if arguments.world is None:
+        data = open_recorded(arguments.recordings, arguments.out, (local, about_local))
+        fitted, limiting = (
+            [SensedDrive(track.frames(slice(None)), track.poses_xyyaw, track.actions, track.twists) for track in tracks]
+            for tracks in (data.tracks("optimizer"), data.tracks("validation"))
+        )
+    else:
+        world = world_named(arguments.world)
+        fitted, limiting = _simulated(world, arguments)
+    size, motion_size = look_size(place.encoder), local.config.feature_size
+    config = FamiliarityConfig(size, motion_size, local.config.actions, local.config.twist)
+    with torch.inference_mode():
+        seen = [see(networks, config, drive) for drive in fitted if len(drive.poses_xyyaw) > 1]
+        held_out = [see(networks, config, drive) for drive in limiting if len(drive.poses_xyyaw) > 1]
+    familiarity = fit(config, seen, held_out)
+    long = [drive for drive in limiting if len(drive.poses_xyyaw) >= 2 * _WINDOWS[0]][: arguments.fault_drives]
+    disagreement, shares = fit_disagreement(networks, familiarity, name, long)
+    familiarity = with_config(familiarity, dataclasses.replace(familiarity.config, disagreement=disagreement))
+    details: dict[str, Any] = {
+        f"{LOCAL}_sha256": about_local["sha256"],
+        f"{PLACE}_sha256": about_place["sha256"],
+        "training": runs.record("train_familiarity", arguments),
+        "metrics": {"validation": {f"within_three_deviations_{kind}": share for kind, share in shares.items()}},
+    }
+    save_checkpoint(folder / f"{FAMILIARITY}.safetensors", familiarity, FAMILIARITY, name, details)
+    limits = {kind: round(limit, 3) for kind, limit in zip(DISTANCES, familiarity.config.limits, strict=True)}
+    print(f"{name}: limits {limits}, factor {disagreement}, within three deviations {shares}")
+    return familiarity
+
+
+def _simulated(world: World, arguments: Arguments) -> tuple[list[SensedDrive], list[SensedDrive]]:
+    def drives(seeds: Iterable[int]) -> list[SensedDrive]:
+        # Each in a maze of a size of its own, as they are drawn from the first seed.
+        return [
+            SensedDrive.of_episode(world, episode)
+            for seed in seeds
+            for episode in simulate(driven(world, seed), [seed], arguments.frames)
+        ]
+
+    first = len(VALIDATION_SEEDS) // 2 - arguments.limit_drives  # no table takes these
+    return drives(OPTIMIZER_TRAIN_SEEDS[-arguments.drives :]), drives(
+        VALIDATION_SEEDS[first : first + arguments.limit_drives]
+    )
+
+
+def driven(world: World, seed: int) -> World:
+    """The world; for every third seed with the driver from whom the optimizer learns as well, where there is one."""
+    if world.optimizer_driver is None or seed % 3:
+        return world
+    return dataclasses.replace(world, driver=world.optimizer_driver)
+
+
+def see(networks: Networks, config: FamiliarityConfig, drive: SensedDrive) -> Seen:
+    """What the networks make of a drive."""
+    images, parts = drive.images, []
+    actions = None if drive.actions is None or not config.actions else action_histories(drive.actions)
+    twists = None if drive.twists is None or not config.twist else torch.from_numpy(np.array(drive.twists)).float()
+    for at in torch.arange(len(images) - 1).split(_CHUNK):
+        earlier, later = images[at], images[at + 1]
+        some = None if actions is None else actions[at], None if twists is None else twists[at]
+        relative, _, motion = networks.local(earlier, later, *some)
+        told = told_vector(config, *some, len(at))
+        parts.append((look(networks.place.encoder, later), motion, told, relative, change(earlier, later)))
+    looks, motions, told_steps, relatives, changes = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Seen(looks, motions, told_steps, relatives, changes, relative_poses(drive.poses_xyyaw))
+
+
+def fit(config: FamiliarityConfig, seen: list[Seen], held_out: list[Seen]) -> Familiarity:
+    """Fit everything but ``disagreement``."""
+    familiarity = Familiarity(config)
+    looks, motions, told, truth = (
+        torch.cat([getattr(one, name) for one in seen]) for name in ("looks", "motions", "told", "truth")
+    )
+    familiarity.fit(looks, motions, told, truth)
+    spread = truth.std(0).clamp(min=1e-6)
+    residual = (truth - familiarity.told_motion(told)).std(0).clamp(min=1e-6)
+    share = torch.where(residual < _CLEAR * spread, 1.0, 0.5) * config.is_told
+    std = torch.maximum(residual, told_std([(familiarity.told_motion(one.told), one.truth) for one in seen]))
+    usual = float(torch.cat([one.change for one in seen]).median())
+    config = dataclasses.replace(
+        config, usual_change=max(usual, 1e-9), told_std=tuple(std.tolist()), told_share=tuple(share.tolist())
+    )
+    familiarity = with_config(familiarity, config)
+    averaged = [running_mean(distances_of(familiarity, one), config.memory) for one in held_out]
+    limits = np.percentile(np.concatenate(averaged), 99.9, axis=0)
+    limits = np.where(limits > 0.0, limits, np.inf)
+    return with_config(familiarity, dataclasses.replace(config, limits=tuple(map(float, limits))))
+
+
+def told_std(pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Deviation of a step ``(3,)`` whose independent errors add up to those of told motions over windows of steps.
+
+    The largest one of all windows, for errors that last add up faster.
+    """
+    found = torch.zeros(3)
+    for window in _WINDOWS:
+        squares = []
+        for told, truth in pairs:
+            for at in range(0, len(told) - window + 1, window // 2):
+                ends = [se2.r2g(steps[at : at + window].double())[-1] for steps in (told, truth)]
+                squares.append(se2.wrapped(se2.between(*ends)).square())
+        if squares:
+            mean = torch.stack(squares).mean(0)
+            std = torch.cat((mean[:2].mean().expand(2), mean[2:])).div(window).sqrt().float()
+            found = torch.maximum(found, std)
+    return found
+
+
+def distances_of(familiarity: Familiarity, seen: Seen) -> np.ndarray:
+    """Distances ``(n, 4)`` of a drive."""
+    with torch.inference_mode():
+        found: np.ndarray = (
+            familiarity.distances(seen.looks, seen.motions, seen.told, seen.relative, seen.change).double().numpy()
+        )
+    return found
+
+
+def running_mean(distances: np.ndarray, memory: int) -> np.ndarray:
+    """The mean of distances ``(n, 4)`` as ``FamiliarityWatch`` keeps it."""
+    mean, found = np.zeros(distances.shape[1]), []
+    for row in distances:
+        mean = mean + (row - mean) / memory
+        found.append(mean)
+    return np.stack(found)
+
+
+def with_config(familiarity: Familiarity, config: FamiliarityConfig) -> Familiarity:
+    """The same tensors with another configuration."""
+    changed = Familiarity(config)
+    changed.load_state_dict(familiarity.state_dict())
+    return changed
+
+
+def fit_disagreement(
+    networks: Networks, familiarity: Familiarity, world: str, drives: list[SensedDrive]
+) -> tuple[float, dict[str, float]]:
+    """The smallest factor with which drives with each fault are honest, and the shares of their poses within."""
+    runs_of: dict[str, list[tuple[np.ndarray, list[LocalEstimate], list[LocalEstimate]]]] = {
+        kind: [] for kind in FAULTS
+    }
+    cores = []
+    for factor in (1e-9, 1.0):  # variances are a sum: what does not depend on the factor, and its square times the rest
+        config = dataclasses.replace(familiarity.config, disagreement=factor)
+        cores.append(LocalOdometry(networks.local, networks.place, world, with_config(familiarity, config)))
+    for kind, found in runs_of.items():
+        for seed, drive in enumerate(drives):
+            bad = faulted(drive, kind, len(drive.poses_xyyaw) // 4, seed)
+            without, with_one = (estimates_of(core, bad) for core in cores)
+            found.append((seen_from_first(drive.poses_xyyaw)[1:], without, with_one))
+    shares: dict[str, float] = {}
+    for factor in FACTORS:
+        shares = {
+            kind: float(np.mean([_share(*run, factor) for run in found])) for kind, found in runs_of.items() if found
+        }
+        if min(shares.values(), default=1.0) >= _WANTED:
+            return factor, shares
+    return FACTORS[-1], shares
+
+
+def _share(truth: np.ndarray, without: list[LocalEstimate], with_one: list[LocalEstimate], factor: float) -> float:
+    steps = [
+        dataclasses.replace(a, covariance=a.covariance + factor**2 * (b.covariance - a.covariance))
+        for a, b in zip(without, with_one, strict=True)
+    ]
+    odometry = np.stack([step.odom_xyyaw for step in steps])
+    return within(odometry, odometry_covariances(odometry, steps), truth)
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)
