@@ -121,7 +121,7 @@ def test_a_session_goes_on_from_another_start_in_one_map(
     if world == "scan":
         first, second, elsewhere = house_drives()
     else:
-        frames = {"maze2d": 220, "maze3d": 200}[world]
+        frames = {"maze2d": 300, "maze3d": 200}[world]
         first, second = (maze_drive(world, MAZE, MAZE + k, frames) for k in (0, 7))
         elsewhere = maze_drive(world, OTHER_MAZE, OTHER_MAZE, 70)
     mapped = new(world)
