@@ -81,7 +81,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     rows = row_estimators(arguments, drives)
     seeds = range(_FIRST_SEED[arguments.split], _FIRST_SEED[arguments.split] + arguments.seeds)
     maps = _MAPS[arguments.split][: arguments.maps or None]
-    result: dict[str, Any] = {**runs.record("results_doom", arguments), "maps": {}}
+    result: dict[str, Any] = {**runs.record("results_doom", arguments), "path_m": {}, "maps": {}}
     result.pop("arguments")
     tracks: dict[str, dict[str, np.ndarray]] = {}
     for of in tqdm(maps, desc=f"{arguments.world} {arguments.split}", unit="map"):
@@ -91,7 +91,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
                   for metric in METRICS}
             for row in ROWS
         }  # fmt: skip
-        entry["path_m"] = mean_interval(np.array([one.errors["local"]["path_m"] for one in found])).as_json()
+        result["path_m"][map_name(of)] = mean_interval(
+            np.array([one.errors["local"]["path_m"] for one in found])
+        ).as_json()
         result["maps"][map_name(of)] = entry
         tracks[map_name(of)] = found[0].tracks
     write_at_once(arguments.out / f"{arguments.world}.json", json.dumps(result, indent=2) + "\n")

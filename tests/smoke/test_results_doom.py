@@ -7,16 +7,15 @@ import pytest
 
 from ngo_estimator.checkpoint import write_untrained
 from training import results_doom, tune_doom
-from training.data.doom_drives import TEST_MAPS
 from training.scoring.doom_rows import METRICS, ROWS
 
 
 def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_untrained(tmp_path / "weights" / "doom", "doom")
     monkeypatch.setattr(results_doom, "_FIT_MAPS", 1)
-    monkeypatch.setitem(results_doom._MAPS, "test", TEST_MAPS[-1:])
+    monkeypatch.setitem(results_doom._MAPS, "test", (("take_cover.wad", "MAP01"),))
     monkeypatch.setattr(results_doom, "draw_levels", lambda path: None)
-    monkeypatch.setattr(tune_doom, "VALIDATION_MAPS", TEST_MAPS[-2:-1])
+    monkeypatch.setattr(tune_doom, "VALIDATION_MAPS", (("simpler_basic.wad", "MAP01"),))
     for name in ("BELIEFS", "STEP_SCALES", "LOOP_SCALES"):
         monkeypatch.setattr(tune_doom, name, getattr(tune_doom, name)[:1])
     folders = {"weights": tmp_path / "weights", "runs": tmp_path / "runs", "out": tmp_path / "out"}

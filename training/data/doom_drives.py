@@ -28,11 +28,13 @@ VALIDATION_MAPS: tuple[Map, ...] = tuple(("freedoom2.wad", f"MAP{number:02}") fo
 TEST_MAPS: tuple[Map, ...] = (
     *(("freedoom2.wad", f"MAP{number:02}") for number in range(21, 33)),
     *((f"{name}.wad", "MAP01") for name in (
-        "basic", "cig", "deadly_corridor", "deathmatch", "defend_the_center", "defend_the_line", "health_gathering",
-        "health_gathering_supreme", "multi_deathmatch", "multi_duel", "my_way_home", "predict_position",
+        "basic", "deadly_corridor", "deathmatch", "defend_the_center", "defend_the_line", "health_gathering",
+        "health_gathering_supreme", "multi_deathmatch", "my_way_home", "predict_position",
         "rocket_basic", "simpler_basic", "take_cover",
     )),
+    ("cig.wad", "MAP02"),
 )  # fmt: skip
+"""All scenarios of ViZDoom that have a start for a single player; ``basic`` stands for its variants with sounds."""
 
 _PLACES, _PLACE_SHARES = ("map", "rooms", "maze"), (0.5, 0.3, 0.2)
 _DRIVERS = {

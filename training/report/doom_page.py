@@ -35,15 +35,28 @@ def page(result: dict[str, Any], weights: Path) -> str:
     parts = [
         _INTRODUCTION.format(**result),
         "## Median over maps\n\nIn brackets: smallest and largest mean of a map.\n\n"
-        + markdown(["Row", *_COLUMNS.values()], medians),
+        + markdown(["Row", *_COLUMNS.values()], medians)
+        + f"\n\n{_ratios(maps)}",
         "![Paths on every map](images/results_doom_maps.png)",
     ]
     for metric, title in _COLUMNS.items():
-        rows = [[name, *(interval(entry[row][metric]) for row in ROWS)] for name, entry in maps.items()]
-        parts.append(f"## {title}\n\n" + markdown(["Map", *(f"`{row}`" for row in ROWS)], rows))
+        rows = [
+            [name, number(result["path_m"][name]["mean"]), *(interval(entry[row][metric]) for row in ROWS)]
+            for name, entry in maps.items()
+        ]
+        parts.append(f"## {title}\n\n" + markdown(["Map", "Path, m", *(f"`{row}`" for row in ROWS)], rows))
     parts.append("## Training\n\n" + markdown(["Network", "Command", "Minutes", "Datapoints/s"], _trainings(weights)))
     parts.append(_LEVELS)
     return "\n\n".join(parts) + "\n"
+
+
+def _ratios(maps: dict[str, Any]) -> str:
+    ratios = np.array([entry["ours"]["ate_m"]["mean"] / entry["local"]["ate_m"]["mean"] for entry in maps.values()])
+    return (
+        f"The corrected ATE of a map is {number(float(np.median(ratios)))} of its odometry's in the median "
+        f"({number(ratios.min())} to {number(ratios.max())}). {int((ratios > 1.05).sum())} of {len(ratios)} maps are "
+        "more than 5 % worse than their odometry."
+    )
 
 
 def _median(maps: dict[str, Any], row: str, metric: str) -> str:
@@ -89,6 +102,7 @@ Written by `{command}` at revision {revision}.
 
 Three drives of 1000 frames on each map, by the driver `explorer`, from the map's own start. No training and no choice
 has seen these maps: freedoom2's MAP21 to MAP32 and the scenarios of ViZDoom (`training/data/doom_drives.py`).
+`rocket_basic` and `simpler_basic` are the same map.
 
 - **Final error**: distance of the last two positions, in percent of the path, aligned at the first pose alone.
 - **ATE**: root mean square distance of positions after the best rigid alignment.
