@@ -88,6 +88,10 @@ def _order_of_elimination(pairs: np.ndarray, count: int) -> np.ndarray:
     return order.astype(np.int64)
 
 
+def _factorised(matrix: csc_matrix) -> SuperLU:
+    return splu(matrix, permc_spec="NATURAL", **_SYMMETRIC)
+
+
 class FactorisedInformation:
     """The factorised information matrix of the poses of one graph, node 0 excepted, which is known.
 
@@ -100,15 +104,9 @@ class FactorisedInformation:
 
     def __init__(self, rank: np.ndarray, matrix: csc_matrix, near: "FactorisedInformation | None" = None) -> None:
         self._rank, self._matrix = rank, matrix
-        self._exact = False
-        if near is None or near._factor.nnz < _LEAST_REUSED:
-            self._factorise()
-        else:
-            self._factor = near._factor
-
-    def _factorise(self) -> None:
-        self._factor: SuperLU = splu(self._matrix, permc_spec="NATURAL", **_SYMMETRIC)
-        self._exact = True
+        large = near is not None and near._factor.nnz >= _LEAST_REUSED
+        self._exact = not large
+        self._factor: SuperLU = near._factor if near is not None and large else _factorised(matrix)
 
     def _solved(self, right: np.ndarray) -> np.ndarray:
         """Solution ``(rows,)`` of the equations with the right hand side ``(rows,)``."""
@@ -118,7 +116,7 @@ class FactorisedInformation:
             solution, failed = cg(self._matrix, right, rtol=_TOLERANCE, maxiter=_MOST_REFINEMENTS, M=known)
             if not failed:
                 return solution
-            self._factorise()
+            self._factor, self._exact = _factorised(self._matrix), True
         solution = self._factor.solve(right)
         return solution
 
@@ -133,7 +131,7 @@ class FactorisedInformation:
         right = np.zeros((self._matrix.shape[0], len(wanted)))
         right[wanted, np.arange(len(wanted))] = 1.0
         if not self._exact:
-            self._factorise()
+            self._factor, self._exact = _factorised(self._matrix), True
         covariance: np.ndarray = self._factor.solve(right)[wanted]
         return 0.5 * (covariance + covariance.T)
 
