@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import long_run, online
+from benchmarks import equal_errors, long_run, online
 from demo.graph import GraphError
 from demo.session import SessionConfig
 
-KEYS = ("ngo_node_p99_ms", "local_node_p99_ms", "ratio_to_gtsam_lm", "ratio_to_isam2")
+KEYS = (*online.BARS, "ratio_to_isam2_default", "cpu_s_a_minute_at_10_hz")
 
 
 @pytest.mark.timeout(300)
@@ -55,7 +55,7 @@ def test_frames_end_to_end_are_counted_and_none_may_be_lost(tmp_path: Path, monk
 
 
 def test_a_missed_bar_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    result = dict.fromkeys(KEYS, 1.5)
+    result = {**dict.fromkeys(online.BARS, 0.1), "ratio_to_gtsam_lm": 1.5}
     monkeypatch.setattr(online, "measure", lambda *_: result)
     monkeypatch.setattr(online, "table", lambda _: "")
     assert online.main(online.Arguments(worlds=("maze3d",))) == 1
@@ -89,3 +89,10 @@ def test_a_long_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_sizes_that_measure_nothing_are_refused(changes: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         online.Arguments(**changes)  # type: ignore[arg-type]
+
+
+def test_equal_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    equal_errors.main(equal_errors.Arguments(worlds=("maze2d",), drives=1, frames=160, out=tmp_path))
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])["maze2d"]
+    assert set(result) == {"odometry", "ours", "at_once", "gtsam_lm", "isam2", "isam2_default", "difference"}
+    assert result["difference"][0] < 1e-4 and result["ours"][0] < 2.0 * result["odometry"][0]

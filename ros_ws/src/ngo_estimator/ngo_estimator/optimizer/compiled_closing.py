@@ -26,13 +26,8 @@ _GATE_INPUTS = 11
 _KERNEL_WIDTH = RobustLoopGate.WIDTH
 
 
-def fits(steps: MetaSteps) -> bool:
-    """Whether ``CompiledClosing`` takes these: a single trajectory on the CPU, and no gradient."""
-    return not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu"
-
-
 class CompiledClosing:
-    """As ``LoopClosing``, for what ``fits``; arguments as there."""
+    """As ``LoopClosing``, for a single trajectory on the CPU, without gradients; arguments as there."""
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +12,9 @@ from torch import Tensor
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.gauss_newton import chain_factors, node_covariance, pair_factors, step_information
 from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.normal_equations import FactorisedInformation
+
+if TYPE_CHECKING:
+    from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 
 
 @dataclass(frozen=True)

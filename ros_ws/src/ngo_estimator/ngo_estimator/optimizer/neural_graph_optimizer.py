@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +20,6 @@ from ngo_estimator.networks.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
-from ngo_estimator.optimizer.compiled_closing import CompiledClosing, fits
 from ngo_estimator.optimizer.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
@@ -33,6 +33,9 @@ from ngo_estimator.optimizer.meta_poses import (
 from ngo_estimator.optimizer.odometry_test import without_contradictions
 from ngo_estimator.optimizer.overlaps import find_overlaps
 from ngo_estimator.optimizer.registered_odometry import registered_steps
+
+if TYPE_CHECKING:
+    from ngo_estimator.optimizer.compiled_closing import CompiledClosing
 
 _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 """Before anything is learned: errors of a relative meta-pose in units of the deviations that its steps add up to."""
@@ -257,9 +260,14 @@ class NeuralGraphOptimizer(AttentionNetwork):
 
     def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing | CompiledClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
-        kind = CompiledClosing if fits(steps) else LoopClosing
         believed = without_contradictions(loops, steps)
-        return kind(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+        arguments = (self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+        if torch.is_grad_enabled() or steps.relative.shape[0] != 1 or steps.relative.device.type != "cpu":
+            return LoopClosing(*arguments)
+        # The compiler's library takes 100 MB: only those pay for it that optimise.
+        from ngo_estimator.optimizer.compiled_closing import CompiledClosing
+
+        return CompiledClosing(*arguments)
 
 
 def _without_fixed(

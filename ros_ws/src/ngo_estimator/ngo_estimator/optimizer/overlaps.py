@@ -9,12 +9,10 @@ import math
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans
-from ngo_estimator.optimizer.block_cholesky import Array
 from ngo_estimator.optimizer.gauss_newton import pick
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere, frame_odometry
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, PairViews, measure_overlaps
@@ -24,15 +22,6 @@ OVERLAP_LOGIT = 4.0
 
 LEAST_SHARED = 0.25
 """Share of the rays that must agree before two frames are registered."""
-
-_DRIFT_M = 0.5
-"""Deviation of a position under which frames are compared."""
-
-_AGREEING = 5.0
-"""Ranges agree that differ by so many of their deviations, and half of the drift."""
-
-_EVERY = 3
-"""One of so many rays tells whether frames share what they see."""
 
 
 def find_overlaps(scans: Scans, in_blocks: Tensor, nodes: Tensor, embeddings: Tensor, search: LoopSearch) -> Loops:
@@ -109,50 +98,8 @@ def shared_views(config: RegistrationConfig, a: Tensor, b: Tensor, relative: Ten
     half = math.radians(config.field_of_view_deg) / 2.0
     share = np.empty(len(relative), np.float32)
     settings = (half, config.noise_m, config.noise_share)
-    _share_views(first, second, poses, np.cos(angles), np.sin(angles), settings, share)
+    # The compiler's library takes 100 MB: only those pay for it that compare.
+    from ngo_estimator.optimizer.shared_views_kernel import share_views
+
+    share_views(first, second, poses, np.cos(angles), np.sin(angles), settings, share)
     return torch.from_numpy(share).to(relative)
-
-
-@njit(cache=True, error_model="numpy")
-def _share_views(
-    a: Array, b: Array, relative: Array, cos: Array, sin: Array, settings: tuple[float, float, float], share: Array
-) -> None:
-    for k in range(len(relative)):
-        x, y, yaw = relative[k]
-        share[k] = _seen_again(a[k], b[k], (x, y, yaw), cos, sin, settings)
-        if share[k] > 0.0:
-            turn_x, turn_y = math.cos(yaw), math.sin(yaw)
-            inverse = (-turn_x * x - turn_y * y, turn_y * x - turn_x * y, -yaw)
-            share[k] = min(share[k], _seen_again(b[k], a[k], inverse, cos, sin, settings))
-
-
-@njit(cache=True, error_model="numpy")
-def _seen_again(
-    a: Array,
-    b: Array,
-    relative: tuple[float, float, float],
-    cos: Array,
-    sin: Array,
-    settings: tuple[float, float, float],
-) -> float:
-    """Share of some rays of ``b`` that end where ``a`` sees a wall."""
-    half, noise, noise_share = settings
-    turn_x, turn_y = math.cos(relative[2]), math.sin(relative[2])
-    meets, count = 0, 0
-    farthest = a.max()
-    farthest += 0.5 * _DRIFT_M + _AGREEING * (noise + noise_share * farthest)
-    for ray in range(0, len(b), _EVERY):
-        count += 1
-        if not b[ray] > 0.0:
-            continue
-        x, y = b[ray] * cos[ray], b[ray] * sin[ray]
-        seen_x, seen_y = turn_x * x - turn_y * y + relative[0], turn_y * x + turn_x * y + relative[1]
-        distance = math.sqrt(seen_x * seen_x + seen_y * seen_y)
-        if not distance < farthest:
-            continue
-        at = round((half - math.atan2(seen_y, seen_x)) * (len(a) - 1) / (2.0 * half))
-        if at < 0 or at > len(a) - 1 or not a[at] > 0.0:
-            continue
-        tolerance = 0.5 * _DRIFT_M + _AGREEING * (noise + noise_share * a[at])
-        meets += abs(distance - a[at]) < tolerance
-    return meets / count
