@@ -26,6 +26,7 @@ from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.familiarity import (
     DISTANCES,
+    NO_LIMIT,
     Familiarity,
     FamiliarityConfig,
     change,
@@ -186,7 +187,7 @@ def fit(config: FamiliarityConfig, seen: list[Seen], held_out: list[Seen]) -> Fa
     familiarity = with_config(familiarity, config)
     averaged = [running_mean(distances_of(familiarity, one), config.memory) for one in held_out]
     limits = np.percentile(np.concatenate(averaged), 99.9, axis=0)
-    limits = np.where(limits > 0.0, limits, np.inf)
+    limits = np.where(limits > 0.0, limits, NO_LIMIT)
     return with_config(familiarity, dataclasses.replace(config, limits=tuple(map(float, limits))))
 
 

@@ -7,7 +7,6 @@ the motion is from the one that actions or wheels tell, and how much changed sin
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +16,9 @@ from ngo_estimator.networks.place_encoder import PlaceEncoder
 
 DISTANCES = ("look", "motion", "told", "change")
 """The distances of an observation, in the order of ``Familiarity.distances``."""
+
+NO_LIMIT = 1e9
+"""Limit of a distance that tells nothing."""
 
 HISTORY = 12
 """Latest actions from which the motion is told."""
@@ -47,7 +49,7 @@ class FamiliarityConfig:
     motion_size: int
     actions: int = 0
     twist: bool = False
-    limits: tuple[float, ...] = (math.inf,) * len(DISTANCES)
+    limits: tuple[float, ...] = (NO_LIMIT,) * len(DISTANCES)
     told_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     told_share: tuple[float, float, float] = (0.0, 0.0, 0.0)
     disagreement: float = 1.0
