@@ -54,7 +54,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         parts += [
             f"## {title}",
             f"Up to {settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} "
-            "m each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have the first of them.",
+            "m each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have some of them.",
             _table(result["tables"][name], _BUILDING_COLUMNS),
             _against_ours(result["paired"][name]),
         ]
