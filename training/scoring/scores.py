@@ -103,6 +103,7 @@ METRICS: dict[str, tuple[Metric, ...]] = {
         ),
     ),
 }
+METRICS["doom"] = METRICS["maze3d"]
 """The metrics of each world; the first is the one that comparisons and figures are about."""
 
 

@@ -89,7 +89,7 @@ def image_of(world: str, kind: str, seed: int) -> np.ndarray:
 
 def step_of(estimate: LocalEstimate, kind: str) -> RelativeStep:
     """What arrives of a relative pose."""
-    names = [name for name in vars(estimate) if name != "missed_frames"]
+    names = [name for name in vars(estimate) if name not in ("missed_frames", "repeated")]
     step = RelativeStep(**{name: getattr(estimate, name) for name in names})
     if kind == "nan":
         return replace(step, relative_xyyaw=np.full(3, np.nan))

@@ -75,21 +75,3 @@ def test_with_and_without_gradients_the_optimizer_gives_the_same(form: str) -> N
     dense = optimized(optimizer, inputs)
     ends = [result.end_covariance()[0].diagonal() for result in (sparse, dense)]
     assert torch.allclose(ends[0], ends[1], rtol=0.1)
-
-
-@pytest.mark.parametrize("gain", [1.5, 1e6])
-def test_a_near_factor_serves_and_one_that_is_too_far_off_does_not(
-    gain: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(normal_equations, "_LEAST_REUSED", 1)
-    monkeypatch.setattr(normal_equations, "_MOST_REFINEMENTS", 8)
-    _, factors = random_graph()
-    structure = GraphStructure(torch.cat([f.nodes[0] for f in factors]).numpy(), BLOCKS + 1)
-    first = NormalEquations(factors, structure)
-    last = factors[1]
-    changed = [factors[0], Factors(last.nodes, last.jacobian, last.residual, gain * last.information)]
-    again = NormalEquations(changed, structure, first)
-    assert torch.allclose(again.step(), gauss_newton_step(changed, BLOCKS + 1), rtol=1e-4, atol=1e-6)
-    assert (again._factor is first._factor) == (gain == 1.5)
-    expected = node_covariance(changed, BLOCKS + 1, 5)[0].numpy()
-    np.testing.assert_allclose(again.covariance([5]), expected, rtol=1e-8, atol=1e-14)

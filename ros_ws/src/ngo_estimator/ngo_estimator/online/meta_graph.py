@@ -677,8 +677,8 @@ class MetaGraph:
         frames, blocks, counted = len(self.odometry) - 1, self.blocks, self._buffers()
         require(
             frames // self._block == blocks
-            and {len(counted[name]) for name in _BUFFERS[:3]} == {frames}
-            and {len(counted[name]) for name in _BUFFERS[3:6]} == {blocks},
+            and {len(counted[name]) for name in (*_BUFFERS[:3], "familiar")} == {frames}
+            and {len(counted[name]) for name in (*_BUFFERS[3:6], "fixed")} == {blocks},
             f"{frames} steps and {blocks} meta-poses do not belong together",
         )
         require(

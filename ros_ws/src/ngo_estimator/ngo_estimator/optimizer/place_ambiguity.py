@@ -19,8 +19,9 @@ def places_by_odometry(positions: Tensor, size_m: float) -> Tensor:
     """Numbers ``(..., frames)``, from 0 on, of the squares of ``size_m`` that positions ``(..., frames, 2)`` lie in."""
     squares = torch.floor(positions / size_m).long()
     keys = squares[..., 0] * 2**20 + squares[..., 1]
-    numbers = [torch.unique(row, return_inverse=True)[1] for row in keys.reshape(-1, keys.shape[-1])]
-    return torch.stack(numbers).reshape(keys.shape)
+    ordered, order = keys.sort(dim=-1)
+    new = torch.nn.functional.pad((ordered[..., 1:] != ordered[..., :-1]).long(), (1, 0))
+    return torch.empty_like(keys).scatter_(-1, order, new.cumsum(-1))
 
 
 def looks_like_everything(similarity: Tensor, places: Tensor, visited: Tensor) -> Tensor:
@@ -31,7 +32,7 @@ def looks_like_everything(similarity: Tensor, places: Tensor, visited: Tensor) -
         places: of these frames, by ``places_by_odometry`` ``(batch, frames)``, or ``(frames,)``.
         visited: which of the frames are compared, of a shape that expands to that of ``similarity``.
     """
-    count = int(places.max()) + 1 if places.numel() else 0
+    count = places.shape[-1]  # at most, with no number read back from the device
     found = similarity.new_zeros(2, *similarity.shape[:-1], count)
     index = (places.unsqueeze(-2) if similarity.dim() > places.dim() else places).expand(similarity.shape)
     for row, which in zip(found, (visited & (similarity > ALIKE), visited), strict=True):
