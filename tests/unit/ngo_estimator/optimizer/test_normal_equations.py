@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.optimizer import normal_equations
 from ngo_estimator.optimizer.gauss_newton import Factors, gauss_newton_step, node_covariance
 from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
 from tests.unit.ngo_estimator.optimizer.test_gauss_newton import BLOCKS, random_graph, with_whole_information
