@@ -11,6 +11,7 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav2_msgs.srv import SaveMap
 from nav_msgs.msg import OccupancyGrid
 from ngo_msgs.msg import RelativePose, Trajectory
+from ngo_msgs.srv import SaveState
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
@@ -213,6 +214,22 @@ def test_what_cannot_be_saved_is_said_in_one_line(mapper: Mapper, request_: dict
     assert not mapper.save(**request_)
     mapper.process.wait_for_log(f"save_map: {complaint}")
     assert len(mapper.process.lines) == before + 1
+
+
+def test_a_saved_map_is_there_again_after_a_restart(mapper: Mapper, tmp_path: Path) -> None:
+    mapper.wait_for_map(expected(30, poses(30)))
+    for name, said in ((str(tmp_path / "scans"), "wrote "), ("../scans", "path is '../scans'; expected a folder in")):
+        answer = mapper.probe.call(SaveState, "ngo_map/save_state", SaveState.Request(path=name))
+        assert answer.success == (said == "wrote ") and answer.message.startswith(said)
+    with running("/again", state=str(tmp_path / "scans")) as again:
+        assert "they wait for their trajectory" in again.process.log
+        again.trajectories.publish(trajectory(CORRECTED))
+        again.wait_for_map(expected(30, CORRECTED))
+    with NodeProcess(
+        "ngo_estimator", "ngo_map", {**LIDAR, "max_range": 2.0, "state": str(tmp_path / "scans")}
+    ) as other:
+        assert other.wait() == 2
+        assert len(other.lines) == 1 and "was saved with max_range 1.0; here it is 2.0" in other.log
 
 
 def test_bad_messages_are_dropped_with_a_reason(mapper: Mapper) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.state_arrays import StateError
 from ngo_estimator.mapping.occupancy_grid import OccupancyGrid
 from ngo_estimator.mapping.range_scan import RangeScan, range_scan
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
@@ -179,6 +180,41 @@ def test_a_scan_far_outside_is_left_out_and_the_others_move() -> None:
     update = scan_map.update(stamps(), poses)
     assert "use a coarser resolution" in update.too_large
     assert update.left >= 1
+
+
+def test_a_restored_map_is_drawn_again_and_goes_on() -> None:
+    scan_map, again = ScanMap(EVERY), ScanMap(replace(EVERY, most_waiting=5))
+    take(scan_map, range(40))
+    scan_map.update(stamps(38), path(0.0, 38))  # two wait for their poses
+    again.restore(scan_map.state())
+    # Another odometry goes on, later.
+    take(again, range(40, 44), origin_ns=2)
+    again.update(stamps(44), path(0.01, 44))
+    assert (len(again), again.waiting, again.lost) == (44, 0, 0)
+    np.testing.assert_array_equal(again.cells().cropped().values, from_scratch(list(range(44)), path(0.01)))
+
+
+def test_a_restored_map_of_another_trajectory_is_left_out() -> None:
+    scan_map, again = ScanMap(EVERY), ScanMap(EVERY)
+    take(scan_map, range(10))
+    scan_map.update(stamps(10), path(0.0, 10))
+    again.restore(scan_map.state())
+    take(again, range(20, 24), origin_ns=2)
+    again.update(stamps(4, first=20), path(0.0, 24)[20:])
+    assert (len(again), again.waiting) == (4, 0)
+
+
+def test_arrays_that_no_map_gave_are_refused() -> None:
+    with pytest.raises(StateError, match="the map is empty"):
+        ScanMap(EVERY).state()
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(10))
+    scan_map.update(stamps(10), path(0.0, 10))
+    good = scan_map.state()
+    for name, array in good.items():
+        for wrong in ({}, {name: array[..., None]}, {name: np.concatenate((array, array[-1:]))}):
+            with pytest.raises(StateError):
+                ScanMap(EVERY).restore({**{key: value for key, value in good.items() if key != name}, **wrong})
 
 
 def test_wrong_settings_are_named() -> None:

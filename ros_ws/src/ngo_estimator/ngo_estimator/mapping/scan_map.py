@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
+from ngo_estimator.data.state_arrays import Arrays, StateError, flat, part, require, split, taken, under
 from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, OccupancyGrid, OccupancyMap
 from ngo_estimator.mapping.range_scan import Array, RangeScan, range_scan
 
@@ -75,6 +76,7 @@ class ScanMap:
         self._run = 0  # counts the starts of the source
         self._last_odom: Array | None = None  # of the frame whose scan was taken last
         self._waiting: dict[int, tuple[int, RangeScan]] = {}  # by stamp: the start of the source, and the scan
+        self._restored = 0  # scans that were restored: they may wait beside the others
         self.lost = 0
         """Scans that waited in vain: no trajectory has their stamps."""
         self._forget()
@@ -111,9 +113,45 @@ class ScanMap:
         self._last_odom = step.odom_xyyaw
         for stamp, scan in scans:
             self._waiting[stamp] = self._run, scan
-        while len(self._waiting) > self.config.most_waiting:
+        while len(self._waiting) > self.config.most_waiting + self._restored:
             self._waiting.pop(next(iter(self._waiting)))
             self.lost += 1
+
+    def state(self) -> Arrays:
+        """All scans in the map, and those that wait, for ``restore``; a trajectory says where they lie.
+
+        Raises ``StateError`` where there are none.
+        """
+        waiting = {stamp: scan for stamp, (run, scan) in self._waiting.items() if run == self._map_run}
+        known = sorted({**waiting, **dict(zip(self._stamps.tolist(), self._scans, strict=True))}.items())
+        if not known:
+            raise StateError("the map is empty; nothing was written")
+        scans = [scan for _, scan in known]
+        return {
+            "stamps_ns": np.array([stamp for stamp, _ in known], np.int64),
+            "sensors": np.array([scan.sensor_xyyaw for scan in scans], np.float64),
+            **under("ends", flat([scan.ends for scan in scans], np.zeros((0, 2), np.float32))),
+            **under("hits", flat([scan.hits for scan in scans], np.zeros(0, np.bool_))),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``.
+
+        The scans wait for the first trajectory that has their stamps.
+        """
+        stamps = taken(arrays, "stamps_ns", np.int64, -1)
+        sensors = taken(arrays, "sensors", np.float64, len(stamps), 3)
+        ends, hits = split(part(arrays, "ends"), np.float32, 2), split(part(arrays, "hits"), np.bool_)
+        lengths = [len(ends), len(hits)] == [len(stamps)] * 2 and list(map(len, ends)) == list(map(len, hits))
+        finite = all(bool(np.isfinite(values).all()) for values in (sensors, *ends))
+        require(
+            lengths and finite and bool((np.diff(stamps) > 0).all()), "stamps, ends and hits do not belong together"
+        )
+        self._source, self._last_odom = None, None
+        self._forget()
+        rows = zip(stamps.tolist(), map(RangeScan, sensors, ends, hits), strict=True)
+        self._waiting = {stamp: (self._run, scan) for stamp, scan in rows}
+        self._restored = len(stamps)
 
     def _is_elsewhere(self, odom: Array) -> bool:
         """Whether a frame is far enough from the last one whose scan was taken, by their poses ``(3,)`` in odom."""

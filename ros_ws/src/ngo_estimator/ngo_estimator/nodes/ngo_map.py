@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from nav2_msgs.srv import SaveMap
 from ngo_msgs.msg import RelativePose, Trajectory
+from ngo_msgs.srv import SaveState
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -25,8 +26,9 @@ from ngo_estimator.nodes.messages import relative_step
 from ngo_estimator.nodes.settings import MapNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import weights_folder
+from ngo_estimator.online.saved_state import read_state, write_state
 from ngo_estimator.trajectory.files import seconds
-from ngo_estimator.trajectory.save_path import path_inside
+from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 NAME = "ngo_map"
 _SUMMARY = "Publishes a map from the ranges in relative poses, at their corrected poses."
@@ -43,6 +45,9 @@ class NgoMap(Node):
         self._source = self._open_source(settings)
         warm_up()
         self._map = ScanMap(ScanMapConfig(resolution_m=settings.resolution))
+        self._identity = {"map": settings.world, "max_range": settings.max_range}
+        if settings.state:
+            self._load(Path(settings.save_directory).expanduser() / Path(settings.state).expanduser())
         self._trajectory: Trajectory | None = None
         self._due = False  # whether the map does not follow the trajectory yet
         self._begun = False
@@ -50,6 +55,7 @@ class NgoMap(Node):
         with checked_overrides():
             self._create_topics(settings)
         self.create_service(SaveMap, "~/save_map", self._on_save)
+        self.create_service(SaveState, "~/save_state", self._on_save_state)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(settings.map_update_interval, self._follow, clock=steady)
         self._live.on_change(self._on_settings)
@@ -67,6 +73,13 @@ class NgoMap(Node):
                 f"{folder}: its place codes hold no ranges; a map needs a lidar, or networks that see ranges"
             )
         return source
+
+    def _load(self, folder: Path) -> None:
+        try:
+            self._map.restore(read_state(folder, self._identity))
+        except ValueError as error:
+            raise StartError(str(error)) from error
+        self.get_logger().info(f"loaded {self._map.waiting} scans from {folder}: they wait for their trajectory")
 
     def _create_topics(self, settings: MapNodeSettings) -> None:
         self._status = NodeStatus(
@@ -163,6 +176,18 @@ class NgoMap(Node):
             round(request.free_thresh, 6) or FREE,
             round(request.occupied_thresh, 6) or OCCUPIED,
         )
+
+    def _on_save_state(self, request: SaveState.Request, response: SaveState.Response) -> SaveState.Response:
+        """Save the scans of the map, from which it is drawn again once the trajectory is loaded."""
+        try:
+            arrays = self._map.state()
+            folder = folder_inside(Path(self._settings.save_directory), request.path)
+            write_state(folder, self._identity, arrays)
+        except Exception as error:  # the caller of the service gets an answer in any case
+            response.message = " ".join(str(error).split()) or repr(error)
+            return response
+        response.success, response.message = True, f"wrote {len(arrays['stamps_ns'])} scans to {folder}"
+        return response
 
     def _on_settings(self, settings: MapNodeSettings) -> None:
         self._status.set_period(settings.diagnostics_period_s)
