@@ -35,8 +35,12 @@ def stamps(messages: list[Image] | list[Odometry] | list[PoseWithCovarianceStamp
 
 def test_the_estimators_run_unchanged_on_a_scenario_that_vizdoom_ships(probe: Probe) -> None:
     """Every frame gets a corrected pose, and the corrected motion is about as long as the true one."""
-    received = {"image_reliability": "reliable", "image_depth": 100}  # a busy machine must lose none
-    with NodeProcess("ngo_estimator", "local_node", received) as local, NodeProcess("ngo_estimator", "ngo_node") as ngo:
+    weights = {"world": "doom"}
+    received = {**weights, "image_reliability": "reliable", "image_depth": 100}  # a busy machine must lose none
+    with (
+        NodeProcess("ngo_estimator", "local_node", received) as local,
+        NodeProcess("ngo_estimator", "ngo_node", weights) as ngo,
+    ):
         local.wait_for_log("ready: ")
         ngo.wait_for_log("ready: ")
         truth = probe.collect(Odometry, "ground_truth")
