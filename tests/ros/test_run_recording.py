@@ -217,8 +217,8 @@ def test_equals_the_live_nodes(world: str, tmp_path: Path) -> None:
     if world == "faulty":
         entries = faulty_entries()
     else:
-        # After 101 steps no optimisation is under way, whose end the live node would wait for.
-        entries = episode_entries(world, drive(world, 102), START_NS, START_NS)
+        # After 103 steps no optimisation is under way, whose end the live node would wait for.
+        entries = episode_entries(world, drive(world, 104), START_NS, START_NS)
     recording = make.write_mcap(tmp_path / "drive.mcap", entries)
     nodes = LiveNodes(name, weights)
     try:
