@@ -132,6 +132,7 @@ def test_maze3d_publishes_what_the_core_records(probe: Probe, latched: QoSProfil
     assert math.degrees(2 * math.atan(40 / info.k[0])) == pytest.approx(108)
     assert (info.k[2], info.k[5]) == (39.5, 29.5)
     assert info.header.frame_id == image.header.frame_id == "camera_optical_frame"
+    probe.spin_until(lambda: mounted, "the camera's mounting")
     (transform,) = mounted[0].transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("base_link", "camera_optical_frame")
     q = transform.transform.rotation

@@ -4,12 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from ngo_estimator.checkpoint import load_familiarity, write_untrained
 from training import faults, train_familiarity
 
 
 def test_familiarity_is_fitted_and_faults_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)  # some untrained networks know their drives less well than others
     write_untrained(tmp_path / "maze2d", "maze2d")
     train_familiarity.main(
         train_familiarity.Arguments("maze2d", drives=4, limit_drives=2, fault_drives=1, frames=128, weights=tmp_path)
