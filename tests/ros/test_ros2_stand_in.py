@@ -159,7 +159,8 @@ def test_arrays_of_every_kind_are_lists_and_end_with_dots_past_the_limit() -> No
     assert "- 1.0\n- '...'\nunlikeness: 0.0\nfrom_place_code: []\n" in text
     assert text.count("\n- 1.0") == 128 + 1
     assert message_to_yaml(message, truncate_length=None).count("\n- 1.0") == 200 + 1
-    assert "motion_feature: []\nplace_code: []\nunlikeness: 0.0\nfrom_place_code: []\n" in message_to_yaml(RelativePose())
+    empty = message_to_yaml(RelativePose())
+    assert "motion_feature: []\nplace_code: []\nunlikeness: 0.0\nfrom_place_code: []\n" in empty
 
 
 def test_messages_within_arrays_are_printed_in_full() -> None:
