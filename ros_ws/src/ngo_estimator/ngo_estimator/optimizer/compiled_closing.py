@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ngo_estimator.geometry.planar_motion import wrap
 from ngo_estimator.optimizer.block_cholesky import Array
-from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER
+from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER, LoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
@@ -26,7 +26,7 @@ _GATE_INPUTS = 11
 _KERNEL_WIDTH = RobustLoopGate.WIDTH
 
 
-class CompiledClosing:
+class CompiledClosing(LoopClosing):
     """As ``LoopClosing``, for a single trajectory on the CPU, without gradients; arguments as there."""
 
     def __init__(
@@ -38,14 +38,13 @@ class CompiledClosing:
         odometry_noise: Tensor,
         correction_std: Tensor,
     ) -> None:
-        self._gate, self._steps, self._find_overlaps = gate, steps, find_overlaps
+        super().__init__(gate, steps, loops, find_overlaps, odometry_noise, correction_std)
         self._layers, self._head = [_of(layer) for layer in gate.layers if isinstance(layer, nn.Linear)], _of(gate.head)
         self._noise_2 = np.stack((gate.noise.double().numpy(), gate.components.double().numpy()))
         self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
         self._poses = np.zeros((len(self._std) + 1, 3))
         self._take(loops)
-        self._closed: ClosedLoops | None = None
 
     def _take(self, loops: Loops) -> None:
         self._loops = loops
@@ -64,13 +63,6 @@ class CompiledClosing:
             loops.valid[0].unsqueeze(-1),
         )
         self._constants = torch.cat([part.double() for part in constants], dim=-1).numpy()
-
-    @property
-    def closed(self) -> ClosedLoops:
-        """The loops of the last ``close``; raises ``RuntimeError`` before it."""
-        if self._closed is None:
-            raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
-        return self._closed
 
     def look(self, state: GraphState, iteration: int) -> Tensor:
         """As ``LoopClosing.look``."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -33,9 +32,6 @@ from ngo_estimator.optimizer.meta_poses import (
 from ngo_estimator.optimizer.odometry_test import without_contradictions
 from ngo_estimator.optimizer.overlaps import find_overlaps
 from ngo_estimator.optimizer.registered_odometry import registered_steps
-
-if TYPE_CHECKING:
-    from ngo_estimator.optimizer.compiled_closing import CompiledClosing
 
 _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 """Before anything is learned: errors of a relative meta-pose in units of the deviations that its steps add up to."""
@@ -258,7 +254,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
         found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
         return without_contradictions(found, steps)
 
-    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing | CompiledClosing:
+    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
         believed = without_contradictions(loops, steps)
         arguments = (self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
