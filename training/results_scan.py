@@ -4,8 +4,7 @@
 
 Every row is measured on the logs in a folder, where one is given, on simulated buildings and mazes that nothing was
 trained or chosen on, and beside other programs. The command writes ``training/results/scan.json``,
-``docs/results_scan.md`` and ``docs/images/results_scan_*.png``. Pictures of logs go to a folder of their own, if one is
-given. Run it again to continue after a stop.
+``docs/results_scan.md`` and ``docs/images/results_scan_*.png``. Run it again to continue after a stop.
 """
 
 import json
@@ -19,14 +18,15 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-import ngo_recordings
-import ngo_sim
+from ngo_recordings import mounting, recording, scan_stream, topics
+from ngo_sim import building2d, episodes, maze2d
 from training.common import runs
 from training.common.command_line import run_command
 from training.common.curves import write_at_once
-from training.data import scans, simulated_drives
+from training.data import building_drives, scans, simulated_drives
+from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
 from training.data.scans import CONDITIONS
-from training.data.simulated_drives import BUILDING_TEST_SEEDS, building_drive, maze_drive, scanned_maze_drive
+from training.data.simulated_drives import maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, logs_below
@@ -40,10 +40,15 @@ Numbers = dict[str, dict[str, Any]]
 """``{mean, ci95}`` by the metric's key."""
 
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
-_SIMULATED = (ngo_sim, scans, simulated_drives)
-_READ = (ngo_recordings, lidar_logs)
+_BUILDINGS = (building2d, building_drives)
+_MAZES = (maze2d, episodes, scans, simulated_drives)
+_READ = (mounting, recording, scan_stream, topics, lidar_logs)
 _MOST_SCANS = 20_000  # of a building: some robots stand for hours
-_PAIRED = "ate_m"
+_SHOWN = ("buildings", "ablation", "length_m", "mazes", "frames")
+_PAIRED = ("ate_m", "within_three_deviations")
+_SLIPS_PER_KM = 300.0  # of the table of slip; the buildings have up to 60
+_ABLATED = ("buildings", "aliased")
+_SLIP_ROWS = ("wheels", "ours")
 _SCANNER_ROWS = ("ours_without_wheels",)
 
 
@@ -59,6 +64,8 @@ class Arguments:
     """Simulated buildings of each of the two tables."""
     length_m: float = 500.0
     """Way that the robot drives in a building."""
+    ablation: int = 5
+    """Of these, how many the rows of the ablation are measured on; and buildings with slipping wheels."""
     mazes: int = 8
     """Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0."""
     frames: int = 2000
@@ -75,16 +82,15 @@ class Arguments:
     """Folder that gets results_scan.md and images/."""
     runs: Path = runs.ROOT / "runs"
     """Folder of what was measured."""
-    pictures: Path | None = None
-    """Folder that gets pictures of the logs; none: they are not drawn."""
 
     def __post_init__(self) -> None:
         if unknown := [row for row in self.rows if row not in ROWS]:
             raise ValueError(f"rows has {', '.join(unknown)}; expected among {', '.join(ROWS)}")
-        if self.buildings < 2 or self.mazes < 2 or self.frames < 2 or not self.length_m > 0.0:
+        counts = (self.buildings, self.ablation, self.mazes, self.frames)
+        if min(counts) < 2 or not self.length_m > 0.0:
             raise ValueError(
-                f"buildings, mazes, frames, length_m are {self.buildings}, {self.mazes}, {self.frames}, "
-                f"{self.length_m}; expected at least 2 of each, and a positive way"
+                f"buildings, ablation, mazes, frames, length_m are {counts}, {self.length_m}; expected at least 2 of "
+                "each, and a positive way"
             )
 
 
@@ -92,7 +98,11 @@ def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     record = runs.record("results", arguments)
     rows, skipped = _rows(arguments.rows)
-    tables = {name: _measured(arguments, name, sources, rows) for name, sources in _sources(arguments, skipped).items()}
+    slip_rows = {name: row for name, row in rows.items() if name in _SLIP_ROWS}
+    tables = {
+        name: _measured(arguments, name, sources, slip_rows if name == "slip" else rows)
+        for name, sources in _sources(arguments, skipped).items()
+    }
     scanner_rows = {name: row for name, row in rows.items() if name in _SCANNER_ROWS}
     scanners = {
         condition: _measured(arguments, condition, _scanner_sources(arguments, condition), scanner_rows)
@@ -103,7 +113,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
     result = {
         "command": _command(record["command"], bool(logs)),
         "revision": record["revision"],
-        "settings": {name: getattr(arguments, name) for name in ("buildings", "length_m", "mazes", "frames")},
+        "settings": {
+            name: getattr(arguments, name) for name in ("buildings", "ablation", "length_m", "mazes", "frames")
+        },
         "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
         "tables": {name: _table_numbers(table) for name, table in tables.items()},
         "scanners": {name: _table_numbers(table) for name, table in scanners.items()},
@@ -113,9 +125,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "failed": _failures({"logs": logs, **tables, **scanners}),
     }
     write_at_once(arguments.out / "scan.json", json.dumps(result, indent=2) + "\n")
-    images = lidar_figures.draw_buildings(arguments.docs / "images", tables)
-    if arguments.pictures is not None:
-        lidar_figures.draw_logs(arguments.pictures, logs)
+    images = lidar_figures.draw(arguments.docs / "images", logs, tables)
     write_at_once(arguments.docs / "results_scan.md", lidar_page.page(result, images))
     _print(found, skipped)
     return result
@@ -138,21 +148,11 @@ def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
 
 def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSource]]:
     """The drives of each table; what is not there is added to what is skipped."""
-    seeds = {
-        "buildings": BUILDING_TEST_SEEDS[: arguments.buildings],
-        "aliased": BUILDING_TEST_SEEDS[_ALIASED_FIRST : _ALIASED_FIRST + arguments.buildings],
-    }
+    aliased = BUILDING_TEST_SEEDS[_ALIASED_FIRST:]
     sources = {
-        table: [
-            DriveSource(
-                f"{table}_{seed}",
-                f"building {seed} {table} {arguments.length_m:g} m, {_MOST_SCANS} scans",
-                partial(building_drive, seed, arguments.length_m, table == "aliased", _MOST_SCANS),
-                _SIMULATED,
-            )
-            for seed in chosen
-        ]
-        for table, chosen in seeds.items()
+        "buildings": [_building(arguments, "buildings", seed) for seed in BUILDING_TEST_SEEDS[: arguments.buildings]],
+        "aliased": [_building(arguments, "aliased", seed) for seed in aliased[: arguments.buildings]],
+        "slip": [_building(arguments, "slip", seed) for seed in BUILDING_TEST_SEEDS[: arguments.ablation]],
     }
     mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
     sources["maze2d"] = [
@@ -160,7 +160,7 @@ def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSo
             f"maze2d_{seed}",
             f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
             partial(maze_drive, seed, arguments.frames, mazes[0]),
-            _SIMULATED,
+            _MAZES,
             has_wheels=False,
         )
         for seed in mazes
@@ -176,6 +176,17 @@ def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSo
     return {"logs": of_logs, **sources}
 
 
+def _building(arguments: Arguments, table: str, seed: int) -> DriveSource:
+    slips = _SLIPS_PER_KM if table == "slip" else None
+    named = "" if slips is None else f", {slips:g} slips a km"
+    return DriveSource(
+        f"{table}_{seed}",
+        f"building {seed} {table} {arguments.length_m:g} m, {_MOST_SCANS} scans{named}",
+        partial(building_drive, seed, arguments.length_m, table == "aliased", _MOST_SCANS, slips),
+        _BUILDINGS,
+    )
+
+
 def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
     changes = CONDITIONS[condition]
     return [
@@ -183,7 +194,7 @@ def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
             f"maze_{seed}",
             f"scanned maze {seed}, {condition}, {json.dumps(changes)}, {arguments.frames} frames",
             partial(scanned_maze_drive, seed, arguments.frames, changes),
-            _SIMULATED,
+            _MAZES,
             has_wheels=False,
         )
         for seed in WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes]
@@ -193,11 +204,17 @@ def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
 def _measured(arguments: Arguments, table: str, sources: Sequence[DriveSource], rows: Mapping[str, Row]) -> Table:
     cache = arguments.runs / "scan" / "results" / table.replace(" ", "_").replace("%", "percent").replace(",", "")
     measured: dict[str, dict[str, Scored]] = {}
+    ablation = len(sources) if table == "logs" else arguments.ablation if table in _ABLATED else 0
     with tqdm(sources, desc=table, unit="drive") as bar:
-        for source in bar:
+        for index, source in enumerate(bar):
             bar.set_postfix_str(source.name)
+            asked = {
+                name: row
+                for name, row in rows.items()
+                if (index < ablation or not row.ablation) and not (table == "logs" and row.needs_truth)
+            }
             measured[source.name] = dict(
-                score_drive(source, dict(rows), arguments.weights, cache, known_only=arguments.known)
+                score_drive(source, asked, arguments.weights, cache, known_only=arguments.known)
             )
     return measured
 
@@ -238,16 +255,30 @@ def _table_numbers(table: Table) -> dict[str, Numbers]:
 
 
 def _paired(table: Table) -> dict[str, Any]:
-    """By row: how much larger its ATE is than ours on the same drives, in a table of two drives or more."""
-    by_row: dict[str, list[tuple[float, float]]] = {}
+    """By row: how much larger its numbers are than those of our row on the same drives, in a table of two or more."""
+    pairs: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for rows in table.values():
-        ours = rows["ours"].errors if "ours" in rows else {}
         for row, scored in rows.items():
-            if row != "ours" and _PAIRED in ours and _PAIRED in scored.errors:
-                by_row.setdefault(row, []).append((float(scored.errors[_PAIRED][0]), float(ours[_PAIRED][0])))
+            other = _paired_with(row)
+            known = rows[other].errors if other in rows and other != row else {}
+            for key in _PAIRED:
+                if key in known and key in scored.errors:
+                    pair = float(scored.errors[key][0]), float(known[key][0])
+                    pairs.setdefault(row, {}).setdefault(key, []).append(pair)
     return {
-        row: {_PAIRED: compare(*np.array(pairs).T).as_json()} for row, pairs in by_row.items() if len(pairs) > 1
-    }  # fmt: skip
+        row: {
+            "with": _paired_with(row),
+            **{key: compare(*np.array(found).T).as_json() for key, found in keys.items() if len(found) > 1},
+        }
+        for row, keys in pairs.items()
+    }
+
+
+def _paired_with(row: str) -> str:
+    """Our row that another one is compared with."""
+    if row.endswith("percent_wrong"):
+        return "_".join(("ours", *row.split("_")[-3:]))
+    return "ours_without_wheels" if row == "constant_deviations_without_wheels" else "ours"
 
 
 def _failures(tables: Mapping[str, Table]) -> list[str]:

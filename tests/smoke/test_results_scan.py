@@ -9,14 +9,17 @@ from pathlib import Path
 import pytest
 
 from training import results_scan
+from training.data.scans import CONDITIONS
 from training.scoring import lidar_rows
 from training.scoring.lidar_rows import ROWS
 
 
 @pytest.mark.timeout(600)
 def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results_scan, "CONDITIONS", dict(list(CONDITIONS.items())[:2]))
     arguments = results_scan.Arguments(
         buildings=2,
+        ablation=2,
         length_m=4.0,
         mazes=2,
         frames=40,
@@ -30,14 +33,17 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert str(tmp_path) not in text
 
     there = {name for name, row in ROWS.items() if not row.missing()}
-    assert set(result["tables"]) == {"buildings", "aliased", "maze2d"}
+    assert set(result["tables"]) == {"buildings", "aliased", "slip", "maze2d"}
     assert set(result["tables"]["buildings"]) == there
-    assert set(result["tables"]["maze2d"]) == {name for name in there if not ROWS[name].needs_wheels}
+    assert set(result["tables"]["slip"]) == {"wheels", "ours"}
+    without_wheels = {name for name in there if not ROWS[name].needs_wheels and not ROWS[name].ablation}
+    assert set(result["tables"]["maze2d"]) == without_wheels
     ate = result["tables"]["buildings"]["ours"]["ate_m"]
     assert 0.0 < ate["mean"] < 0.3
     assert ate["drives"] == 2
     assert ate["ci95"][0] <= ate["mean"] <= ate["ci95"][1]
     assert result["paired"]["buildings"]["wheels"]["ate_m"]["relative_percent"]["mean"] > 0.0
+    assert result["paired"]["aliased"]["gtsam_lm_30_percent_wrong"]["with"] == "ours_30_percent_wrong"
     assert result["logs"] == {}
     assert result["failed"] == []
     assert [line for line in result["skipped"] if line.startswith("logs: no folder")]

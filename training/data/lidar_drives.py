@@ -40,6 +40,14 @@ class Relations:
     relative_xyyaw: np.ndarray
 
 
+_START_NS = 1_000_000_000  # of simulated stamps: 0 means unknown in ROS
+
+
+def simulated_stamps_ns(stamps_s: np.ndarray) -> np.ndarray:
+    """Stamps of a simulated drive from its times (s), both ``(n,)``."""
+    return _START_NS + np.rint(stamps_s * 1e9).astype(np.int64)
+
+
 Reference = TruePoses | ReferencePoses | Relations
 
 

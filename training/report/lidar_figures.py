@@ -16,39 +16,41 @@ from training.scoring.lidar_scores import Scored
 
 Drives = Mapping[str, Mapping[str, Scored]]
 
-_COLUMNS = 2
+_MANY = 4  # smaller pictures of more drives
 _DRAWN = {"buildings": 4, "aliased": 2}
+_COLOURS = "Key scans at corrected poses (grey), corrected path (blue), wheels where they stay in the picture (red)"
 
 
-def draw_buildings(folder: Path, tables: Mapping[str, Drives]) -> dict[str, str]:
-    """Draw the first buildings of each table into ``folder``; returns the files' names with their captions."""
-    images: dict[str, str] = {}
+def draw(folder: Path, logs: Drives, tables: Mapping[str, Drives]) -> dict[str, str]:
+    """Draw logs and the first buildings of each table into ``folder``; returns the files' names with their captions.
+
+    A log with relations has a picture of its own; all others share one.
+    """
+    with_relations = {name: rows for name, rows in _drawable(logs).items() if "translation_m" in rows["ours"].errors}
+    pictures = {f"log_{name}": ({name: rows}, name) for name, rows in with_relations.items()}
+    others = {name: rows for name, rows in _drawable(logs).items() if name not in with_relations}
+    pictures["logs"] = others, "the logs with a mapper's poses"
     for table, count in _DRAWN.items():
-        drives = {
-            name: rows for name, rows in tables.get(table, {}).items() if "ours" in rows and not rows["ours"].failed
-        }
+        first = list(_drawable(tables.get(table, {})).items())[:count]
+        pictures[table] = dict(first), f"the first drives of the table `{table}`, truth in black"
+    images: dict[str, str] = {}
+    for name, (drives, what) in pictures.items():
         if drives:
-            name = f"results_scan_{table}.png"
-            _draw(folder / name, dict(list(drives.items())[:count]))
-            images[name] = (
-                f"The first of the table `{table}`: walls are all key scans at corrected poses (grey), the corrected "
-                "path is blue, the truth black, the wheels red where they stay in the picture."
-            )
+            _draw(folder / f"results_scan_{name}.png", drives)
+            images[f"results_scan_{name}.png"] = f"{_COLOURS}: {what}."
     return images
 
 
-def draw_logs(folder: Path, logs: Drives) -> None:
-    """Draw every log into ``folder`` as ``NAME.png``, with wheels and without."""
-    for name, rows in logs.items():
-        for row in ("ours", "ours_without_wheels"):
-            if row in rows and not rows[row].failed:
-                _draw(folder / f"{name}_{row}.png", {f"{name}, {row}": {**rows, "ours": rows[row]}})
+def _drawable(drives: Drives) -> Drives:
+    return {name: rows for name, rows in drives.items() if "ours" in rows and not rows["ours"].failed}
 
 
 def _draw(path: Path, drives: Drives) -> None:
-    columns = min(_COLUMNS, len(drives))
+    many = len(drives) > _MANY
+    columns = min(3 if many else 2, len(drives))
     lines = -(-len(drives) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(7.0 * columns, 6.0 * lines), squeeze=False)
+    width, height = (4.6, 4.0) if many else (7.0, 6.0)
+    figure, axes = plt.subplots(lines, columns, figsize=(width * columns, height * lines), squeeze=False)
     for axis in axes.flat[len(drives) :]:
         axis.set_visible(False)
     for axis, (name, rows) in zip(axes.flat, drives.items(), strict=False):

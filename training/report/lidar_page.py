@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from training.scoring.lidar_bars import NETWORKS_POSITION_M
+from training.scoring.lidar_rows import ROWS
 
 _TITLES = {
     "wheels": "wheels",
@@ -14,6 +15,10 @@ _TITLES = {
     "kiss_icp": "KISS-ICP, z = 0",
     "icp_slam": "MRPT `icp-slam`",
     "rbpf_slam": "MRPT `rbpf-slam`",
+    "constant_deviations": "ours, deviations not learned",
+    "constant_deviations_without_wheels": "ours, without wheels, deviations not learned",
+    "without_agreement": "ours, loops need no neighbours that agree",
+    "without_kernel": "ours, without the robust kernel",
     "cartographer_published": "Cartographer, as published (Hess et al. 2016), not run here",
 }
 
@@ -22,7 +27,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
     """The page's text; ``images`` are the names of files in ``images/`` with their captions."""
     settings, logs = result["settings"], result["logs"]
     with_relations = {name: rows for name, rows in logs.items() if "translation_m" in rows.get("ours", {})}
-    with_mapper = {name: rows for name, rows in logs.items() if name not in with_relations}
+    with_mapper = {name: _of_rows(rows, ablation=False) for name, rows in logs.items() if name not in with_relations}
     parts = [
         "<!-- Made by `python -m training.results --world scan`; changes belong into report/lidar_page.py. -->",
         "# Results of the lidar",
@@ -40,7 +45,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
             "30 s: there loops show.",
         ]
         for name, rows in with_relations.items():
-            parts += [f"### {name}", _table(rows, _RELATION_COLUMNS)]
+            parts += [f"### {name}", _table(_of_rows(rows, ablation=False), _RELATION_COLUMNS)]
     if with_mapper:
         parts += [
             "## Logs with a mapper's poses",
@@ -50,14 +55,15 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
             "As published online:",
             _across(with_mapper, "online_ate_m"),
         ]
-    for name, title in (("buildings", "Simulated buildings"), ("aliased", "Buildings whose rooms repeat")):
+    for name, title in _BUILDING_TITLES.items():
         parts += [
             f"## {title}",
             f"Up to {settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} "
             "m each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have some of them.",
-            _table(result["tables"][name], _BUILDING_COLUMNS),
-            _against_ours(result["paired"][name]),
+            _table(_of_rows(result["tables"][name], ablation=False), _BUILDING_COLUMNS),
+            _against_ours(_of_rows(result["paired"][name], ablation=False)),
         ]
+    parts += _ablation(result)
     parts += [
         "## Mazes, scanners of many qualities",
         f"Up to {settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE "
@@ -73,6 +79,56 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         if lines:
             parts += [f"## {title}", "\n".join(f"- {line}" for line in lines)]
     return "\n\n".join(parts) + "\n"
+
+
+def _ablation(result: Mapping[str, Any]) -> list[str]:
+    parts = [
+        "## Ablation",
+        f"The first {result['settings']['ablation']} drives of each table. The only part that learned is the network "
+        "of a step's deviations. No pose depends on it, the published covariance does. Differences are to the row that "
+        "is named, on the same drives, with 95 % bootstrap intervals over the drives.",
+    ]
+    for name, title in _BUILDING_TITLES.items():
+        rows = {row: numbers for row, numbers in _of_rows(result["tables"][name], True).items() if row not in _FED}
+        if rows:
+            parts += [
+                f"### {title}",
+                _table(rows, _BUILDING_COLUMNS),
+                _differences(_of_rows(result["paired"][name], True)),
+            ]
+    logs = {
+        log: {row: numbers for row, numbers in rows.items() if row == "ours" or (row in ROWS and ROWS[row].ablation)}
+        for log, rows in result["logs"].items()
+    }
+    unfed = {log: {row: numbers for row, numbers in rows.items() if row not in _FED} for log, rows in logs.items()}
+    if any(len(rows) > 1 for rows in unfed.values()):
+        parts += ["### Logs", "ATE, or mean translational error of relations, m.", _across(unfed, *_ERRORS)]
+    if slip := result["tables"]["slip"]:
+        parts += [
+            "### Wheels that slip",
+            "The first buildings again, but the wheels slip 300 times a km, each time for 0.3 to 1.5 s by up to 60 %.",
+            _table(slip, _BUILDING_COLUMNS),
+        ]
+    tables = {**result["logs"], **{name: result["tables"][name] for name in _BUILDING_TITLES}}
+    fed = {name: rows for name, rows in tables.items() if any(row in _FED for row in rows)}
+    if fed:
+        parts += [
+            "### Wrong loops fed in",
+            "Errors (m: ATE; of a log with relations the mean of these) where so many of all loops are wrong, all at "
+            "once, from odometry. A wrong loop is a right one that took another place; five in a row agree with each "
+            "other. Each number is the mean over three draws.",
+            _across({name: {row: rows[row] for row in _FED if row in rows} for name, rows in fed.items()}, *_ERRORS),
+        ]
+    return parts
+
+
+_BUILDING_TITLES = {"buildings": "Simulated buildings", "aliased": "Buildings whose rooms repeat"}
+_FED = [row for row in ROWS if row.endswith("percent_wrong")]
+_ERRORS = ("ate_m", "translation_m")
+
+
+def _of_rows(rows: Mapping[str, Any], ablation: bool) -> dict[str, Any]:
+    return {name: numbers for name, numbers in rows.items() if (name in ROWS and ROWS[name].ablation) == ablation}
 
 
 _RELATION_COLUMNS = {
@@ -98,7 +154,7 @@ _BUILDING_COLUMNS = {
 
 def _table(rows: Mapping[str, Any], columns: Mapping[str, str]) -> str:
     shown = {key: title for key, title in columns.items() if any(key in numbers for numbers in rows.values())}
-    body = [[_TITLES.get(row, row), *(_number(numbers.get(key)) for key in shown)] for row, numbers in rows.items()]
+    body = [[_title(row), *(_number(numbers.get(key)) for key in shown)] for row, numbers in rows.items()]
     counts = [max((number.get("drives", 0) for number in numbers.values()), default=0) for numbers in rows.values()]
     if not any(counts):  # one log
         return _markdown(["", *shown.values()], body)
@@ -106,21 +162,60 @@ def _table(rows: Mapping[str, Any], columns: Mapping[str, str]) -> str:
     return _markdown(["", "drives", *shown.values()], counted)
 
 
-def _across(logs: Mapping[str, Any], key: str) -> str:
-    """One metric: a line a row, a column a log."""
-    rows = list(dict.fromkeys(row for numbers in logs.values() for row in numbers if key in numbers[row]))
-    body = [[_TITLES.get(row, row), *(_number(logs[log].get(row, {}).get(key)) for log in logs)] for row in rows]
+def _across(logs: Mapping[str, Any], *keys: str) -> str:
+    """One metric, the first of these that a row has: a line a row, a column a log."""
+
+    def found(numbers: Mapping[str, Any]) -> str:
+        return next((_number(numbers[key]) for key in keys if key in numbers), "")
+
+    rows = list(dict.fromkeys(row for numbers in logs.values() for row in numbers if found(numbers[row])))
+    body = [[_title(row), *(found(logs[log].get(row, {})) for log in logs)] for row in rows]
     return _markdown(["", *logs], body)
+
+
+def _title(row: str) -> str:
+    """A row's name in words; with wrong loops that of its solver with their share."""
+    if row not in _FED:
+        return _TITLES.get(row, row)
+    *solver, percent, _, _ = row.split("_")
+    return f"{_SOLVERS['_'.join(solver)]}, {percent} % wrong"
+
+
+_SOLVERS = {
+    "ours": "**ours**",
+    "without_kernel": "ours, without the robust kernel",
+    "gtsam_lm": "GTSAM, LM with Cauchy",
+    "gtsam_gnc": "GTSAM, GNC",
+}
 
 
 def _against_ours(paired: Mapping[str, Any]) -> str:
     """How much larger each row's ATE is than ours, with its interval, in one line each."""
-    body = []
-    for row, numbers in paired.items():
-        relative = numbers["ate_m"]["relative_percent"]
-        low, high = relative["ci95"]
-        body.append([_TITLES.get(row, row), f"{relative['mean']:+.1f} [{low:+.1f}, {high:+.1f}]"])
+    body = [
+        [_title(row), _signed(numbers["ate_m"]["relative_percent"], ".1f")]
+        for row, numbers in paired.items()
+        if "ate_m" in numbers
+    ]
     return _markdown(["ATE against ours, same drives", "%"], body)
+
+
+def _differences(paired: Mapping[str, Any]) -> str:
+    keys = {"ate_m": "ATE, m", "within_three_deviations": "truth within 3 deviations"}
+    body = [
+        [
+            _title(row),
+            _title(numbers["with"]),
+            *(_signed(numbers[key]["difference"], ".4f") if key in numbers else "" for key in keys),
+        ]
+        for row, numbers in paired.items()
+        if row not in _FED
+    ]
+    return _markdown(["difference of", "to", *keys.values()], body)
+
+
+def _signed(numbers: Mapping[str, Any], digits: str) -> str:
+    low, high = numbers["ci95"]
+    return f"{numbers['mean']:+{digits}} [{low:+{digits}}, {high:+{digits}}]"
 
 
 def _scanners(result: Mapping[str, Any]) -> str:

@@ -14,20 +14,24 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-import ngo_estimator
 from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.odometry import lidar_odometry
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
+from ngo_estimator.online import scan_trajectory
 from ngo_estimator.online.scan_graph import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory
-from ngo_estimator.optimizer.scan_pose_graph import RelativePoses
 from ngo_recordings.scan_stream import WheelPose
 from training.baselines import lidar_peers, mrpt_slam
 from training.baselines.lidar_peers import GraphPeerConfig, KissConfig
 from training.data.lidar_drives import LidarDrive
+from training.scoring import wrong_loops
+from training.scoring.wrong_loops import Solver, WrongLoopsConfig, solve_ours, with_wrong_loops
 
 _MOST_WALL_POINTS = 60_000  # of a picture
+_NO_KERNEL = 1e6  # deviations: so wide that every residual counts in full
+_PIPELINE = (lidar_odometry, scan_trajectory)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +58,14 @@ class Estimate:
 class Pipeline:
     """Our estimators with the shipped settings, and what a row changes of them.
 
-    ``wheels`` are listened to where the robot has any.
+    ``wheels`` are listened to where the robot has any. Without ``learned_deviations`` registration's own deviations of
+    a step are published.
     ``odometry`` and ``graph`` are changes of the front end and of the back end, by the setting's name with dots:
     ``{"loops.least_agreeing": 0}``.
     """
 
     wheels: bool = True
+    learned_deviations: bool = True
     odometry: Mapping[str, Any] = field(default_factory=dict)
     graph: Mapping[str, Any] = field(default_factory=dict)
 
@@ -107,11 +113,11 @@ class DriveRuns:
         pipeline = dataclasses.replace(pipeline, wheels=pipeline.wheels and bool(self.drive.wheels))
         key = identity_of(pipeline)
         if key not in self._runs:
-            self._runs[key] = self._optimized(self._front(pipeline), pipeline.graph)
+            self._runs[key] = self._optimized(self._front(pipeline), pipeline)
         return self._runs[key]
 
     def _front(self, pipeline: Pipeline) -> _Front:
-        key = identity_of(dataclasses.replace(pipeline, graph={}))
+        key = identity_of(dataclasses.replace(pipeline, learned_deviations=True, graph={}))
         if key not in self._fronts:
             settings = changed(read_lidar_file(self._weights, "odometry", LidarOdometryConfig), pipeline.odometry)
             deviation = load_step_deviation(self._weights) if settings.learned_deviation else None
@@ -130,12 +136,12 @@ class DriveRuns:
             self._fronts[key] = _Front(steps, odometry.lag_s, sum(step.unsure for step in steps), took_s)
         return self._fronts[key]
 
-    def _optimized(self, front: _Front, changes: Mapping[str, Any]) -> _Run:
-        settings = changed(read_lidar_file(self._weights, "graph", ScanGraphConfig), changes)
+    def _optimized(self, front: _Front, pipeline: Pipeline) -> _Run:
+        settings = changed(read_lidar_file(self._weights, "graph", ScanGraphConfig), pipeline.graph)
         online = ScanTrajectory(settings)
         covariances = [np.zeros((3, 3))]
         began = time.process_time()
-        for step in front.steps:
+        for step in front.steps if pipeline.learned_deviations else map(_unscaled, front.steps):
             covariances.append(online.update(step).covariance)
         online.finish()
         back_s = time.process_time() - began
@@ -143,6 +149,13 @@ class DriveRuns:
         if trajectory is None or len(trajectory.stamps_ns) != len(covariances):
             raise ValueError(f"{self.drive.name}: {len(front.steps)} steps give no trajectory; expected a single one")
         return _Run(online, trajectory, np.stack(covariances), front, back_s)
+
+
+def _unscaled(step: LidarStep) -> LidarStep:
+    """The step without the factors of the network, which no pose depends on."""
+    return (
+        step if step.key is None else dataclasses.replace(step, key=dataclasses.replace(step.key, factors=np.ones(3)))
+    )
 
 
 def _take(odometry: LidarOdometry, steps: list[LidarStep], at_end: bool) -> None:
@@ -175,9 +188,6 @@ def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
     )
 
 
-Solver = Callable[[RelativePoses, RelativePoses, np.ndarray, GraphPeerConfig], np.ndarray]
-
-
 def graph_peer(runs: DriveRuns, solve: Solver, config: GraphPeerConfig) -> Estimate:
     """Another solver on the steps and the loops of our own run, from its odometry."""
     run = runs.run(Pipeline())
@@ -189,6 +199,20 @@ def graph_peer(runs: DriveRuns, solve: Solver, config: GraphPeerConfig) -> Estim
     poses = graph.frame_poses(nodes=nodes)
     facts = {"solver_s": seconds, "loops": len(loops.nodes)}
     return Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw, facts=facts)
+
+
+def fed_with_wrong_loops(
+    runs: DriveRuns, solve: Solver, config: GraphPeerConfig, wrong: WrongLoopsConfig
+) -> list[Estimate]:
+    """A solver on the steps and the loops of our own run and wrong loops, one estimate for each seed of these."""
+    run = runs.run(Pipeline())
+    steps, loops = run.online.graph.measurements()
+    start, estimates = _chained(steps.relative), []
+    for seed in wrong.seeds:
+        fed = with_wrong_loops(loops, len(start), wrong.percent, np.random.default_rng(seed))
+        poses = run.online.graph.frame_poses(nodes=solve(steps, fed, start, config))
+        estimates.append(Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw))
+    return estimates
 
 
 def _chained(relative: np.ndarray) -> np.ndarray:
@@ -227,25 +251,40 @@ def mrpt(runs: DriveRuns, program: mrpt_slam.Program) -> Estimate:
 class Row:
     """A row: how it estimates, by which settings, and what it needs.
 
-    ``code`` are the packages that its numbers follow from. ``missing`` says in a few words what it lacks on this
-    machine, or nothing.
+    ``code`` are the modules that its numbers follow from, beside those that they import. ``missing`` says in a few
+    words what it lacks on this machine, or nothing. Of several estimates, one a seed, the mean error counts. Rows of
+    the ``ablation`` are measured on some drives of a table alone; one that ``needs_truth`` changes covariances alone.
     """
 
-    estimate: Callable[[DriveRuns], Estimate]
+    estimate: Callable[[DriveRuns], Estimate | list[Estimate]]
     settings: Any
     needs_wheels: bool = False
-    code: tuple[ModuleType, ...] = (ngo_estimator,)
+    code: tuple[ModuleType, ...] = _PIPELINE
     missing: Callable[[], str] = lambda: ""
+    ablation: bool = False
+    needs_truth: bool = False
 
 
-def _ours(**changes: Any) -> Row:
+def _ours(ablation: bool = False, **changes: Any) -> Row:
     pipeline = Pipeline(**changes)
-    return Row(partial(ours, pipeline=pipeline), pipeline)
+    return Row(
+        partial(ours, pipeline=pipeline), pipeline, ablation=ablation, needs_truth=not pipeline.learned_deviations
+    )
 
 
 def _gtsam(solve: Solver) -> Row:
     config = GraphPeerConfig()
-    return Row(partial(graph_peer, solve=solve, config=config), config, code=(ngo_estimator, lidar_peers))
+    return Row(partial(graph_peer, solve=solve, config=config), config, code=(*_PIPELINE, lidar_peers))
+
+
+def _fed(solve: Solver, percent: float, **changes: Any) -> Row:
+    config, wrong = GraphPeerConfig(**changes), WrongLoopsConfig(percent)
+    return Row(
+        partial(fed_with_wrong_loops, solve=solve, config=config, wrong=wrong),
+        {"solver": dataclasses.asdict(config), "wrong": dataclasses.asdict(wrong)},
+        code=(*_PIPELINE, lidar_peers, wrong_loops),
+        ablation=True,
+    )
 
 
 def _mrpt(program: mrpt_slam.Program) -> Row:
@@ -268,11 +307,22 @@ ROWS: dict[str, Row] = {
     "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
     "icp_slam": _mrpt("icp-slam"),
     "rbpf_slam": _mrpt("rbpf-slam"),
-    # The ablation.
-    "without_agreement": _ours(graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
-    "without_kernel": _ours(graph={"kernel": 1e6}),
-    "constant_deviations": _ours(odometry={"learned_deviation": False}),
+    "constant_deviations": _ours(True, learned_deviations=False),
+    "constant_deviations_without_wheels": _ours(True, learned_deviations=False, wheels=False),
+    "without_agreement": _ours(True, graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
+    "without_kernel": _ours(True, graph={"kernel": _NO_KERNEL}),
+    **{
+        f"{name}_{percent}_percent_wrong": _fed(solve, percent, **changes)
+        for percent in (10, 30, 60)
+        for name, solve, changes in (
+            ("ours", solve_ours, {}),
+            ("without_kernel", solve_ours, {"cauchy": _NO_KERNEL}),
+            ("gtsam_lm", lidar_peers.solve_lm, {}),
+            ("gtsam_gnc", lidar_peers.solve_gnc, {}),
+        )
+    },
 }
+"""By name. Those that end with ``percent_wrong`` get wrong loops, so many of all."""
 
 
 def identity_of(settings: Any) -> str:

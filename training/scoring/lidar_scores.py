@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +11,7 @@ import numpy as np
 
 from ngo_common.files import written_whole
 from training.baselines.mrpt_slam import MrptError
+from training.common.source_code import code_digest
 from training.data import lidar_drives
 from training.data.lidar_drives import LidarDrive, TruePoses
 from training.scoring import lidar_errors as errors_module
@@ -26,7 +27,7 @@ _MOST_DRAWN = 4000  # poses of a path in a picture
 class DriveSource:
     """A drive that is made when it is needed.
 
-    ``identity`` says in words all that it follows from beside ``code``, the modules and packages that make it.
+    ``identity`` says in words all that it follows from beside ``code``, the modules that make it.
     """
 
     name: str
@@ -65,7 +66,7 @@ def score_drive(
         if row.needs_wheels and not source.has_wheels:
             continue
         path = cache / f"{source.name}.{name}.npz"
-        code = _code((*_ALWAYS, *source.code, *row.code))
+        code = code_digest((*_ALWAYS, *source.code, *row.code))
         identity = json.dumps([name, identity_of(row.settings), source.identity, code, _weights(row, weights)])
         known = _read(path, identity)
         if known is None and known_only:
@@ -82,10 +83,13 @@ def _scored(runs: DriveRuns, row: Row) -> Scored:
     if row.needs_wheels and not drive.wheels:
         return Scored(failed=f"{drive.name} has no wheel odometry")
     try:
-        estimate = row.estimate(runs)
-        errors = _errors(drive, estimate)
+        found = row.estimate(runs)
+        estimates = found if isinstance(found, list) else [found]
+        each = [_errors(drive, estimate) for estimate in estimates]
     except (ValueError, MrptError) as error:
         return Scored(failed=str(error))
+    errors = {key: np.mean([errors[key] for errors in each], axis=0) for key in each[0]}
+    estimate = estimates[0]
     truth = drive.reference.poses_xyyaw if isinstance(drive.reference, TruePoses) else np.zeros((0, 3))
     walls = np.zeros((0, 2)) if estimate.walls is None else estimate.walls
     return Scored(errors, _thinned(estimate.poses), walls, _thinned(truth))
@@ -112,24 +116,9 @@ def _thinned(poses: np.ndarray) -> np.ndarray:
 
 def _weights(row: Row, weights: Path) -> str:
     """A hash of the shipped settings, for a row of our own estimators."""
-    ours = [module.__name__ for module in row.code if module.__name__ == "ngo_estimator"]
-    return _digest(sorted(weights.iterdir())) if ours else ""
-
-
-def _code(modules: Sequence[ModuleType]) -> str:
-    """A hash of the files of modules and of whole packages that numbers follow from."""
-    files: list[Path] = []
-    for module in modules:
-        folders = list(getattr(module, "__path__", ()))
-        if folders:
-            files += [path for folder in folders for path in sorted(Path(folder).rglob("*.py"))]
-        else:
-            files.append(Path(str(module.__file__)))
-    return _digest(files)
-
-
-def _digest(files: Sequence[Path]) -> str:
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files if path.is_file())).hexdigest()
+    if not any(module.__name__.startswith("ngo_estimator.") for module in row.code):
+        return ""
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(weights.iterdir()))).hexdigest()
 
 
 def _read(cache: Path, identity: str) -> Scored | None:

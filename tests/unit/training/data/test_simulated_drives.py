@@ -2,9 +2,10 @@ import numpy as np
 
 from ngo_estimator.data.images import scan_image
 from ngo_sim.episodes import record_episode
+from training.data.building_drives import building_drive
 from training.data.lidar_drives import TruePoses
 from training.data.scans import ROWS, SCAN_IMAGE, ScannedMaze
-from training.data.simulated_drives import building_drive, maze_drive, scanned_maze_drive
+from training.data.simulated_drives import maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
 
 

@@ -1,0 +1,60 @@
+"""Wrong loops fed into a graph, as places that look alike give them, and who still finds the trajectory."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
+from training.baselines.lidar_peers import GraphPeerConfig
+
+_GROUP = 5
+_MOST_ITERATIONS = 100  # GTSAM's own limit
+
+Solver = Callable[[RelativePoses, RelativePoses, np.ndarray, GraphPeerConfig], np.ndarray]
+
+
+@dataclass(frozen=True)
+class WrongLoopsConfig:
+    """Wrong loops are ``percent`` of all; they are drawn once for each of the ``seeds``."""
+
+    percent: float
+    seeds: Sequence[int] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.percent < 100.0 or not self.seeds:
+            raise ValueError(
+                f"percent, seeds are {self.percent}, {self.seeds}; expected between 0 and 100, and a seed at least"
+            )
+
+
+def with_wrong_loops(loops: RelativePoses, nodes: int, percent: float, rng: np.random.Generator) -> RelativePoses:
+    """The loops of a graph of so many nodes, and behind them wrong ones, ``percent`` of all.
+
+    A wrong loop is a right one that took another node for its first. Five loops in a row are wrong in the same way, so
+    that they agree with each other: the robot took a place for another one that looks alike.
+    """
+    right = len(loops.nodes)
+    wrong = round(right * percent / (100.0 - percent))
+    if wrong == 0 or nodes < 3:
+        return loops
+    starts = rng.integers(right, size=-(-wrong // _GROUP))
+    rows = ((starts[:, None] + np.arange(_GROUP)) % right).ravel()[:wrong]
+    pairs = loops.nodes[rows].copy()
+    pairs[:, 0] = (pairs[:, 0] + np.repeat(rng.integers(1, nodes, size=len(starts)), _GROUP)[:wrong]) % nodes
+    kept = np.abs(pairs[:, 0] - pairs[:, 1]) > 1  # others would be steps, or join a node with itself
+    return RelativePoses(
+        np.concatenate((loops.nodes, pairs[kept])),
+        np.concatenate((loops.relative, loops.relative[rows][kept])),
+        np.concatenate((loops.root, loops.root[rows][kept])),
+    )
+
+
+def solve_ours(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
+    """Poses ``(nodes, 3)`` by our own graph with a kernel of ``config.cauchy`` deviations, from ``start``."""
+    graph = ScanPoseGraph(steps, loops, np.ones(len(loops.nodes)), start, config.cauchy)
+    for _ in range(_MOST_ITERATIONS):
+        graph.iterate()
+        if graph.converged:
+            break
+    return graph.poses
