@@ -2,7 +2,8 @@
 
 import ast
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -11,8 +12,12 @@ _READS = ("ngo_estimator.checkpoint",)
 """Modules that import every network to read the one that is asked for: what reads one imports its network, too."""
 
 
-def code_digest(modules: Sequence[ModuleType]) -> str:
-    """A hash of the modules and of all that they import from their own top-level package, directly or not."""
+@cache
+def code_digest(modules: tuple[ModuleType, ...]) -> str:
+    """A hash of the modules and of all that they import from their own top-level package, directly or not.
+
+    The files are read once in a process, as modules are.
+    """
     files = sorted({path for module in modules for path in _files(module.__name__)})
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 

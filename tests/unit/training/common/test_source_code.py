@@ -27,8 +27,10 @@ def test_the_digest_follows_imports_within_the_package(tmp_path: Path, monkeypat
     try:
         before = code_digest((top,))
         (package / "other.py").write_text("VALUE = 2")
+        code_digest.cache_clear()
         assert code_digest((top,)) == before
         (package / "deep" / "used.py").write_text("VALUE = 2")
+        code_digest.cache_clear()
         assert code_digest((top,)) != before
     finally:
         for name in [name for name in sys.modules if name.startswith("house_of_tests")]:
