@@ -119,6 +119,13 @@ def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mappe
         probe.spin_until(lambda: trajectories and len(trajectories[-1].stamps_ns) == both, "both drives in one map")
         assert len(transforms) == len(node.poses) < len(later)
         assert node.wait_for_value("frames", bool) == str(both)
+        # Another odometry does not wipe the map: the robot is looked for in it again.
+        third, known = [_later(message, 2) for message in mapped.steps], len(node.poses)
+        node.publish(*third)
+        assert _planar(node.wait_for_stamp(_stamp_ns(third[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        process.wait_for_log("looks for the robot in the map, which stays")
+        whole = both + len(node.poses) - known
+        assert node.wait_for_value("frames", lambda value: value == str(whole))
         # The same while the node runs; and a reset begins a new map.
         load = LoadState.Request(path="maze", mode=LoadState.Request.RELOCALISE)
         response = probe.call(LoadState, "ngo_node/load_state", load)
@@ -173,11 +180,11 @@ def test_a_localization_without_a_map_is_one_line_and_exit_code_2() -> None:
         assert len(process.lines) == 1 and "parameter 'state' is ''" in process.lines[0], process.log
 
 
-def _later(message: RelativePose) -> RelativePose:
-    """The same message an hour later."""
+def _later(message: RelativePose, hours: int = 1) -> RelativePose:
+    """The same message so many hours later."""
     moved = deepcopy(message)
     for stamp in (moved.header.stamp, moved.from_stamp, moved.origin_stamp):
-        stamp.sec += 3600
+        stamp.sec += hours * 3600
     return moved
 
 

@@ -62,7 +62,9 @@ class SimulatorNode(Node):
         self._clock_out = self.outputs.create(Clock, "/clock") if self.config.publish_clock else None
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         try:
-            self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
+            config = self.config
+            maze_seed = None if config.maze_seed < 0 else config.maze_seed
+            self.simulation = Simulation(self.make_world(), config.seed, config.driver, maze_seed)
         except ValueError as error:  # an error that only the files or the world can show
             raise BadParameter(str(error)) from None
         self._pacer = Pacer()
