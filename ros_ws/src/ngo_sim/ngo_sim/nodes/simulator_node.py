@@ -11,7 +11,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
-from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -124,7 +123,7 @@ class SimulatorNode(Node):
                 self._name_watch.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
-                    self.image_publisher.wait_for_all_acked(Duration(seconds=5))
+                    self.outputs.wait_for_all_acked()
                     self.get_logger().info(f"published all {self._published} frames")
                     return
                 idle_s = _IDLE_S
