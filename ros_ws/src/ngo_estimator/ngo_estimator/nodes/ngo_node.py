@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 NAME = "ngo_node"
 _DEPTH = 100
 _SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
-_PENDING_S = 0.3
+_PENDING_S = 1.0
 _SEARCH_LINE_S = 10.0
 _SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
 
