@@ -248,13 +248,15 @@ class ScanOdometry:
         is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
         evidence = step_evidence(since_key, found, prediction, searched, unsure)
         factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
+        turned = turned_covariance(-self._pose[2], both)
+        shared = self._prior.accept(scan.stamp_ns, pose, covariance, step, turned, is_key, unsure)
         estimate = ScanEstimate(
             scan.stamp_ns,
             step,
-            turned_covariance(-self._pose[2], both) * np.outer(factors, factors),
+            turned * np.outer(factors, factors),
             pose,
             since_key,
-            turned_covariance(-self._key[2], covariance),
+            turned_covariance(-self._key[2], covariance + shared),
             is_key,
             found.share,
             searched,
@@ -262,7 +264,6 @@ class ScanOdometry:
             evidence,
             factors,
         )
-        self._prior.accept(scan.stamp_ns, pose, step, turned_covariance(-self._pose[2], both), is_key, unsure)
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
