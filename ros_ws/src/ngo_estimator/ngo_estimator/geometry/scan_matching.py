@@ -16,6 +16,10 @@ from ngo_estimator.geometry.line_map import CELL_M, LineMap
 from ngo_estimator.geometry.planar_motion import Array, wrap
 
 
+_NOISE_DEVIATIONS = 2.0
+"""Of the scatter of noisy normals, which says nothing of where the scan is."""
+
+
 @dataclass(frozen=True)
 class IcpConfig:
     """How scans are registered.
@@ -93,8 +97,9 @@ def icp(
         prior: mean ``(3,)`` and information ``(3, 3)`` of the pose; without it directions that no line holds keep
             their start, at a deviation of 1 m and 1 rad.
         config: settings.
-        open_share: a direction of motion is open, and left to the prior, where the lines' mean squared slope against
-            it is below this: there the noise of normals speaks, and not the walls.
+        open_share: over 0 the direction of motion that the lines hold least counts as far as the normals of both sides
+            agree on it: their noise is independent. It is open, and left to the prior, where the mean squared slope of
+            the lines against it is below this share.
 
     Raises:
         ValueError: a shape is wrong or a number is not finite.
@@ -174,6 +179,7 @@ def _icp(
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         g0, g1, g2 = 0.0, 0.0, 0.0
+        c00, c01, c11, e00, e01, e11 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # of normals that agree, of those that do not
         squares, weights = 0.0, 0.0
         fitted, tried = 0, 0
         for i in range(len(points)):
@@ -183,9 +189,9 @@ def _icp(
             tried += 1
             arm_x, arm_y = cos * points[i, 0] - sin * points[i, 1], sin * points[i, 0] + cos * points[i, 1]
             x, y = arm_x + pose[0], arm_y + pose[1]
+            turned_x, turned_y = cos * nx - sin * ny, sin * nx + cos * ny
             best = _nearest(
-                map_points, map_normals, first, corner, rows, columns, x, y,
-                cos * nx - sin * ny, sin * nx + cos * ny, facing,
+                map_points, map_normals, first, corner, rows, columns, x, y, turned_x, turned_y, facing
             )  # fmt: skip
             if best < 0:
                 continue
@@ -205,6 +211,13 @@ def _icp(
             h11 += weight * my * my
             h12 += weight * my * lever
             h22 += weight * lever * lever
+            off_x, off_y = mx - turned_x, my - turned_y
+            c00 += weight * mx * turned_x
+            c01 += 0.5 * weight * (mx * turned_y + my * turned_x)
+            c11 += weight * my * turned_y
+            e00 += weight * off_x * off_x
+            e01 += weight * off_x * off_y
+            e11 += weight * off_y * off_y
             g0 += weight * mx * distance
             g1 += weight * my * distance
             g2 += weight * lever * distance
@@ -213,13 +226,20 @@ def _icp(
         scale = 1.0 / (variance * correlation)
         data = np.array(((h00, h01, h02), (h01, h11, h12), (h02, h12, h22))) * scale
         slope = np.array((g0, g1, g2)) * scale
-        half_gap = math.hypot(0.5 * (h00 - h11), h01)
-        if 0.5 * (h00 + h11) - half_gap < open_share * weights:
+        if open_share > 0.0 and weights > 0.0:
+            # The direction that the walls hold least: what both scans' normals say of it, and how far they disagree.
             direction = 0.5 * math.atan2(2.0 * h01, h00 - h11)
-            along = np.array((-math.sin(direction), math.cos(direction), 0.0))
-            data -= np.outer(along, along @ data)
-            data -= np.outer(data @ along, along)
-            slope -= along * (along @ slope)
+            x, y = -math.sin(direction), math.cos(direction)
+            claimed = h00 * x * x + 2.0 * h01 * x * y + h11 * y * y
+            agreed = c00 * x * x + 2.0 * c01 * x * y + c11 * y * y
+            apart = e00 * x * x + 2.0 * e01 * x * y + e11 * y * y
+            agreed -= _NOISE_DEVIATIONS * 0.5 * apart * math.sqrt(correlation / weights)
+            held = 0.0 if agreed < open_share * weights else min(agreed / claimed, 1.0)
+            if held < 1.0:
+                along = np.array((x, y, 0.0))
+                data -= (1.0 - math.sqrt(held)) * np.outer(along, along @ data)
+                data -= (1.0 - math.sqrt(held)) * np.outer(data @ along, along)
+                slope -= (1.0 - held) * along * (along @ slope)
         total = data + prior
         if step == steps:
             break
