@@ -21,7 +21,7 @@ def driven(steps: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     for k, (step, covariance) in enumerate(steps, 1):
         prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
         pose = compose(pose, step)
-        prior.accept(k * PERIOD_NS, pose, turned_covariance(pose[2], covariance), step, covariance, False, False)
+        prior.accept(k * PERIOD_NS, pose, turned_covariance(pose[2], covariance), step, covariance, False, False, False)
     return between(pose, prior.predict((len(steps) + 1) * PERIOD_NS, pose, np.zeros((3, 3)), None).mean)
 
 
@@ -41,7 +41,7 @@ def test_an_open_direction_tells_no_velocity() -> None:
             step[2] = 0.03
             covariance = np.diag((prediction.covariance[0, 0], 1e-6, 1e-8))
         pose = compose(pose, step)
-        prior.accept(k * PERIOD_NS, pose, covariance, step, covariance, k % 3 == 0, False)
+        prior.accept(k * PERIOD_NS, pose, covariance, step, covariance, False, k % 3 == 0, False)
     expected = between(pose, prior.predict(21 * PERIOD_NS, pose, np.zeros((3, 3)), None).mean)
     assert math.hypot(*expected[:2]) == pytest.approx(STEP[0], abs=0.01)
     assert expected[2] == pytest.approx(0.03, abs=2e-3)
@@ -64,7 +64,7 @@ def test_an_error_of_the_velocity_adds_up_over_key_scans(keys: int) -> None:
             covariance = np.diag((prediction.covariance[0, 0] if open_ahead else 1e-6, 1e-6, 1e-8))
             pose = np.array((prediction.mean[0] if open_ahead else truth, 0.0, 0.0))
             is_key = k % keys == 0 or k in (10, 40)
-            shared = prior.accept(k * PERIOD_NS, pose, covariance, pose - before, covariance, is_key, False)
+            shared = prior.accept(k * PERIOD_NS, pose, covariance, pose - before, covariance, False, is_key, False)
             total += (covariance + shared)[0, 0] if is_key else 0.0
         errors.append(pose[0] - truth)
         variance = total
@@ -89,7 +89,7 @@ def followed(counted: list[np.ndarray], measured: list[np.ndarray]) -> list[Pred
         wheels.add(k * PERIOD_NS, counted[k])
         predictions.append(prior.predict(k * PERIOD_NS, measured[k - 1], np.eye(3) * 1e-4, wheels))
         step = measured[k] - measured[k - 1]
-        prior.accept(k * PERIOD_NS, measured[k], SURE, step, SURE, k % 8 == 0, False)
+        prior.accept(k * PERIOD_NS, measured[k], SURE, step, SURE, False, k % 8 == 0, False)
     return predictions
 
 

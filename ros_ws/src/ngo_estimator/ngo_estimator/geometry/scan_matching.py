@@ -16,10 +16,6 @@ from ngo_estimator.geometry.line_map import CELL_M, LineMap
 from ngo_estimator.geometry.planar_motion import Array, wrap
 
 
-_NOISE_DEVIATIONS = 2.0
-"""Of the scatter of noisy normals, which says nothing of where the scan is."""
-
-
 @dataclass(frozen=True)
 class IcpConfig:
     """How scans are registered.
@@ -29,7 +25,7 @@ class IcpConfig:
     ``facing_deg``. ``fit_m`` is the distance within which a point counts as fitted. ``noise_m`` is the least deviation
     of a distance; larger residuals raise it. ``correlation`` is the number of neighbouring points that share one error:
     calibration, uneven walls and wrong pairs repeat from point to point, so that n points tell no more than
-    n / ``correlation`` independent ones.
+    n / ``correlation`` independent ones. ``normal_deviations`` of the scatter of noisy normals are no information.
     """
 
     steps: int = 16
@@ -42,6 +38,7 @@ class IcpConfig:
     fit_m: float = 0.10
     noise_m: float = 0.015
     correlation: float = 8.0
+    normal_deviations: float = 2.0
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.annealing_steps < 1:
@@ -56,10 +53,10 @@ class IcpConfig:
                 f"first_gate_m, last_gate_m are {self.first_gate_m}, {self.last_gate_m}; expected positive lengths, "
                 f"the last no larger than the first, the first at most {CELL_M}"
             )
-        if not (0.0 < self.facing_deg <= 90.0 and self.correlation >= 1.0):
+        if not (0.0 < self.facing_deg <= 90.0 and self.correlation >= 1.0 and 0.0 <= self.normal_deviations < math.inf):
             raise ValueError(
-                f"facing_deg, correlation are {self.facing_deg}, {self.correlation}; expected over 0 to 90, and at "
-                "least 1"
+                f"facing_deg, correlation, normal_deviations are {self.facing_deg}, {self.correlation}, "
+                f"{self.normal_deviations}; expected over 0 to 90, at least 1, and at least 0"
             )
         if not (0.0 < self.fit_m < math.inf and 0.0 < self.noise_m < math.inf):
             raise ValueError(f"fit_m, noise_m are {self.fit_m}, {self.noise_m}; expected positive lengths")
@@ -138,7 +135,7 @@ def icp(
         config.fit_m,
         config.noise_m,
         config.correlation,
-        open_share,
+        (config.normal_deviations, open_share),
     )
     covariance = np.linalg.inv(total).astype(np.float64)
     return Registration(pose, covariance, data, fitted / max(tried, 1), int(fitted))
@@ -165,13 +162,14 @@ def _icp(
     fit: float,
     noise: float,
     correlation: float,
-    open_share: float,
+    noisy: tuple[float, float],
 ) -> tuple[Array, Array, Array, int, int]:
     pose = start.copy()
     data = np.zeros((3, 3))
     total = prior.copy()
     fitted, tried = 0, 0
     variance = noise * noise
+    normal_deviations, open_share = noisy
     for step in range(steps + 1):
         done = min(step / annealing, 1.0)
         kernel = kernels[0] * (kernels[1] / kernels[0]) ** done
@@ -233,7 +231,7 @@ def _icp(
             claimed = h00 * x * x + 2.0 * h01 * x * y + h11 * y * y
             agreed = c00 * x * x + 2.0 * c01 * x * y + c11 * y * y
             apart = e00 * x * x + 2.0 * e01 * x * y + e11 * y * y
-            agreed -= _NOISE_DEVIATIONS * 0.5 * apart * math.sqrt(correlation / weights)
+            agreed -= normal_deviations * 0.5 * apart * math.sqrt(correlation / weights)
             held = 0.0 if agreed < open_share * weights else min(agreed / claimed, 1.0)
             if held < 1.0:
                 along = np.array((x, y, 0.0))

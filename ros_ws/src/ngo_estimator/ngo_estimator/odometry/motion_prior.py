@@ -152,6 +152,7 @@ class MotionPrior:
         covariance: Array,
         step: Array,
         step_covariance: Array,
+        passes: bool,
         is_key: bool,
         unsure: bool,
     ) -> Array:
@@ -159,7 +160,7 @@ class MotionPrior:
 
         ``covariance`` and ``step_covariance`` ``(3, 3)`` are those of both: a direction that the walls leave open tells
         no velocity. A step that is ``unsure`` is no measured velocity: without wheels the last one is believed less and
-        less.
+        less. The next priors count from a scan that ``passes``, or ``is_key``, of which the covariances count.
 
         Returns:
             The covariance ``(3, 3)`` that the pose's lacks in a sum of independent steps, along the odometry's axes.
@@ -175,9 +176,11 @@ class MotionPrior:
                 self._motion.velocity = 0.5 * self._motion.velocity
         shared = self._motion.shared()
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
-        if is_key:
-            self._anchor, self._anchor_wheels, self._anchor_covariance = pose, self._now_wheels, np.zeros((3, 3))
+        if passes or is_key:
+            self._anchor, self._anchor_wheels = pose, self._now_wheels
+            self._anchor_covariance = np.zeros((3, 3)) if is_key else covariance
             self._doubted = False
+        if is_key:
             self._motion.begin_at_key()
         return shared
 

@@ -25,7 +25,7 @@ from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 class ScanOdometryConfig:
     """How scans become odometry.
 
-    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one; ``submap_scans`` of these are what
+    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last ones; ``submap_scans`` of these are what
     the next scan is registered to. A search precedes the registration where the prediction may be ``poor_m`` or
     ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
     ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
@@ -50,6 +50,7 @@ class ScanOdometryConfig:
     least_points: int = 15
     farthest_deviations: float = 3.5
     open_share: float = 0.01
+    wheels_open: float = 0.0
     icp: IcpConfig = field(default_factory=IcpConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     wide: WideSearchConfig = field(default_factory=WideSearchConfig)
@@ -118,6 +119,7 @@ class ScanOdometry:
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
         self._key = np.zeros(3)
+        self._passed = np.zeros(3)  # of the last key scan, or of a later scan that would be one in an unknown place
         self._stamp_ns: int | None = None
 
     def update(self, scan: KeyScan, wheels: WheelOdometry | None = None) -> ScanEstimate:
@@ -163,7 +165,7 @@ class ScanOdometry:
         poor = deviation_m > config.poor_m or deviation[2] > math.radians(config.poor_deg)
         prior = (prediction.mean, prediction.information)
         starts = list(prediction.starts)
-        open_share = 0.0 if prediction.by_wheels else config.open_share
+        open_share = config.wheels_open if prediction.by_wheels else config.open_share
         on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
         if poor:
             window = (
@@ -244,12 +246,14 @@ class ScanOdometry:
             both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
         if wheels is not None and not unsure and found.share >= self.config.good_share:
             wheels.observe_turn(self._stamp_ns, scan.stamp_ns, float(step[2]))
-        distance, turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
-        is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
+        distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
+        passed = between(self._passed, pose)
+        passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
+        is_key = passes and not self._submap.knows(scan, pose, distance_m, turn_rad)
         evidence = step_evidence(since_key, found, prediction, searched, unsure)
         factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
         turned = turned_covariance(-self._pose[2], both)
-        shared = self._prior.accept(scan.stamp_ns, pose, covariance, step, turned, is_key, unsure)
+        shared = self._prior.accept(scan.stamp_ns, pose, covariance, step, turned, passes, is_key, unsure)
         estimate = ScanEstimate(
             scan.stamp_ns,
             step,
@@ -265,6 +269,8 @@ class ScanOdometry:
             factors,
         )
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
+        if passes:
+            self._passed = pose
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
             self._submap.add(scan, pose)
