@@ -50,7 +50,7 @@ def test_an_open_direction_tells_no_velocity() -> None:
 @pytest.mark.parametrize("keys", [1, 4, 1000])
 def test_an_error_of_the_velocity_adds_up_over_key_scans(keys: int) -> None:
     """Along a corridor errors of 120 drives are as large as the sum of what their key scans say, however many."""
-    config = MotionPriorConfig(acceleration_m_s2=0.5)
+    config = MotionPriorConfig(acceleration_m_s2=0.5, largest_m_s=1.0)
     random, errors, variance = np.random.default_rng(keys), [], 0.0
     for _ in range(120):
         prior, pose, truth, speed = MotionPrior(config), np.zeros(3), 0.0, 0.4

@@ -55,6 +55,12 @@ class ConstantVelocity:
         self._drift = self._drift - drift @ known @ gain.T
         self._joint = joint - gain @ (predicted - covariance) @ gain.T
 
+    def forget(self) -> None:
+        """Nothing is known of the velocity any more, but that it is small."""
+        self.velocity = np.zeros(3)
+        self._joint[_V, :] = self._joint[:, _V] = 0.0
+        self._drift[:, _V] = 0.0
+
     def measure(self, velocity: Array, covariance: Array, noise: Array) -> None:
         """A ``velocity`` ``(3,)`` was measured apart from this filter's pose, after changes of a deviation ``noise``."""
         before = self._joint[_V, _V] + np.diag(noise**2)

@@ -33,7 +33,7 @@ class MotionPriorConfig:
     largest_m: float = 1.0
     largest_deg: float = 45.0
     longest_s: float = 1.5
-    largest_m_s: float = 0.5
+    largest_m_s: float = 0.3
     largest_rad_s: float = 1.0
     doubt_m: float = 0.1
     doubt_m_s2: float = 4.0
@@ -92,7 +92,7 @@ class MotionPrior:
         """
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
         if elapsed > self.config.longest_s:
-            self._motion.velocity = np.zeros(3)
+            self._motion.forget()
         constant = self._motion.velocity * elapsed
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is None or self._now_wheels is None or self._last_wheels is None:

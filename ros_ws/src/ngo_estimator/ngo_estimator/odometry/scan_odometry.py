@@ -25,10 +25,10 @@ from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 class ScanOdometryConfig:
     """How scans become odometry.
 
-    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last ones; ``submap_scans`` of these are what
-    the next scan is registered to. A search precedes the registration where the prediction may be ``poor_m`` or
-    ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
-    ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
+    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one, unless another was taken within
+    ``known_m`` of it and turned alike. The last ``submap_scans`` of these are what the next scan is registered to. A
+    search precedes the registration where the prediction may be ``poor_m`` or ``poor_deg`` wrong (one deviation); its
+    window is ``search_deviations`` wide to each side, at most ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
     where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
     ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that is
     ``farthest_deviations`` from the prediction is no better than it. Where no wheels lead, one of less than
@@ -37,6 +37,7 @@ class ScanOdometryConfig:
 
     key_distance_m: float = 0.3
     key_turn_deg: float = 15.0
+    known_m: float = 0.15
     submap_scans: int = 30
     poor_m: float = 0.1
     poor_deg: float = 5.0
@@ -50,7 +51,6 @@ class ScanOdometryConfig:
     least_points: int = 15
     farthest_deviations: float = 3.5
     open_share: float = 0.01
-    wheels_open: float = 0.0
     icp: IcpConfig = field(default_factory=IcpConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     wide: WideSearchConfig = field(default_factory=WideSearchConfig)
@@ -58,8 +58,8 @@ class ScanOdometryConfig:
 
     def __post_init__(self) -> None:
         positive = (
-            self.key_distance_m, self.key_turn_deg, self.poor_m, self.poor_deg, self.search_deviations, self.wide_m,
-            self.farthest_deviations, self.largest_window_m, self.largest_window_deg,
+            self.key_distance_m, self.key_turn_deg, self.known_m, self.poor_m, self.poor_deg, self.search_deviations,
+            self.wide_m, self.farthest_deviations, self.largest_window_m, self.largest_window_deg,
         )  # fmt: skip
         if not all(0.0 < value < math.inf for value in positive):
             raise ValueError(f"the distances, angles and deviations are {positive}; expected positive numbers")
@@ -165,7 +165,7 @@ class ScanOdometry:
         poor = deviation_m > config.poor_m or deviation[2] > math.radians(config.poor_deg)
         prior = (prediction.mean, prediction.information)
         starts = list(prediction.starts)
-        open_share = config.wheels_open if prediction.by_wheels else config.open_share
+        open_share = 0.0 if prediction.by_wheels else config.open_share
         on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
         if poor:
             window = (
@@ -249,7 +249,9 @@ class ScanOdometry:
         distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
         passed = between(self._passed, pose)
         passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
-        is_key = passes and not self._submap.knows(scan, pose, distance_m, turn_rad)
+        # Where the robot may be elsewhere, nobody knows what it would see.
+        certain = float(max(covariance[0, 0], covariance[1, 1])) < self.config.poor_m**2
+        is_key = passes and not (certain and self._submap.knows(scan, pose, self.config.known_m, turn_rad))
         evidence = step_evidence(since_key, found, prediction, searched, unsure)
         factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
         turned = turned_covariance(-self._pose[2], both)
