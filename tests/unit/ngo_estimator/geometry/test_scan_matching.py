@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, likelihood_field, search
 from ngo_estimator.geometry.line_map import line_map
 from ngo_estimator.geometry.planar_motion import Array, between, rotated, transformed
@@ -53,15 +54,14 @@ def test_a_corridor_leaves_the_way_along_it_open() -> None:
 def test_noisy_normals_tell_no_motion_along_a_corridor() -> None:
     """Normals that scatter by 10 degrees slope against the corridor. The walls hold nothing along it all the same."""
     generator, truth = np.random.default_rng(1), np.array((0.2, 0.0, 0.0))
+
+    def noisy(scan: KeyScan) -> KeyScan:
+        turns = np.radians(10.0) * generator.standard_normal(len(scan.points))
+        turned = [rotated(turn, normal[None])[0] for turn, normal in zip(turns, scan.normals, strict=True)]
+        return replace(scan, normals=np.stack(turned))
+
     for _ in range(5):
-        scans = [scan_at(HALLWAY, pose, angles=fan(361, 360.0)) for pose in (IDENTITY, truth)]
-        walls, seen = (
-            replace(
-                scan,
-                normals=np.stack([rotated(turn, normal[None])[0] for turn, normal in zip(turns, scan.normals, strict=True)]),
-            )
-            for scan, turns in ((scan, np.radians(10.0) * generator.standard_normal(len(scan.points))) for scan in scans)
-        )
+        walls, seen = (noisy(scan_at(HALLWAY, pose, angles=fan(361, 360.0))) for pose in (IDENTITY, truth))
         prior = (IDENTITY, np.diag((0.15**-2, 0.15**-2, 0.1**-2)))
         found = icp(line_map([walls], [IDENTITY]), seen.points, seen.normals, IDENTITY, prior, open_share=0.01)
         assert math.sqrt(found.covariance[0, 0]) > 0.1

@@ -1,8 +1,8 @@
 """The robot's velocity where no wheels tell it, and how errors of it go into poses.
 
-Not in the paper. Where walls leave a direction open, as a corridor does, the velocity carries the pose along it, and its
-error carries on from scan to scan and from key scan to key scan. Pose and velocity therefore have one covariance. A
-graph takes its steps as independent: what a step shares with those before it is added to its own covariance.
+Not in the paper. Where walls leave a direction open, as a corridor does, the velocity carries the pose along it. Its
+error lasts from scan to scan and from key scan to key scan. Pose and velocity therefore have one covariance. A graph
+takes its steps as independent: what a step shares with those before it is added to its own covariance.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ class ConstantVelocity:
         self._drift[:, _V] = 0.0
 
     def measure(self, velocity: Array, covariance: Array, noise: Array) -> None:
-        """A ``velocity`` ``(3,)`` was measured apart from this filter's pose, after changes of a deviation ``noise``."""
+        """Another source measured a ``velocity`` ``(3,)``, after changes of the deviations ``noise`` ``(3,)``."""
         before = self._joint[_V, _V] + np.diag(noise**2)
         gain = np.linalg.solve((before + covariance).T, before.T).T
         self.velocity = self.velocity + gain @ (velocity - self.velocity)

@@ -21,9 +21,10 @@ class MotionPriorConfig:
 
     Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
     ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
-    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or
-    ``doubt_deg`` and ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most
-    ``longest_freeze_s``, while constant velocity moves by ``frozen_m``.
+    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Wheels are doubted
+    where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or ``doubt_deg`` and
+    ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most ``longest_freeze_s``, while constant
+    velocity moves by ``frozen_m``.
     """
 
     still_m: float = 0.03
