@@ -46,29 +46,16 @@ def line_map(scans: Sequence[KeyScan], poses: Sequence[Array]) -> LineMap:
 
 def line_map_of_points(points: Array, normals: Array) -> LineMap:
     """The lines at points ``(n, 2)`` with normals ``(n, 2)``, zero where there is none."""
-    points, normals = _near_lines(points, normals)
+    has_line = (normals[:, 0] != 0.0) | (normals[:, 1] != 0.0)
+    points, normals = points[has_line], normals[has_line]
+    if len(points):
+        near = np.abs(points - np.median(points, axis=0)).max(axis=1) < _FARTHEST_M
+        points, normals = points[near], normals[near]
     corner = points.min(axis=0) - CELL_M if len(points) else np.zeros(2)
     extent = points.max(axis=0) - corner if len(points) else np.zeros(2)
     shape = (int(extent[1] / CELL_M) + 2, int(extent[0] / CELL_M) + 2)
     first, order = _cells(points, corner, shape[0], shape[1])
     return LineMap(points[order], normals[order], first, corner, shape)
-
-
-@njit(cache=True)
-def _near_lines(points: Array, normals: Array) -> tuple[Array, Array]:
-    """Those that have normals, and are not far from the middle point."""
-    kept, count = np.empty(len(points), dtype=np.int64), 0
-    for i in range(len(points)):
-        if normals[i, 0] != 0.0 or normals[i, 1] != 0.0:
-            kept[count], count = i, count + 1
-    if count == 0:
-        return np.empty((0, 2)), np.empty((0, 2))
-    middle_x, middle_y = np.median(points[kept[:count], 0]), np.median(points[kept[:count], 1])
-    near = 0
-    for i in kept[:count]:
-        if abs(points[i, 0] - middle_x) < _FARTHEST_M and abs(points[i, 1] - middle_y) < _FARTHEST_M:
-            kept[near], near = i, near + 1
-    return points[kept[:near]], normals[kept[:near]]
 
 
 @njit(cache=True)

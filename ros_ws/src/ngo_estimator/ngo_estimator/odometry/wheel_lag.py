@@ -96,7 +96,8 @@ class WheelLag:
         )
         first, last = max(int(first) - 1, 0), int(last) + 1
         near = np.ascontiguousarray(stamps_s[first:last]), np.ascontiguousarray(yaws[first:last])
-        return _averages(at_s - self._lags, *near, self.config.largest_s)
+        averaged: Array = _averages(at_s - self._lags.astype(np.float64), *near, self.config.largest_s)
+        return averaged
 
     def _decide(self) -> bool:
         best = int(np.argmin(self._sums))
