@@ -37,7 +37,7 @@ class ScanOdometryConfig:
 
     key_distance_m: float = 0.3
     key_turn_deg: float = 15.0
-    known_m: float = 0.15
+    known_m: float = 0.3
     submap_scans: int = 30
     poor_m: float = 0.1
     poor_deg: float = 5.0
