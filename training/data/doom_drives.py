@@ -43,7 +43,8 @@ _DRIVERS = {
     "maze": (("random_goals", "learned", "explorer"), (0.65, 0.15, 0.2)),
 }
 _ONE_BY_ONE = (*("map",) * 4, "rooms", "rooms", "maze", "maze")
-_CALIBRATION = 1000  # of the optimizer's seeds
+CALIBRATION = 1000
+"""The last ones of the optimizer's seeds, which drive on the maps for validation."""
 
 
 def map_drive(of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False) -> Episode:
@@ -75,7 +76,7 @@ def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
         return
     for seed in seeds:
         place, rng = _ONE_BY_ONE[seed % len(_ONE_BY_ONE)], np.random.default_rng([seed, 2])
-        learned_from = seed in OPTIMIZER_TRAIN_SEEDS and seed < OPTIMIZER_TRAIN_SEEDS[-_CALIBRATION]
+        learned_from = seed in OPTIMIZER_TRAIN_SEEDS and seed < OPTIMIZER_TRAIN_SEEDS[-CALIBRATION]
         if place == "map" and learned_from:
             yield map_drive(TRAIN_MAPS[int(rng.integers(len(TRAIN_MAPS)))], seed, frames, drawn_start=True)
         elif place == "map":
