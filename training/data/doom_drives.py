@@ -36,6 +36,9 @@ TEST_MAPS: tuple[Map, ...] = (
 )  # fmt: skip
 """All scenarios of ViZDoom that have a start for a single player; ``basic`` stands for its variants with sounds."""
 
+ROOMS: Map = ("rooms", "")
+"""Stands for the generated level of a drive's seed."""
+
 _PLACES, _PLACE_SHARES = ("map", "rooms", "maze"), (0.5, 0.3, 0.2)
 _DRIVERS = {
     "map": (("explorer", "learned", "random"), (0.85, 0.1, 0.05)),
@@ -49,7 +52,7 @@ CALIBRATION = 1000
 
 def map_drive(of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False) -> Episode:
     """A drive of ``frames`` frames on a map, from its own start or one that the seed draws."""
-    env = Maze3D(Maze3DConfig(wad=of[0], map=of[1]))
+    env = Maze3D(Maze3DConfig(level="rooms") if of == ROOMS else Maze3DConfig(wad=of[0], map=of[1]))
     try:
         return record_episode(env, driver, frames, seed, {"drawn_start": True} if drawn_start else None)
     finally:

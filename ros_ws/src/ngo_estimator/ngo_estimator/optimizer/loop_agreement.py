@@ -18,7 +18,7 @@ from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances
 from ngo_estimator.optimizer.meta_poses import MetaSteps, with_origin
 
-WITHIN = 3.0
+WITHIN = 2.2
 """Deviations of the odometry between its poses that a loop may be off, over x, y and yaw together."""
 
 NEAR = 8
@@ -32,8 +32,9 @@ _AGREEING_M, _AGREEING_RAD = 0.35, 0.1
 
 
 def agreeing(loops: Loops, steps: MetaSteps, fewest: int) -> Loops:
-    """The loops; those that the odometry does not allow, or with fewer than ``fewest`` witnesses, are not valid.
+    """The loops; those that the odometry does not allow, or that have too few witnesses, are not valid.
 
+    A loop needs ``fewest`` witnesses for each deviation by which it is off: the more it changes, the more must say so.
     A witness is another loop that the odometry allows, to another frame, both of whose ends are near. Led along the
     odometry from end to end, both say the same.
     """
@@ -44,7 +45,7 @@ def agreeing(loops: Loops, steps: MetaSteps, fewest: int) -> Loops:
         squared = (loop_residuals(loops, poses).square() / (variance + noise)).sum(-1)
         valid = loops.valid & (squared <= WITHIN**2)
         found = torch.stack([_witnesses(loops, poses, valid, batch) for batch in range(len(valid))])
-        valid = valid & (found >= fewest)
+        valid = valid & (found >= fewest * squared.sqrt())
         # What is not valid joins neighbours: the equations are as sparse as without it.
         return dataclasses.replace(loops, valid=valid, start=torch.where(valid, loops.start, loops.end))
 

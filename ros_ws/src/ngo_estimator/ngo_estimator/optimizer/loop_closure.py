@@ -30,7 +30,8 @@ class LoopSearch:
     is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
     place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
     With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
-    With ``witnesses``, a loop must be as the odometry allows, and so many others nearby must agree (``loop_agreement``).
+    With ``witnesses``, a loop must be as the odometry allows, and others nearby must agree: so many for each of the
+    odometry's deviations by which it is off (``loop_agreement``).
     """
 
     per_pose: int = 4
