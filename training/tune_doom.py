@@ -34,11 +34,11 @@ from training.scoring.doom_rows import Features, gtsam_graph, local, ours
 from training.scoring.lidar_errors import WITHIN_DEVIATIONS, absolute_error_m
 from training.scoring.online_estimate import with_origin
 
-WITNESSES = (1, 2)
+WITNESSES = (1, 2, 3)
 """Witnesses for each deviation by which a loop is off."""
-STEP_SCALES = (0.25, 0.5)
+STEP_SCALES = (0.125, 0.25, 0.5)
 """Factors of the deviations of steps."""
-LOOP_SCALES = (-1.0, -1.5, -2.0)
+LOOP_SCALES = (-0.5, -1.0, -1.5, -2.0)
 """Stretch of the deviations of a loop's position: the information gets the factor exp(4 tanh(x / 2))."""
 BELIEF, HEADING_SCALE = 1.0, -2.0
 """Added to what a loop is believed, in quarters of its logit; stretch of its heading's deviation, as above."""
@@ -56,7 +56,7 @@ HARM_BELOW_M = 0.2
 class Arguments:
     """Settings of the choice."""
 
-    seeds: int = 3
+    seeds: int = 5
     """Drives of each validation map, and twice as many through generated levels."""
     frames: int = 1000
     """Frames of a drive."""
@@ -110,7 +110,7 @@ def error(poses: np.ndarray, features: Features) -> float:
 
 
 def covariance_scale(core: OnlineTrajectory, features: list[Features]) -> float:
-    """The smallest factor of the covariance with which ``WANTED`` of all published poses are within three deviations."""
+    """The least factor of the covariance with which ``WANTED`` of all published poses are within three deviations."""
     needed = []
     for one in features:
         found = ours(core)(one)

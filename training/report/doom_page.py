@@ -55,7 +55,7 @@ def _ratios(maps: dict[str, Any], returns: dict[str, float]) -> str:
     ratios = np.array([entry["ours"]["ate_m"]["mean"] / entry["local"]["ate_m"]["mean"] for entry in maps.values()])
     revisited = np.array([returns[name] >= _RETURNS for name in maps])
     there = (
-        f" Over the {revisited.sum()} maps where a drive returns to a tenth of its poses or more (1 m, 35 degrees), the "
+        f" Over the {revisited.sum()} maps where a tenth of the poses or more are returns (1 m, 35 degrees), the "
         f"median is {number(float(np.median(ratios[revisited])))}."
         if revisited.any()
         else ""

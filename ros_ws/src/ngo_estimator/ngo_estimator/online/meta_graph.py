@@ -345,7 +345,8 @@ class MetaGraph:
         own[began + 1 :] = se2.compose(own[began], se2.r2g(relative))
         whole = slice(began, self.blocks * self._block)
         in_block, log_std = (
-            torch.from_numpy(rows.slice(whole.start, whole.stop)).unsqueeze(0) for rows in (self._relative, self._log_std)
+            torch.from_numpy(rows.slice(whole.start, whole.stop)).unsqueeze(0)
+            for rows in (self._relative, self._log_std)
         )
         in_block = poses_in_blocks(in_block, self._block)
         self._steps.replace(first, in_block[0, :, -1].numpy())
