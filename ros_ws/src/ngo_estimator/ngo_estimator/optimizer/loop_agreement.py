@@ -35,6 +35,7 @@ def agreeing(loops: Loops, steps: MetaSteps, fewest: int) -> Loops:
     """The loops; those that the odometry does not allow, or that have too few witnesses, are not valid.
 
     A loop needs ``fewest`` witnesses for each deviation by which it is off: the more it changes, the more must say so.
+    Its own deviation grows with the root of their number.
     A witness is another loop that the odometry allows, to another frame, both of whose ends are near. Led along the
     odometry from end to end, both say the same.
     """
@@ -47,7 +48,10 @@ def agreeing(loops: Loops, steps: MetaSteps, fewest: int) -> Loops:
         found = torch.stack([_witnesses(loops, poses, valid, batch) for batch in range(len(valid))])
         valid = valid & (found >= fewest * squared.sqrt())
         # What is not valid joins neighbours: the equations are as sparse as without it.
-        return dataclasses.replace(loops, valid=valid, start=torch.where(valid, loops.start, loops.end))
+        # Loops that agree err together: all of them count as one.
+        together = 0.5 * torch.log1p(found.to(loops.log_scale.dtype)).unsqueeze(-1)
+        start = torch.where(valid, loops.start, loops.end)
+        return dataclasses.replace(loops, valid=valid, start=start, log_scale=loops.log_scale + together)
 
 
 def _witnesses(loops: Loops, poses: Tensor, valid: Tensor, batch: int) -> Tensor:
