@@ -4,8 +4,9 @@
 
 The optimizer is the robust pose graph that an untrained one is, without a network. What is chosen: how many witnesses a
 loop needs, and how far deviations of steps and loops are stretched. A choice with which the error on a map is larger
-than that of its odometry, or on a drive much larger, is out, whatever it gains elsewhere. The optimizer's covariance is then fitted to its errors. The
-command writes ``neural_graph_optimizer.safetensors`` and ``training/results/doom.gtsam.json``.
+than that of its odometry, or on a drive much larger, is out, whatever it gains elsewhere. The optimizer's covariance is
+then fitted to its errors. The command writes ``neural_graph_optimizer.safetensors`` and
+``training/results/doom.gtsam.json``.
 """
 
 import dataclasses
@@ -125,7 +126,7 @@ def covariance_scale(core: OnlineTrajectory, features: list[Features]) -> float:
 
 
 def harmful(corrected: np.ndarray, odometry: np.ndarray, maps: list[Map]) -> bool:
-    """Whether errors ``(drives,)`` (m) are larger than those of the odometry: on one of the ``maps``, or of one drive."""
+    """Whether errors ``(drives,)`` (m) are larger than the odometry's: the mean on one of the ``maps``, or a drive's."""
     if (corrected > np.maximum(MOST_HARM_OF_A_DRIVE * odometry, HARM_BELOW_M)).any():
         return True
     drives_of = [np.array([of == one for of in maps]) for one in set(maps)]

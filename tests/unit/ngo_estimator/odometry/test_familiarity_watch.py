@@ -34,7 +34,7 @@ def share_within(world: str, steps: list[LocalEstimate]) -> float:
     return within(odometry, odometry_covariances(odometry, steps), stored(world).poses_xyyaw[1:])
 
 
-@pytest.mark.parametrize("world", (*WORLDS, "doom"))
+@pytest.mark.parametrize("world", [*WORLDS, "doom"])
 def test_shipped_weights_of_pictures_and_rows_tell_unlike_input(world: str) -> None:
     assert LocalOdometry.load(WEIGHTS / world, world).tells_unlike_input
 
