@@ -126,7 +126,7 @@ def covariance_scale(core: OnlineTrajectory, features: list[Features]) -> float:
 
 
 def harmful(corrected: np.ndarray, odometry: np.ndarray, maps: list[Map]) -> bool:
-    """Whether errors ``(drives,)`` (m) are larger than the odometry's: the mean on one of the ``maps``, or a drive's."""
+    """Whether errors ``(drives,)`` (m) are larger than the odometry's: the mean of one of ``maps``, or one alone."""
     if (corrected > np.maximum(MOST_HARM_OF_A_DRIVE * odometry, HARM_BELOW_M)).any():
         return True
     drives_of = [np.array([of == one for of in maps]) for one in set(maps)]
