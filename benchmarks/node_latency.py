@@ -110,11 +110,11 @@ class Feed:
             self._wait(stamp)
         return len(frames) / (time.monotonic() - begin)
 
-    def paced(self, frames: Sequence[Frame]) -> list[float]:
-        """Send frames at ``RATE_HZ``; returns how many ms each answer took once all have come."""
+    def paced(self, frames: Sequence[Frame], rate_hz: float = RATE_HZ) -> list[float]:
+        """Send frames at a rate; returns how many ms each answer took once all have come."""
         begin, stamps = time.monotonic(), []
-        for index, frame in enumerate(tqdm(frames, f"{self._name} at {RATE_HZ:g} Hz")):
-            due = begin + index / RATE_HZ
+        for index, frame in enumerate(tqdm(frames, f"{self._name} at {rate_hz:g} Hz")):
+            due = begin + index / rate_hz
             while (left := due - time.monotonic()) > 0.0:
                 self._spin(left)
             stamps.append(self._send(frame))

@@ -123,6 +123,10 @@ class Graph:
         """The exit code of a node that has ended, else None."""
         return self._processes[name].poll()
 
+    def pid(self, name: str) -> int:
+        """The process of a node."""
+        return self._processes[name].pid
+
     def check(self) -> None:
         """Raise GraphError for a node that has ended with another exit code than 0."""
         for name, process in self._processes.items():
