@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import load_local, load_place
+from ngo_estimator.checkpoint import FAMILIARITY, load_description, load_familiarity, load_local, load_place
+from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
@@ -27,6 +28,7 @@ from training.common import runs
 from training.common.command_line import run_command
 from training.common.curves import write_at_once
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
+from training.data.episodes import images_of
 from training.data.features import features_of
 from training.data.worlds import world_named
 from training.report.doom_levels import draw_levels
@@ -41,6 +43,7 @@ from training.scoring.doom_rows import (
     gtsam_graph,
     local,
     ours,
+    returning,
 )
 from training.scoring.statistics import mean_interval
 
@@ -81,7 +84,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     rows = row_estimators(arguments, drives)
     seeds = range(_FIRST_SEED[arguments.split], _FIRST_SEED[arguments.split] + arguments.seeds)
     maps = _MAPS[arguments.split][: arguments.maps or None]
-    result: dict[str, Any] = {**runs.record("results_doom", arguments), "path_m": {}, "maps": {}}
+    result: dict[str, Any] = {**runs.record("results_doom", arguments), "path_m": {}, "returns": {}, "maps": {}}
     result.pop("arguments")
     tracks: dict[str, dict[str, np.ndarray]] = {}
     for of in tqdm(maps, desc=f"{arguments.world} {arguments.split}", unit="map"):
@@ -94,6 +97,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         result["path_m"][map_name(of)] = mean_interval(
             np.array([one.errors["local"]["path_m"] for one in found])
         ).as_json()
+        result["returns"][map_name(of)] = float(np.mean([one.errors["local"]["returns"] for one in found]))
         result["maps"][map_name(of)] = entry
         tracks[map_name(of)] = found[0].tracks
     write_at_once(arguments.out / f"{arguments.world}.json", json.dumps(result, indent=2) + "\n")
@@ -125,6 +129,8 @@ class Drives:
         self._frames, self._weights = arguments.frames, weights
         self.local, described = load_local(weights, arguments.world)
         self.place, described_place = load_place(weights, arguments.world)
+        familiarity = load_familiarity(weights, arguments.world)
+        self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self.place.encoder)
         self._networks = (described["sha256"], described_place["sha256"])
         self._world = world_named(arguments.world)
 
@@ -149,14 +155,31 @@ class Drives:
         with np.load(path) as stored:
             return dict(stored)
 
+    def judged(self, of: Map, seed: int, features: Features) -> Features:
+        """The features with steps and deviations as ``local_node`` publishes them, and ``unlikeness`` ``(steps,)``."""
+        if self._watch is None:
+            return features
+        drive = self.drive(of, seed)
+        relative, log_std, motion = (torch.from_numpy(features[name]) for name in ("relative", "log_std", "motion"))
+        steps = relative, torch.exp(2.0 * log_std.double()), motion
+        found = self._watch.judge_drive(images_of(self._world, drive), drive.actions, steps)
+        return {
+            **features,
+            "relative": np.stack([one.relative for one in found]).astype(np.float32),
+            "log_std": 0.5 * np.log(np.stack([one.variance for one in found])),
+            "unlikeness": np.array([one.unlikeness for one in found]),
+        }
+
     def scored(self, of: Map, seed: int, rows: "Rows") -> Scored:
         """The errors of the rows on a drive."""
         key = hashlib.sha256(json.dumps([self._networks, rows.identity, self._frames]).encode()).hexdigest()
         path = self._folder / "scored" / f"{map_name(of)}-{seed}-{key[:12]}.json"
         if not path.exists():
-            features = self.features(of, seed)
+            features = self.judged(of, seed, self.features(of, seed))
             estimates = {row: estimator(features) for row, estimator in rows.estimators.items()}
             errors = {row: errors_of(estimate, features["truth"]) for row, estimate in estimates.items()}
+            radius_m, angle_rad = self._world.place_radius_m, self._world.heading_limit_rad
+            errors["local"]["returns"] = returning(features["truth"], radius_m, angle_rad)
             tracks = {row: estimate.poses[:, :2].tolist() for row, estimate in estimates.items()}
             tracks["truth"] = features["truth"][:, :2].tolist()
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,13 +210,15 @@ def row_estimators(arguments: Arguments, drives: Drives) -> Rows:
     actions = ActionsFit.of([(one["actions"], one["poses"]) for one in fitted])
     settings = load_settings(arguments.out / f"{arguments.world}.gtsam.json")
     core = OnlineTrajectory.load(arguments.weights / arguments.world, world=arguments.world)
+    known = arguments.weights / arguments.world / f"{FAMILIARITY}.safetensors"
+    familiarity = load_description(known, FAMILIARITY)["sha256"] if known.exists() else None
     estimators = {
         "actions_only": actions.estimate,
         "local": local,
         "gtsam": gtsam_graph(settings, drives.place.pair_head),
         "ours": ours(core),
     }
-    return Rows(estimators, json.dumps([core.identity, dataclasses.asdict(settings)]))
+    return Rows(estimators, json.dumps([core.identity, dataclasses.asdict(settings), familiarity]))
 
 
 if __name__ == "__main__":

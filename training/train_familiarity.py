@@ -133,6 +133,8 @@ def main(arguments: Arguments) -> Familiarity:
 
 
 def _simulated(world: World, arguments: Arguments) -> tuple[list[SensedDrive], list[SensedDrive]]:
+    from training.data.doom_drives import CALIBRATION  # training on recordings does without the simulators
+
     def drives(seeds: Iterable[int]) -> list[SensedDrive]:
         # Each in a maze of a size of its own, as they are drawn from the first seed.
         return [
@@ -142,9 +144,8 @@ def _simulated(world: World, arguments: Arguments) -> tuple[list[SensedDrive], l
         ]
 
     first = len(VALIDATION_SEEDS) // 2 - arguments.limit_drives  # no table takes these
-    return drives(OPTIMIZER_TRAIN_SEEDS[-arguments.drives :]), drives(
-        VALIDATION_SEEDS[first : first + arguments.limit_drives]
-    )
+    fitted = OPTIMIZER_TRAIN_SEEDS[: -CALIBRATION if world.name == "doom" else None]  # training levels alone
+    return drives(fitted[-arguments.drives :]), drives(VALIDATION_SEEDS[first : first + arguments.limit_drives])
 
 
 def driven(world: World, seed: int) -> World:

@@ -36,6 +36,9 @@ TEST_MAPS: tuple[Map, ...] = (
 )  # fmt: skip
 """All scenarios of ViZDoom that have a start for a single player; ``basic`` stands for its variants with sounds."""
 
+ROOMS: Map = ("rooms", "")
+"""Stands for the generated level of a drive's seed."""
+
 _PLACES, _PLACE_SHARES = ("map", "rooms", "maze"), (0.5, 0.3, 0.2)
 _DRIVERS = {
     "map": (("explorer", "learned", "random"), (0.85, 0.1, 0.05)),
@@ -43,12 +46,13 @@ _DRIVERS = {
     "maze": (("random_goals", "learned", "explorer"), (0.65, 0.15, 0.2)),
 }
 _ONE_BY_ONE = (*("map",) * 4, "rooms", "rooms", "maze", "maze")
-_CALIBRATION = 1000  # of the optimizer's seeds
+CALIBRATION = 1000
+"""The last ones of the optimizer's seeds, which drive on the maps for validation."""
 
 
 def map_drive(of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False) -> Episode:
     """A drive of ``frames`` frames on a map, from its own start or one that the seed draws."""
-    env = Maze3D(Maze3DConfig(wad=of[0], map=of[1]))
+    env = Maze3D(Maze3DConfig(level="rooms") if of == ROOMS else Maze3DConfig(wad=of[0], map=of[1]))
     try:
         return record_episode(env, driver, frames, seed, {"drawn_start": True} if drawn_start else None)
     finally:
@@ -75,7 +79,7 @@ def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
         return
     for seed in seeds:
         place, rng = _ONE_BY_ONE[seed % len(_ONE_BY_ONE)], np.random.default_rng([seed, 2])
-        learned_from = seed in OPTIMIZER_TRAIN_SEEDS and seed < OPTIMIZER_TRAIN_SEEDS[-_CALIBRATION]
+        learned_from = seed in OPTIMIZER_TRAIN_SEEDS and seed < OPTIMIZER_TRAIN_SEEDS[-CALIBRATION]
         if place == "map" and learned_from:
             yield map_drive(TRAIN_MAPS[int(rng.integers(len(TRAIN_MAPS)))], seed, frames, drawn_start=True)
         elif place == "map":

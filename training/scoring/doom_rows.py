@@ -25,6 +25,8 @@ METRICS = ("translation_percent", "ate_m", "within_3_std")
 WINDOW = 100
 """Steps over which errors of steps add up where their deviations are fitted: they last, and a trajectory is a sum."""
 
+_AGO = 48
+
 Features = dict[str, np.ndarray]
 """Of one drive, as of ``features_of``, with ``actions`` ``(steps,)`` uint8."""
 
@@ -127,6 +129,20 @@ def ours(core: OnlineTrajectory) -> Callable[[Features], Estimate]:
         return Estimate(trajectory.poses_xyyaw[1:], published, np.array([update.covariance for update in updates]))
 
     return estimate
+
+
+def returning(truth: np.ndarray, radius_m: float, angle_rad: float) -> float:
+    """Share of every eighth pose from which one ``_AGO`` steps or more ago is so near, in position and heading.
+
+    Args:
+        truth: true poses ``(steps, 3)``.
+    """
+    poses = truth[7::8]
+    earlier = np.tri(len(poses), k=-(_AGO // 8), dtype=bool)
+    near = np.hypot(*(poses[:, None, :2] - poses[:, :2]).transpose(2, 0, 1)) <= radius_m
+    turned = poses[:, None, 2] - poses[:, 2]
+    near &= np.abs(np.arctan2(np.sin(turned), np.cos(turned))) <= angle_rad
+    return float((near & earlier).any(axis=1).mean())
 
 
 def errors_of(estimate: Estimate, truth: np.ndarray) -> dict[str, float]:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ngo_estimator.checkpoint import FAMILIARITY, CheckpointError, load_familiarity, load_local, load_place
+from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive
 from training.data.faults import SensedDrive, faulted
@@ -31,6 +32,11 @@ def estimates(world: str, fault: str | None) -> list[LocalEstimate]:
 def share_within(world: str, steps: list[LocalEstimate]) -> float:
     odometry = np.stack([step.odom_xyyaw for step in steps])
     return within(odometry, odometry_covariances(odometry, steps), stored(world).poses_xyyaw[1:])
+
+
+@pytest.mark.parametrize("world", [*WORLDS, "doom"])
+def test_shipped_weights_of_pictures_and_rows_tell_unlike_input(world: str) -> None:
+    assert LocalOdometry.load(WEIGHTS / world, world).tells_unlike_input
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -86,3 +92,27 @@ def test_weights_without_it_work_and_others_than_those_beside_it_are_refused(tmp
     other.write_text(other.read_text().replace('"sha256": "8', '"sha256": "9'))
     with pytest.raises(CheckpointError, match="fitted to another local_pose_network"):
         load_familiarity(folder)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_whole_drive_is_judged_as_frame_by_frame(world: str) -> None:
+    network, place = load_local(WEIGHTS / world)[0], load_place(WEIGHTS / world)[0]
+    familiarity = load_familiarity(WEIGHTS / world, world)
+    assert familiarity is not None
+    frozen = faulted(stored(world), "frozen", BEGIN, 0)
+    actions = stored(world).actions
+    assert actions is not None
+    drive = SensedDrive(frozen.images[:100], frozen.poses_xyyaw[:100], actions[:99])
+    one_by_one = estimates_of(LocalOdometry(network, place, world, familiarity), drive)
+    plain = estimates_of(LocalOdometry(network, place, world), drive)
+    steps = (
+        torch.tensor(np.stack([step.relative_xyyaw for step in plain])),
+        torch.tensor(np.stack([np.diag(step.covariance) for step in plain])),
+        torch.tensor(np.stack([step.motion_feature for step in plain])),
+    )
+    watch = FamiliarityWatch(familiarity, place.encoder)
+    together = watch.judge_drive(drive.images, drive.actions, steps)
+    for one, other in zip(one_by_one, together, strict=True):
+        assert one.repeated == other.repeated and one.unlikeness == pytest.approx(other.unlikeness, rel=1e-4)
+        np.testing.assert_allclose(one.relative_xyyaw, other.relative, atol=1e-5)
+        np.testing.assert_allclose(np.diag(one.covariance), other.variance, rtol=1e-3)

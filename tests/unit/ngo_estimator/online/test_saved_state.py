@@ -208,8 +208,8 @@ def test_other_settings_weights_and_formats_are_refused(
     other = OnlineTrajectory(small_optimizer("loops"), small_pair_head(), 32, 2)
     assert refusal(folder, other).startswith(f'{path}: was saved with weights_sha256 "')
     assert refusal(folder, scans()).startswith(f"{path}: was saved with graph null; here it is ")
-    monkeypatch.setattr(saved_state, "FORMAT", 3)
-    assert refusal(folder, core) == f"{path}: is of format 2; expected 3"
+    monkeypatch.setattr(saved_state, "FORMAT", 4)
+    assert refusal(folder, core) == f"{path}: is of format 3; expected 4"
 
 
 def test_a_lidars_other_settings_are_named(tmp_path: Path) -> None:

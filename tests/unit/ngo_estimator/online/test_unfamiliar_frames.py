@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ngo_estimator.geometry.planar_motion import between
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive, corrected, estimates
@@ -36,3 +37,32 @@ def test_a_session_with_unfamiliar_frames_goes_on_to_the_last_bit() -> None:
     loaded = original.restored(original.state())
     for step in steps[120:]:
         np.testing.assert_array_equal(original.update(step).pose_xyyaw, loaded.update(step).pose_xyyaw)
+
+
+def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back() -> None:
+    """A mean over 16 frames tells: until then their loops and registrations were taken."""
+    torch.set_num_threads(1)
+    steps = estimates(GoldenDrive.load("maze2d"), LocalOdometry.load(WEIGHTS / "maze2d"))
+    told = len(steps) // 8 * 8 - 8
+    late = [replace(step, unlikeness=2.0 if k >= told else 0.0) for k, step in enumerate(steps)]
+    core = OnlineTrajectory.load(WEIGHTS / "maze2d", world="maze2d")
+    trajectory, _ = corrected(late, core)
+    assert core._graph.loop_frames[:, 1].max() <= told - 16
+    ends = [told - 16, told]
+    found, came = (between(*of[ends]) for of in (trajectory.poses_xyyaw, trajectory.odometry_xyyaw))
+    np.testing.assert_allclose(found, came, atol=1e-4)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_behind_a_blind_stretch_a_small_correction_gives_way_to_the_odometry(world: str) -> None:
+    torch.set_num_threads(1)
+    steps = estimates(GoldenDrive.load(world), LocalOdometry.load(WEIGHTS / world))
+    half = len(steps) // 2
+    unknown = np.diag([4.0, 4.0, 0.04])
+    blind = [replace(step, unlikeness=2.0, covariance=unknown) if k >= half else step for k, step in enumerate(steps)]
+    trajectory, update = corrected(blind, OnlineTrajectory.load(WEIGHTS / world, world=world))
+    last = len(steps) // 8 * 8
+    np.testing.assert_allclose(trajectory.poses_xyyaw[last], trajectory.odometry_xyyaw[last], atol=1e-3)
+    moved = np.linalg.norm((trajectory.poses_xyyaw - trajectory.odometry_xyyaw)[: half - 16, :2], axis=1)
+    assert moved.max() > 1e-3  # what was known before stays corrected
+    assert update.covariance[0, 0] > 4.0

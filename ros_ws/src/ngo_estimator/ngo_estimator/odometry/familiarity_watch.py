@@ -16,6 +16,7 @@ from ngo_estimator.networks.place_encoder import PlaceEncoder
 
 _REPEATED = 1e-3  # change in units of the usual one, below which a frame repeats the one before
 _MOVING = 1.0  # deviations from which what is told is motion
+_CHUNK = 64  # steps at once
 _OF_REPEATED = 10.0  # unlikeness of a frame that repeats
 
 NOT_FITTED = (
@@ -88,6 +89,31 @@ class FamiliarityWatch:
             )[0]
             other = self._familiarity.told_motion(known)[0].double().numpy()
         return self._judged(distances.double().numpy(), float(changed), other, relative[0], variance[0])
+
+    def judge_drive(self, images: Tensor, actions: np.ndarray | None, steps: tuple[Tensor, ...]) -> list[Judged]:
+        """Judge all steps of a drive, from its beginning, as ``judge`` would one by one.
+
+        Args:
+            images: ``(n + 1, height, width, channels)``; actions: ``(n,)``, where the networks take them.
+            steps: the network's motions ``(n, 3)``, variances ``(n, 3)`` and motion features ``(n, motion_size)``.
+        """
+        self.reset()
+        relative, variance, features = steps
+        padded = np.concatenate((np.full(HISTORY - 1, NO_ACTION), [] if actions is None else actions)).astype(np.int64)
+        histories = torch.from_numpy(np.lib.stride_tricks.sliding_window_view(padded, HISTORY).copy())
+        found = []
+        for at in torch.arange(len(relative)).split(_CHUNK):
+            known = told_vector(self._config, None if actions is None else histories[at], None, len(at))
+            changed = change(images[at], images[at + 1])
+            with torch.inference_mode():
+                looks = look(self._encoder, images[at + 1])
+                distances = self._familiarity.distances(
+                    looks, features[at].float(), known, relative[at].float(), changed
+                )
+                others = self._familiarity.told_motion(known)
+            rows = zip(distances.double().numpy(), changed.tolist(), others.double().numpy(), at.tolist(), strict=True)
+            found += [self._judged(one, moved, other, relative[k], variance[k]) for one, moved, other, k in rows]
+        return found
 
     def _judged(
         self, distances: np.ndarray, changed: float, other: np.ndarray, relative: Tensor, variance: Tensor

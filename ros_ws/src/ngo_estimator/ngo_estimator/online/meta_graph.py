@@ -17,10 +17,12 @@ from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
+from ngo_estimator.online.blind_stretches import shrunk_corrections, summed_variances
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
+from ngo_estimator.online.step_log import StepLog
 from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
@@ -35,12 +37,18 @@ _FRESH = 2
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
 
+_TOLD_LATE = 16
+"""Frames before the first unfamiliar one that were taken for familiar and may not have been: a mean over them tells."""
+
 _LONG = 2
 """Iterations that take as long as a search for loops."""
 
 _BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features", "familiar", "fixed")
 """Names of the newest rows: the first three and ``familiar`` of each step, the others of each block; without a network
 there are no features."""
+
+_STD = (1e-6, 1e2)
+"""What a step's deviation is limited to (m or rad)."""
 
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
@@ -95,12 +103,15 @@ class MetaGraph:
         window: int,
         key_frames: int,
         network_every: int = 1,
+        log: Callable[[], StepLog] = StepLog,
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
         self._context = optimizer.config.context
-        keep = (2 * self._context + 2) * self._block
+        self._log = log  # of the steps as they came
+        recalled = -(-_TOLD_LATE // self._block) + 1
+        keep = (2 * self._context + 2 + recalled) * self._block
         self.odometry = GrowingRows((3,), np.float64)
         self.odometry.append(np.zeros(3))
         self._relative = SlidingRows((3,), np.float32, keep)
@@ -114,6 +125,8 @@ class MetaGraph:
         self._features = SlidingRows((config.width,), np.float32, blocks_kept)
         self._familiar = SlidingRows((), np.bool_, keep)  # steps
         self._fixed = SlidingRows((), np.bool_, blocks_kept)  # blocks that networks leave as they are
+        self._blind = GrowingRows((3,), np.float64)  # variance of the unfamiliar steps of each block
+        self._recalled = 0  # block from which on frames turned out to be unfamiliar
         self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
         self._nodes = GrowingRows((3,), np.float64)
         self._nodes.append(np.zeros(3))
@@ -180,11 +193,13 @@ class MetaGraph:
 
         With ``joins`` the step is where another odometry goes on, in another place.
         A frame that is not ``familiar`` closes no loops, and networks leave the odometry around it as it is. Its
-        variances are honest, so that ``covariance_scale`` is not for them.
+        variances are honest, so that ``covariance_scale`` is not for them. The first one recalls those before it.
         """
+        self.optimized, self.fault = False, ""
         if not familiar:
             code, variance = np.zeros_like(code), variance / self._scale
-        self.optimized, self.fault = False, ""
+            if len(self._familiar) and self._familiar.slice(len(self._familiar) - 1)[0]:
+                self._recall()
         log_std = 0.5 * np.log(variance)
         step = relative.astype(np.float64)
         self._pose = compose(self._pose, step)
@@ -225,6 +240,7 @@ class MetaGraph:
         relative = between(*self.odometry.values[[-1 - self._block, -1]])
         self._nodes.append(compose(self._nodes.values[-1], relative))
         self._fixed.append(False)
+        self._blind.append(self._blind_variance(block))
         self._work = self._all_work()
 
     def _all_work(self) -> list[Callable[[int], None]]:
@@ -304,11 +320,51 @@ class MetaGraph:
         odometry = torch.from_numpy(self.odometry.values)
         odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
 
+    @torch.inference_mode()
+    def _recall(self) -> None:
+        """Take the newest frames back, which were taken for familiar: their loops, and what was registered by them."""
+        self.abandon()  # it has their loops
+        first = max(0, len(self._familiar) - _TOLD_LATE)
+        self._familiar.slice(first)[:] = False
+        if self._loops is not None:
+            self._loops.recall(first)
+        self._recalled = min(first // self._block, self.blocks)
+        if self._registrations and self._recalled < self.blocks:
+            self._unregister(self._recalled)
+        for block in range(self._recalled, self.blocks):
+            self._blind.values[block] = self._blind_variance(block)
+
+    def _unregister(self, first: int) -> None:
+        """Take the steps from block ``first`` on as the odometry had them."""
+        log, began = self._log(), first * self._block
+        odometry, std = log.odometry.values[began : len(self._relative) + 1], log.odometry_std.values[began:]
+        relative = se2.between(torch.from_numpy(odometry[:-1]), torch.from_numpy(odometry[1:]))
+        self._relative.replace(began, relative.numpy())
+        self._log_std.replace(began, np.log(std[: len(relative)].clip(*_STD)))
+        own = torch.from_numpy(self.odometry.values)
+        own[began + 1 :] = se2.compose(own[began], se2.r2g(relative))
+        whole = slice(began, self.blocks * self._block)
+        in_block, log_std = (
+            torch.from_numpy(rows.slice(whole.start, whole.stop)).unsqueeze(0)
+            for rows in (self._relative, self._log_std)
+        )
+        in_block = poses_in_blocks(in_block, self._block)
+        self._steps.replace(first, in_block[0, :, -1].numpy())
+        self._std.replace(first, block_variances(in_block, log_std).sqrt()[0].numpy())
+
+    def _blind_variance(self, block: int) -> np.ndarray:
+        """Variance ``(3,)`` of the unfamiliar steps of a block, as the odometry has it."""
+        rows = slice(block * self._block, (block + 1) * self._block)
+        log_std, familiar = (of.slice(rows.start, rows.stop) for of in (self._log_std, self._familiar))
+        variance: np.ndarray = np.exp(2.0 * log_std.astype(np.float64))[~familiar].sum(axis=0) * self._scale
+        return variance
+
     def _aggregate(self, block: int) -> None:
         """Features and smoothed odometry of the blocks that the newest one changes, and of itself."""
         if not self._optimizer.config.network and self._optimizer.config.smoother is None:
             return
-        changed = max(0, block - self._context)
+        changed = max(0, min(block, self._recalled) - self._context)
+        self._recalled = block + 1
         start = max(0, changed - self._context)
         rows = (self._relative, self._log_std, self._motion)
         ends = start * self._block, (block + 1) * self._block
@@ -475,7 +531,8 @@ class MetaGraph:
         if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running, self._begun, self.took_s = None, False, self._begun_s
-        self._apply(running, running.result)
+        moved = self._apply(running, running.result)
+        end = end + np.outer(moved, moved)
         self._pose, self._covariance = self._newest(end)
         self.optimized = True
         return True
@@ -490,7 +547,8 @@ class MetaGraph:
         self._settle()
         return self._begun and self.advance(1 + self._optimizer.config.iterations)
 
-    def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> None:
+    def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> np.ndarray:
+        """Take the result; how far the last node is from it ``(3,)``, as unfamiliar frames make corrections unsure."""
         keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
@@ -501,12 +559,28 @@ class MetaGraph:
         poses[:, 2] = se2.wrap(poses[:, 2])
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
         self._before = self._nodes.values[self._active]
+        moved = self._shrink(poses.numpy())
         self._nodes.values[self._active[1:]] = poses.numpy()
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._end, self._information = self._scale * result.end_covariance()[0].numpy(), result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
         if running.runs_network and self._network_every > 1:
             self._corrections = _Corrections.of(first, result.corrections)
+        return moved
+
+    def _shrink(self, poses: np.ndarray) -> np.ndarray:
+        """Shrink corrections of the active nodes ``(n, 3)`` across blind stretches; how far the last one moved."""
+        if not self._blind.values.any():
+            return np.zeros(3)
+        active, log = self._active, self._log().odometry.values
+        odometry = se2.between(torch.from_numpy(log[0]), torch.from_numpy(log[active * self._block])).numpy()
+        weighed = self._loops.weighed() if self._loops is not None else (np.zeros((0, 2), np.int64), np.zeros(0))
+        variance = summed_variances(self._blind.values, active)
+        joined = np.searchsorted(active, weighed[0])
+        shrunk = shrunk_corrections(np.vstack((np.zeros(3), poses)), odometry, variance, joined, weighed[1])
+        moved: np.ndarray = shrunk[-1] - poses[-1]
+        poses[:] = shrunk[1:]
+        return moved
 
     def abandon(self) -> None:
         """Leave undone what has begun; the newest block is taken in all the same."""
@@ -589,6 +663,8 @@ class MetaGraph:
             "covariance": self._covariance,
             "nodes": self._nodes.values,
             "first": np.array(self._first),
+            "blind": self._blind.values,
+            "recalled": np.array(self._recalled),
             "kept": self._kept,
             "gone": self._gone,
             "active": self._active,
@@ -620,6 +696,8 @@ class MetaGraph:
         """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
         self.odometry.restore(arrays, "odometry")
         self._nodes.restore(arrays, "nodes")
+        self._blind.restore(arrays, "blind")
+        self._recalled = taken_integer(arrays, "recalled")
         for name, rows in self._buffers().items():
             rows.restore(part(arrays, name))
         self._pose, self._covariance = (
@@ -678,7 +756,8 @@ class MetaGraph:
         require(
             frames // self._block == blocks
             and {len(counted[name]) for name in (*_BUFFERS[:3], "familiar")} == {frames}
-            and {len(counted[name]) for name in (*_BUFFERS[3:6], "fixed")} == {blocks},
+            and {len(counted[name]) for name in (*_BUFFERS[3:6], "fixed")} == {blocks}
+            and len(self._blind) == blocks,
             f"{frames} steps and {blocks} meta-poses do not belong together",
         )
         require(

@@ -315,6 +315,16 @@ class OnlineLoops:
         self._kept.weight[:] = 0.0
         self._kept.weight[numbers] = weights
 
+    def weighed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes that each loop joins ``(n, 2)``, the earlier one first, and its last weight ``(n,)``."""
+        return np.stack((self._kept.start, self._kept.end), axis=1), self._kept.weight
+
+    def recall(self, first: int) -> None:
+        """Forget what the frames after the steps from number ``first`` on look like, and their loops."""
+        self._codes.slice(first)[:] = 0.0
+        self._embeddings.slice(first)[:] = 0.0
+        self._kept = self._kept.where(self._kept.end * self._block <= first)
+
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
         kept = self._kept.where(numbers)

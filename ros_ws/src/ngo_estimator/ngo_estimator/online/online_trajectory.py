@@ -129,7 +129,8 @@ class OnlineTrajectory(CorrectedTrajectory):
 
     def _new_graph(self) -> MetaGraph:
         blocks = self._window // self._block
-        return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, self._network_every)
+        every = self._network_every
+        return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, every, lambda: self._log)
 
     def _checked(self, step: RelativeStep) -> RelativeStep:
         check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_length)

@@ -30,6 +30,8 @@ class LoopSearch:
     is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
     place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
     With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
+    With ``witnesses``, a loop must be as the odometry allows, and others nearby must agree: so many for each of the
+    odometry's deviations by which it is off (``loop_agreement``).
     """
 
     per_pose: int = 4
@@ -39,6 +41,7 @@ class LoopSearch:
     views: int = 5
     registrations: int = 0
     overlaps: int = 0
+    witnesses: int = 0
 
     def __post_init__(self) -> None:
         if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
@@ -48,6 +51,8 @@ class LoopSearch:
             )
         if not 1 <= self.views <= len(VIEWS):
             raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
+        if self.witnesses < 0:
+            raise ValueError(f"witnesses is {self.witnesses}; expected 0 (none) or more")
         if self.registrations < 0:
             raise ValueError(f"registrations is {self.registrations}; expected 0 (none) or more")
         if self.overlaps < 0 or (self.overlaps and not self.registrations):

@@ -19,6 +19,7 @@ from ngo_estimator.networks.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
+from ngo_estimator.optimizer.loop_agreement import agreeing
 from ngo_estimator.optimizer.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
@@ -257,6 +258,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
     def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
         believed = without_contradictions(loops, steps)
+        if self.config.search.witnesses:
+            believed = agreeing(believed, steps, self.config.search.witnesses)
         arguments = (self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
         if torch.is_grad_enabled() or steps.relative.shape[0] != 1 or steps.relative.device.type != "cpu":
             return LoopClosing(*arguments)
