@@ -19,6 +19,7 @@ from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.compiler_memory import release_compiler
 from ngo_estimator.nodes.file_services import FileServices
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.managed_node import ManagedNode
@@ -151,6 +152,7 @@ class NgoNode(ManagedNode):
             self._whole.changed(loops=True)
         self._status.idle = ""
         listening.callback(setattr, self._status, "idle", "inactive")
+        release_compiler()
         name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
         self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 

@@ -21,7 +21,7 @@ from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
-from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses
+from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 from ngo_estimator.optimizer.registered_odometry import registered_steps
@@ -48,15 +48,20 @@ _LEAST_INFORMATION = 1e-12
 
 @dataclass
 class _Running:
-    """An optimisation in progress, of which so many iterations are ``left``."""
+    """An optimisation in progress, of which so many results were ``taken``."""
 
     iterations: Iterator[OptimizedMetaPoses]
-    left: int
     keys: np.ndarray
     first: int
     numbers: np.ndarray
     runs_network: bool
+    taken: int = 0
     result: OptimizedMetaPoses | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether the result is the last one."""
+        return self.result is not None and self.result.left == 0
 
 
 @dataclass(frozen=True)
@@ -426,12 +431,19 @@ class MetaGraph:
         )
         if (fixed := self._fixed.slice(first)).any():
             steps = replace(steps, fixed=torch.from_numpy(fixed.copy()).unsqueeze(0))
-        loops, numbers = None, np.zeros(0, np.int64)
+        loops, numbers, solution = None, np.zeros(0, np.int64), None
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
-        iterations = self._optimizer.iterate(steps, loops, corrections)
+            if corrections is not None:
+                solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
+        iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         runs_network = self._optimizer.config.network and corrections is None
-        self._running = _Running(iterations, self._optimizer.config.iterations, keys, first, numbers, runs_network)
+        self._running = _Running(iterations, keys, first, numbers, runs_network)
+
+    def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
+        """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
+        nodes = torch.from_numpy(self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))])
+        return se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
 
     def _remembered(self) -> list[Correction] | None:
         """What the network gave lately; None where it is time to run it, or where there is none."""
@@ -460,15 +472,15 @@ class MetaGraph:
                 continue
             if self._running is None:
                 self._prepare()
-            elif self._running.left:
+            elif not self._running.done:
                 self._running.result = next(self._running.iterations)
-                self._running.left -= 1
+                self._running.taken += 1
             else:
                 break
             iterations -= 1
         self._begun_s += time.perf_counter() - began
         running = self._running
-        if running is None or running.left or running.result is None:
+        if running is None or running.result is None or not running.done:
             return False
         end = self._scale * running.result.end_covariance()[0].numpy()
         poses = running.result.meta_relative[-1]
@@ -494,9 +506,10 @@ class MetaGraph:
         keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
-            self.loop_std = result.loop_information[0].double().clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
+            information = result.loop_information[0].double()
+            self.loop_std = information.clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
             self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(running.numbers, self.loop_weights)
+            self._loops.weigh(running.numbers, self.loop_weights, information.numpy())
         poses = se2.r2g(result.meta_relative[-1][0].double())
         poses[:, 2] = se2.wrap(poses[:, 2])
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
@@ -581,7 +594,7 @@ class MetaGraph:
         changed.
         """
         running, code = self._running, self._origin_code
-        iterated = 0 if running is None else 1 + self._optimizer.config.iterations - running.left
+        iterated = 0 if running is None else 1 + running.taken
         known = self._corrections
         arrays = {
             "odometry": self.odometry.values,

@@ -1,0 +1,31 @@
+"""What the compiler needed is given back, and compiled functions go on."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ngo_estimator.geometry.planar_motion import compose
+from ngo_estimator.nodes.compiler_memory import release_compiler
+
+
+def code_kb() -> int:
+    """Resident memory of the compiler's code."""
+    resident, counts = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if "-" in line.split()[0]:
+            counts = "libllvmlite" in line and " r-xp " in line
+        elif counts and line.startswith("Rss:"):
+            resident += int(line.split()[1])
+    return resident
+
+
+def test_the_compilers_code_leaves_memory_and_comes_back_where_it_is_needed() -> None:
+    from numba import njit
+
+    pose, step = np.array([1.0, 2.0, 0.5]), np.array([0.1, 0.0, 0.1])
+    before = compose(pose, step)
+    assert code_kb() > 10_000
+    release_compiler()
+    assert code_kb() < 1_000
+    np.testing.assert_array_equal(compose(pose, step), before)
+    assert njit(lambda a: a + 1)(1) == 2
