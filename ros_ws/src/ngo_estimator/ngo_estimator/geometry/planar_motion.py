@@ -1,6 +1,7 @@
 """Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: ``se2`` without torch.
 
-Poses have the shape ``(3,)`` where nothing else is said. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies in ``(-pi, pi]``.
+Poses have the shape ``(3,)`` where nothing else is said. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies
+in ``(-pi, pi]``.
 """
 
 import math

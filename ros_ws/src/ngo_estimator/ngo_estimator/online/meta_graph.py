@@ -487,7 +487,7 @@ class MetaGraph:
         if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running, self._begun, self.took_s = None, False, self._begun_s
-        self._apply(running, running.result)
+        self._apply(running, running.result, end)
         self._pose, self._covariance = self._newest(end)
         self.optimized = True
         return True
@@ -502,7 +502,7 @@ class MetaGraph:
         self._settle()
         return self._begun and self.advance(1 + self._optimizer.config.iterations)
 
-    def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> None:
+    def _apply(self, running: "_Running", result: OptimizedMetaPoses, end: np.ndarray) -> None:
         keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
@@ -516,7 +516,7 @@ class MetaGraph:
         self._before = self._nodes.values[self._active]
         self._nodes.values[self._active[1:]] = poses.numpy()
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
-        self._end, self._information = self._scale * result.end_covariance()[0].numpy(), result.equations
+        self._end, self._information = end, result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
         if running.runs_network and self._network_every > 1:
             self._corrections = _Corrections.of(first, result.corrections)

@@ -322,11 +322,11 @@ class OnlineLoops:
 
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
-        kept = self._kept.where(numbers)
-        odometry = torch.from_numpy(self._odometry.values)
-        offset = se2.between(odometry[kept.start * self._block], odometry[kept.frame + 1])
-        measured = se2.compose(se2.inverse(offset), kept.measured)
-        return np.stack((kept.frame + 1, kept.end * self._block), axis=1), measured.numpy()
+        kept, odometry = self._kept, self._odometry.values
+        frame = kept.frame[numbers] + 1
+        offset = all_between(odometry[kept.start[numbers] * self._block], odometry[frame])
+        measured = all_between(offset, kept.measured.numpy()[numbers])
+        return np.stack((frame, kept.end[numbers] * self._block), axis=1), measured
 
 
 def _at(offsets: _Offsets, which: int) -> np.ndarray:
