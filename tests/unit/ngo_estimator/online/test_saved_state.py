@@ -117,6 +117,23 @@ def test_the_round_trip_holds_where_an_optimisation_is_in_progress_and_key_frame
     assert_same(core, loaded)
 
 
+def test_the_round_trip_holds_at_each_frame_of_a_meta_pose_where_updates_go_on_from_the_last_solution(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    core, steps, resumed = networks("loops", 1, window_frames=160), make_steps(150), []
+    drive(core, steps[:120], range(0))
+    iterate = core._optimizer.iterate
+    monkeypatch.setattr(core._optimizer, "iterate", lambda *given: (resumed.append(given[-1]), iterate(*given))[1])
+    others = []
+    for step in steps[120:136]:
+        for other in [core, *others]:
+            other.update(step)
+        others.append(networks("loops", 1, window_frames=160).restored(core.state()))
+    assert {solution is None for solution in resumed} == {True, False}
+    for other in others:
+        assert_same(core, other)
+
+
 @pytest.mark.parametrize("when", ["while nothing runs", "while it optimises", "after scans are forgotten"])
 def test_the_round_trip_of_a_lidar_is_exact(tmp_path: Path, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = ScanGraphConfig(most_scans=100) if when == "after scans are forgotten" else ScanGraphConfig()
@@ -208,8 +225,8 @@ def test_other_settings_weights_and_formats_are_refused(
     other = OnlineTrajectory(small_optimizer("loops"), small_pair_head(), 32, 2)
     assert refusal(folder, other).startswith(f'{path}: was saved with weights_sha256 "')
     assert refusal(folder, scans()).startswith(f"{path}: was saved with graph null; here it is ")
-    monkeypatch.setattr(saved_state, "FORMAT", 3)
-    assert refusal(folder, core) == f"{path}: is of format 2; expected 3"
+    monkeypatch.setattr(saved_state, "FORMAT", 4)
+    assert refusal(folder, core) == f"{path}: is of format 3; expected 4"
 
 
 def test_a_lidars_other_settings_are_named(tmp_path: Path) -> None:
