@@ -101,7 +101,7 @@ def test_spread_over_steps_with_the_network_run_seldom_the_result_is_the_same(wo
     np.testing.assert_allclose(core.newest().covariance, drive.covariance, rtol=0.1, atol=0.02 * drive.covariance.max())
 
 
-# Shares of the deviation of the newest position; X (2D) and Y (3D) were measured.
+# Of the newest deviation 0.10 (2D, 0.2 mm) and 0.02 (3D) were measured; docs/reference/speed.md has longer drives.
 @pytest.mark.parametrize("world", WORLDS)
 def test_an_update_from_the_last_solution_on_gives_what_one_from_the_odometry_gives(
     world: str, monkeypatch: pytest.MonkeyPatch
@@ -125,7 +125,6 @@ def test_an_update_from_the_last_solution_on_gives_what_one_from_the_odometry_gi
 
     monkeypatch.setattr(core._optimizer, "iterate", both)
     corrected(steps, core)
-    print(world, len(shares), max(moved_m), max(shares))
-    assert len(shares) > 10
+    assert len(shares) >= 10
     assert max(shares) < 0.5
     assert world == "maze3d" or max(moved_m) < 0.001
