@@ -455,6 +455,16 @@ class MetaGraph:
         # A short trajectory changes a lot with each block.
         return None if new >= min(self._network_every, 1 + seen // 8) else known.for_blocks(self._first, self.blocks)
 
+    def _iterate(self) -> int:
+        """Prepare an optimisation, or run its next iteration; how many iterations that counts for."""
+        if self._running is None:
+            self._prepare()
+            return 1
+        self._running.result = next(self._running.iterations)
+        self._running.taken += 1
+        # With the network it takes twice as long, and has a step of its own where the block has enough of them.
+        return _LONG if self._running.runs_network and self._running.result.left <= self._steps_left else 1
+
     @torch.inference_mode()
     def advance(self, iterations: int) -> bool:
         """Run so many iterations of what has begun, or what takes as long and comes before them.
@@ -470,14 +480,9 @@ class MetaGraph:
                 self._do(self._work.pop(0))
                 iterations -= _LONG
                 continue
-            if self._running is None:
-                self._prepare()
-            elif not self._running.done:
-                self._running.result = next(self._running.iterations)
-                self._running.taken += 1
-            else:
+            if self._running is not None and self._running.done:
                 break
-            iterations -= 1
+            iterations -= self._iterate()
         self._begun_s += time.perf_counter() - began
         running = self._running
         if running is None or running.result is None or not running.done:
@@ -493,6 +498,11 @@ class MetaGraph:
         return True
 
     @property
+    def _steps_left(self) -> int:
+        """Steps to come before the one that completes the next block, less one that is kept free."""
+        return max(0, self._block - 2 - (len(self.odometry) - 1) % self._block)
+
+    @property
     def unfinished(self) -> bool:
         """Whether an optimisation has begun that is not done."""
         return self.running
@@ -500,7 +510,11 @@ class MetaGraph:
     def finish(self) -> bool:
         """Do what is left of an optimisation that has begun; returns whether there was one."""
         self._settle()
-        return self._begun and self.advance(1 + self._optimizer.config.iterations)
+        if not self._begun:
+            return False
+        while not self.advance(1):
+            pass
+        return True
 
     def _apply(self, running: "_Running", result: OptimizedMetaPoses, end: np.ndarray) -> None:
         keys, first = running.keys, running.first
@@ -674,8 +688,9 @@ class MetaGraph:
         self._begun = bool(taken(arrays, "begun", np.bool_))
         require(self._begun or not iterated, "an optimisation has not begun, and iterated")
         require(not (left and iterated), "an optimisation has iterated before its time")
-        if iterated:
-            self.advance(iterated)
+        with torch.inference_mode():
+            for _ in range(iterated):
+                self._iterate()
 
     def _restored_corrections(self, arrays: Arrays) -> _Corrections:
         first, iterations = taken_integer(arrays, "first"), self._optimizer.config.iterations
