@@ -114,11 +114,11 @@ class Feed:
             self._wait(stamp)
         return len(frames) / (time.monotonic() - begin)
 
-    def paced(self, frames: Sequence[Frame]) -> list[float]:
-        """Send frames at ``RATE_HZ``; returns how many ms each answer took once all have come."""
+    def paced(self, frames: Sequence[Frame], rate_hz: float = RATE_HZ) -> list[float]:
+        """Send frames at a rate; returns how many ms each answer took once all have come."""
         begin, stamps = time.monotonic(), []
-        for index, frame in enumerate(tqdm(frames, f"{self._name} at {RATE_HZ:g} Hz")):
-            due = begin + index / RATE_HZ
+        for index, frame in enumerate(tqdm(frames, f"{self._name} at {rate_hz:g} Hz")):
+            due = begin + index / rate_hz
             while (left := due - time.monotonic()) > 0.0:
                 self._spin(left)
             stamps.append(self._send(frame))
@@ -202,5 +202,6 @@ def _measured(
             sent = feed.connect(frames[:first], again)
             frames_per_s = feed.fast(frames[sent:first])
             milliseconds = feed.paced(frames[first:])
-            resident_mb = graph.resident_mb(spec.executable)
+            status = Path(f"/proc/{graph.pid(spec.executable)}/status").read_text()
+            resident_mb = int(status.split("VmRSS:")[1].split()[0]) / 1024.0
     return Latencies(milliseconds, frames_per_s, resident_mb)

@@ -123,10 +123,9 @@ class Graph:
         """The exit code of a node that has ended, else None."""
         return self._processes[name].poll()
 
-    def resident_mb(self, name: str) -> float:
-        """Resident memory of a node that runs."""
-        status = Path(f"/proc/{self._processes[name].pid}/status").read_text()
-        return int(status.split("VmRSS:")[1].split()[0]) / 1024.0
+    def pid(self, name: str) -> int:
+        """The process of a node."""
+        return self._processes[name].pid
 
     def check(self) -> None:
         """Raise GraphError for a node that has ended with another exit code than 0."""

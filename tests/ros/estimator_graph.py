@@ -16,7 +16,7 @@ from visualization_msgs.msg import MarkerArray
 from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 
-from .processes import NodeProcess, Probe
+from .processes import Diagnostics, NodeProcess, Probe
 
 STEP_NS = 100_000_000
 RUN_NS = 1_000_000_000_000
@@ -71,14 +71,16 @@ class Graph:
             probe.collect(MarkerArray, "ngo/loops"),
             probe.collect(TFMessage, "/tf"),
         )
+        self.diagnostics = Diagnostics(probe)
         self._base_ns = FIRST_RUN_NS
 
     def connect(self) -> None:
-        """Play runs until every topic has arrived: only then are all publishers and subscribers matched."""
+        """Play runs until every topic has arrived: only then does local_node know that ngo_node listens, too."""
         self.probe.spin_until(
             lambda: self.images.get_subscription_count() and self.actions.get_subscription_count(),
             "subscribers",
         )
+        self.probe.meet("local_node", "ngo_node")
 
         def all_arrived() -> bool:
             self._base_ns -= RUN_NS

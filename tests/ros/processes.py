@@ -13,7 +13,9 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 import rclpy
-from rcl_interfaces.srv import SetParameters
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -24,6 +26,8 @@ from demo.graph import NodeSpec
 
 # Ample for a machine of its own; one that is shared may need more, and `--timeout` of pytest as well.
 TIMEOUT_S = float(os.environ.get("NGO_TEST_TIMEOUT_S", "60"))
+
+_ASK_AGAIN_S = 2.0
 
 Result = TypeVar("Result")
 
@@ -117,6 +121,7 @@ class Probe:
         self.node: Node = rclpy.create_node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Client] = {}
 
     def __enter__(self) -> "Probe":
         return self
@@ -143,16 +148,41 @@ class Probe:
         deadline = time.monotonic() + timeout_s
         while not (result := condition()):
             assert time.monotonic() < deadline, f"waited {timeout_s:g} s for {what}"
-            self._executor.spin_once(timeout_sec=0.05)
+            self._executor.spin_once(timeout_sec=0.02)
         return result
 
+    def meet(self, *nodes: str) -> None:
+        """Wait until running nodes know every publisher and subscription that this one has made so far.
+
+        `get_subscription_count` and `count_publishers` say what this side knows; what a node publishes before it knows
+        of a subscription never comes. Discovery tells of ends in the order in which they were made. Those of the
+        service that is called here come last, so a node that answers knows all of them.
+        """
+        for name in nodes:
+            client = self.node.create_client(GetParameters, f"{name}/get_parameters")
+            self.spin_until(client.service_is_ready, f"service {name}/get_parameters")
+            answers: list[Any] = []
+            asked_s = 0.0
+
+            def answered() -> bool:
+                nonlocal asked_s
+                if time.monotonic() - asked_s > _ASK_AGAIN_S:
+                    asked_s = time.monotonic()
+                    answers.append(client.call_async(GetParameters.Request()))  # noqa: B023
+                return any(answer.done() for answer in answers)  # noqa: B023
+
+            self.spin_until(answered, f"an answer of {name}")
+            self.node.destroy_client(client)
+
     def call(self, service_type: Any, name: str, request: Any) -> Any:
-        """Call a service and return its response."""
-        client = self.node.create_client(service_type, name)
+        """Call a service of a node, NODE/SERVICE, and return its response."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_type, name)
+            self.meet(name.rpartition("/")[0])  # an answer to who is not known yet is lost
+        client = self._clients[name]
         self.spin_until(client.service_is_ready, f"service {name}")
         future = client.call_async(request)
         self.spin_until(future.done, f"an answer of {name}")
-        self.node.destroy_client(client)
         return future.result()
 
     def set_parameter(self, node: str, name: str, value: Any) -> str:
@@ -169,3 +199,54 @@ class Probe:
             yield
         finally:
             assert self.set_parameter(node, "source_timeout_s", usual_s) == ""
+
+
+class Diagnostics:
+    """What nodes say about themselves on /diagnostics; nodes are named in full."""
+
+    def __init__(self, probe: Probe) -> None:
+        self._probe = probe
+        self._since_ns = 0
+        self._arrays: list[DiagnosticArray] = []
+        probe.node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 1000)
+
+    def _take(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+        if info["source_timestamp"] >= self._since_ns:
+            self._arrays.append(message)
+
+    def clear(self) -> None:
+        """Forget what was said up to now, also what is still on its way."""
+        self._since_ns = time.time_ns()
+        self._arrays.clear()
+
+    def arrays(self, node: str) -> list[DiagnosticArray]:
+        """The messages of a node since then, which hold one status each."""
+        return [array for array in self._arrays if array.status[0].name == node]
+
+    def statuses(self, node: str) -> list[DiagnosticStatus]:
+        """What a node said since then."""
+        return [array.status[0] for array in self.arrays(node)]
+
+    def values(self, node: str) -> dict[str, str]:
+        """The newest values that a node said; empty: it said nothing."""
+        return {entry.key: entry.value for status in self.statuses(node)[-1:] for entry in status.values}
+
+    def wait_for_problem(self, node: str, *texts: str) -> str:
+        """Wait until a node has warned with these texts, and return the message."""
+
+        def found() -> str:
+            for status in self.statuses(node):
+                if status.level == DiagnosticStatus.WARN and all(text in status.message for text in texts):
+                    return str(status.message)
+            return ""
+
+        return self._probe.spin_until(found, f"a warning of {node} with {texts} in diagnostics")
+
+    def wait_for_value(self, node: str, key: str, accepted: Callable[[str], Any]) -> str:
+        """Wait until a node's newest value of ``key`` is accepted, and return it."""
+
+        def found() -> str | None:
+            value = self.values(node).get(key)
+            return value if value is not None and accepted(value) else None
+
+        return str(self._probe.spin_until(found, f"a fitting '{key}' of {node} in diagnostics"))

@@ -113,8 +113,10 @@ def running_nodes() -> Iterator[dict[str, NodeFacts]]:
             for process in processes:
                 assert process.running, process.log
             ready = all("ready: " in process.log for process in processes)
+            known = NODES.keys() <= set(probe.node.get_node_names())
             listeners = {"/odom": 2, "/ngo/pose": 3}
-            return ready and all(probe.node.count_subscribers(topic) == count for topic, count in listeners.items())
+            heard = all(probe.node.count_subscribers(topic) == count for topic, count in listeners.items())
+            return ready and known and heard
 
         probe.spin_until(complete, "all nodes")
         yield facts

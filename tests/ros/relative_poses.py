@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
+from std_srvs.srv import SetBool
 
 from ngo_estimator.checkpoint import OPTIMIZER, PLACE, PlaceNetworks, save_checkpoint
 from ngo_estimator.geometry import se2
@@ -18,7 +19,7 @@ from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 from tests.unit.ngo_estimator.samples import place_config, small_optimizer
 
 from .estimator_graph import FIRST_RUN_NS, RUN_NS, STEP_NS
-from .processes import NodeProcess, Probe
+from .processes import Diagnostics, NodeProcess, Probe
 
 POSITION_STD_M = 0.01
 WORLD = "maze2d"
@@ -96,21 +97,19 @@ class Optimizer:
         self.poses: list[PoseWithCovarianceStamped] = probe.collect(
             PoseWithCovarianceStamped, f"{namespace}/ngo/pose", 5000
         )
-        self.diagnostics: list[DiagnosticArray] = probe.collect(DiagnosticArray, "/diagnostics")
+        self.diagnostics = Diagnostics(probe)
         self._origin_ns = FIRST_RUN_NS
         self.connect()
 
     def connect(self) -> None:
-        """Drive until a pose comes: only then do both ends know each other."""
+        """Meet the node, and see it answer."""
+        self.meet()
+        self.pose_after(self.drive().step(1))
+
+    def meet(self) -> None:
+        """Wait until node and probe know each other's ends of all topics."""
         self.probe.spin_until(lambda: self.publisher.get_subscription_count() == 1, "ngo_node's subscription")
-
-        def arrived() -> bool:
-            if not self.poses:
-                self.publish(self.drive().step(1))
-            return bool(self.poses)
-
-        self.probe.spin_until(arrived, "a pose")
-        self.wait_for_stamp(self._origin_ns + STEP_NS)
+        self.probe.meet(self.name)
 
     def drive(self, seed: int = 0, period_ns: int = STEP_NS) -> Drive:
         """A drive of a restarted source, long before the last one; nothing that it gives has come yet."""
@@ -140,42 +139,36 @@ class Optimizer:
         """The stamps of the poses of this drive, in the order in which they came."""
         return [to_ns(pose.header.stamp) for pose in self.poses]
 
-    def expected(self, messages: list[RelativePose]) -> TrajectoryUpdate:
+    def expected(self, messages: list[RelativePose], optimize: bool = True) -> TrajectoryUpdate:
         """What the core says after these messages, from the beginning."""
         self.core.reset()
         for message in messages:
-            update = self.core.update(relative_step(message))
+            update = self.core.update(relative_step(message), optimize=optimize)
         return update
 
+    def pause(self, paused: bool) -> str:
+        """Have poses follow the odometry, or corrections go on; returns what the node says to it."""
+        response = self.probe.call(SetBool, f"{self.name}/pause", SetBool.Request(data=paused))
+        assert response.success, response.message
+        return str(response.message)
+
     def wait_for_problem(self, *texts: str) -> str:
-        """Wait until the node's diagnostics warn with these texts, and return the message."""
-
-        def found() -> str:
-            for status in self.statuses():
-                if status.level == DiagnosticStatus.WARN and all(text in status.message for text in texts):
-                    return str(status.message)
-            return ""
-
+        """Wait until the node's diagnostics warn from now on with these texts, and return the message."""
         self.diagnostics.clear()
-        return self.probe.spin_until(found, f"a warning with {texts} in diagnostics")
+        return self.diagnostics.wait_for_problem(self.name, *texts)
 
     def wait_for_value(self, key: str, accepted: Any) -> str:
-        """Wait until the diagnostics' value of ``key`` is accepted, and return it."""
-
-        def found() -> str | None:
-            values = [entry.value for status in self.statuses()[-1:] for entry in status.values if entry.key == key]
-            return next((value for value in values if accepted(value)), None)
-
+        """Wait until the diagnostics' value of ``key`` is accepted from now on, and return it."""
         self.diagnostics.clear()
-        return str(self.probe.spin_until(found, f"a fitting '{key}' in diagnostics"))
+        return self.diagnostics.wait_for_value(self.name, key, accepted)
 
     def count(self, key: str) -> int:
-        """The newest count of ``key``, once diagnostics have come."""
+        """The count of ``key`` as it is now."""
         return int(self.wait_for_value(key, str.isdigit))
 
     def statuses(self) -> list[DiagnosticStatus]:
         """What the node said about itself since the list was cleared."""
-        return [status for array in self.diagnostics for status in array.status if status.name == self.name]
+        return self.diagnostics.statuses(self.name)
 
 
 def assert_pose_is(message: PoseWithCovarianceStamped, update: TrajectoryUpdate) -> None:

@@ -2,8 +2,10 @@
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,6 @@ from ngo_msgs.msg import Trajectory
 from ngo_msgs.srv import SaveTrajectory
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes.messages import planar_estimate, pose_message, relative_step, to_ns
@@ -58,18 +59,13 @@ def xyyaw(pose: Any) -> np.ndarray:
 
 
 def test_paused_it_follows_the_odometry_and_then_catches_up(optimizer: Optimizer) -> None:
-    def pause(paused: bool) -> str:
-        response = optimizer.probe.call(SetBool, "ngo_node/pause", SetBool.Request(data=paused))
-        assert response.success
-        return str(response.message)
-
     drive = optimizer.drive()
     steps = drive.steps(1, 72)
     optimizer.pose_after(*steps[:12])
-    assert pause(True) == "paused: poses follow the odometry"
+    assert optimizer.pause(True) == "paused: poses follow the odometry"
     optimizer.pose_after(*steps[12:50])
     optimizer.wait_for_value("paused", "true".__eq__)
-    assert pause(False) == "corrections go on"
+    assert optimizer.pause(False) == "corrections go on"
     optimizer.pose_after(*steps[50:])
     optimizer.core.reset()
     for k, step in enumerate(steps):
@@ -144,6 +140,7 @@ def test_an_initial_pose_moves_pose_path_and_transform(optimizer: Optimizer) -> 
     given = probe.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
     trajectories, transforms = probe.collect(Trajectory, "ngo/trajectory"), probe.collect(TFMessage, "/tf")
     probe.spin_until(lambda: given.get_subscription_count() == 1, "ngo_node's subscription")
+    optimizer.meet()
     drive = optimizer.drive()
     optimizer.pose_after(*drive.steps(1, 20))
     wanted, covariance = np.array([5.0, -3.0, 2.0]), np.diag([0.04, 0.09, 0.01])
@@ -188,6 +185,7 @@ def test_smoothed_corrections_reach_the_transform_little_by_little(optimizer: Op
     """As many steps as leave no optimisation unfinished, which would end by a transform of its own."""
     probe = optimizer.probe
     transforms = probe.collect(TFMessage, "/tf")
+    optimizer.meet()
     assert probe.set_parameter("ngo_node", "tf_smoothing_s", 1.0) == ""
     drive = optimizer.drive()
     steps = drive.steps(1, 45)
@@ -222,9 +220,10 @@ def test_the_path_comes_at_its_rate_and_only_to_those_who_listen(optimizer: Opti
     assert [len(path.poses) for path in own] == list(range(2, 32))
     assert probe.set_parameter("ngo_node", "path_rate_hz", 2.0) == ""
     paths.clear()
+    begin_s = time.monotonic()
     optimizer.pose_after(*drive.steps(31, 100))
     probe.spin_until(lambda: paths and len(paths[-1].poses) == 101, "the newest path when it is time")
-    assert len(paths) <= 4
+    assert len(paths) <= 2.0 * (time.monotonic() - begin_s) + 2
     assert probe.set_parameter("ngo_node", "path_rate_hz", 10.0) == ""
 
 
@@ -252,7 +251,11 @@ def test_quality_of_service_is_overridden_by_ros_own_parameters(parameters: dict
             "-p",
             f"{override}.depth:=3",
         )
-        with NodeProcess("ngo_estimator", "ngo_node", parameters, arguments) as process:
+        refused = ("-r", "__ns:=/refused", "-p", "qos_overrides./refused/ngo/path.publisher.reliability:=sometimes")
+        with (
+            NodeProcess("ngo_estimator", "ngo_node", parameters, arguments) as process,
+            NodeProcess("ngo_estimator", "ngo_node", parameters, refused) as bad,
+        ):
             process.wait_for_log("ready")
             probe.collect(PathMessage, "/latched/ngo/path", latched)
 
@@ -261,10 +264,8 @@ def test_quality_of_service_is_overridden_by_ros_own_parameters(parameters: dict
                 return infos[0].qos_profile.durability if infos else None
 
             probe.spin_until(lambda: durability() == DurabilityPolicy.TRANSIENT_LOCAL, "a latched path")
-        bad = ("-r", "__ns:=/latched", "-p", f"{override}.reliability:=sometimes")
-        with NodeProcess("ngo_estimator", "ngo_node", parameters, bad) as process:
-            assert process.wait() == 2, process.log
-            assert len(process.lines) == 1 and "reliability" in process.log.lower(), process.log
+            assert bad.wait() == 2, bad.log
+            assert len(bad.lines) == 1 and "reliability" in bad.log.lower(), bad.log
 
 
 # ---- life cycle
@@ -320,8 +321,8 @@ def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: di
             # Cleaned up it has forgotten everything.
             assert node.change(Transition.TRANSITION_DEACTIVATE) and node.change(Transition.TRANSITION_CLEANUP)
             assert node.state() == "unconfigured"
+            probe.spin_until(lambda: optimizer.publisher.get_subscription_count() == 0, "ngo_node to stop listening")
             assert node.change(Transition.TRANSITION_CONFIGURE) and node.change(Transition.TRANSITION_ACTIVATE)
-            optimizer.drive()
             optimizer.connect()
             drive = optimizer.drive()
             assert_pose_is(optimizer.pose_after(*drive.steps(1, 5)), optimizer.expected(drive.steps(1, 5)))
@@ -362,8 +363,6 @@ def test_two_robots_in_one_domain_do_not_meet(weights: Path, parameters: dict[st
         transforms = {topic: probe.collect(TFMessage, topic) for topic in set(topics)}
         both = {name: Optimizer(process, weights, probe, f"/{name}") for name, (_, process) in robots.items()}
         drives = {name: optimizer.drive(seed=robots[name][0]) for name, optimizer in both.items()}
-        for messages in transforms.values():
-            messages.clear()
         for step in range(1, 29):
             for name, optimizer in both.items():
                 optimizer.publish(drives[name].step(step))
@@ -373,7 +372,17 @@ def test_two_robots_in_one_domain_do_not_meet(weights: Path, parameters: dict[st
             assert pose.header.frame_id == f"{prefixes[name]}map"
             assert_pose_is(pose, optimizer.expected(drives[name].steps(1, 28)))
             assert len(optimizer.poses) == 28
-        probe.spin_until(lambda: sum(map(len, transforms.values())) == 56, "all transforms")
         for name, topic in zip(("red", "blue"), topics, strict=True):
-            frames = [(m.transforms[0].header.frame_id, m.transforms[0].child_frame_id) for m in transforms[topic]]
-            assert frames.count((f"{prefixes[name]}map", f"{prefixes[name]}odom")) == 28
+            frames = f"{prefixes[name]}map", f"{prefixes[name]}odom"
+            stamps_ns = [drives[name].stamp_ns(step) for step in range(1, 29)]
+            # Those of the robot's drives before are later.
+            own = partial(transform_stamps_ns, transforms[topic], frames, until_ns=stamps_ns[-1])
+            probe.spin_until(lambda own=own: len(own()) >= 28, f"the transforms of {name}")
+            assert own() == stamps_ns
+
+
+def transform_stamps_ns(messages: list[TFMessage], frames: tuple[str, str], until_ns: int) -> list[int]:
+    """The stamps of the transforms between these frames."""
+    found = [message.transforms[0] for message in messages]
+    found = [each for each in found if (each.header.frame_id, each.child_frame_id) == frames]
+    return [stamp_ns for each in found if (stamp_ns := to_ns(each.header.stamp)) <= until_ns]

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 from ngo_estimator.checkpoint import write_untrained
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
 
 DEMO = Path(__file__).parents[2] / "demo" / "run.py"
 FRAMES = 30
@@ -52,7 +52,8 @@ def test_ends_with_the_table_as_json(weights: Path, tmp_path: Path) -> None:
     assert summary is not None and summary.statistics is not None
     counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
     assert counts["/image"] == counts["/ground_truth"] == FRAMES
-    assert counts["/odom"] == counts["/ngo/path"] == counts["/ngo/pose"] == FRAMES - 1
+    assert counts["/odom"] == counts["/ngo/pose"] == FRAMES - 1
+    assert counts["/ngo/path"] >= FRAMES - 1, "one more where an optimisation ends by itself"
 
 
 def test_says_which_node_failed_and_why(tmp_path: Path) -> None:

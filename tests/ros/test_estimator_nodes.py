@@ -4,6 +4,7 @@ The expensive part is to start a node, so most tests share one pair. Each plays 
 start long before those of the run before it, which is what a restarted simulator looks like.
 """
 
+import re
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -12,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diagnostic_msgs.msg import DiagnosticArray
 from evo.tools import file_interface
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
@@ -168,7 +168,7 @@ def unusable_images() -> list[Image]:
 
 
 def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
-    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.diagnostics.clear()
     graph.start_run()
     graph.play(0, 1)
     graph.action(1)
@@ -181,8 +181,7 @@ def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
     assert graph.steps() == [(0, 1), (1, 3)]
 
     def dropped() -> int:
-        statuses = [status for array in diagnostics for status in array.status if status.name == "/local_node"]
-        values = {entry.key: entry.value for status in statuses for entry in status.values}
+        values = graph.diagnostics.values("/local_node")
         return sum(int(value) for key, value in values.items() if key.startswith("dropped: image"))
 
     graph.probe.spin_until(lambda: dropped() >= len(images), "a count of the dropped images")
@@ -265,26 +264,24 @@ def test_who_comes_late_gets_the_newest_path_at_once(graph: Graph) -> None:
 
 
 def test_diagnostics_tell_rates_times_and_the_window(graph: Graph) -> None:
-    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.diagnostics.clear()
     graph.finish_run(frames=7)
 
-    def newest(name: str) -> dict[str, str]:
-        values: dict[str, str] = {}
-        for array in diagnostics:
-            for status in array.status:
-                if status.name == name:
-                    values.update({entry.key: entry.value for entry in status.values})
-        return values
+    def said(name: str) -> set[str]:
+        return {entry.key for status in graph.diagnostics.statuses(name) for entry in status.values}
 
-    graph.probe.spin_until(lambda: newest("/ngo_node").get("frames") == "7", "ngo_node's diagnostics")
-    graph.probe.spin_until(lambda: newest("/local_node"), "local_node's diagnostics")
+    graph.diagnostics.wait_for_value("/ngo_node", "frames", "7".__eq__)
     assert {
         "input rate (Hz)", "received", "dropped", "time an update, mean (ms)", "time an update, max (ms)",
         "window fill", "gaps", "loops", "last correction, largest move (m)", "paused", "restarts",
         "standard deviation of the position (m)", "map_from_odom (x m, y m, yaw rad)",
-    } <= set(newest("/ngo_node"))  # fmt: skip
-    assert {"input rate (Hz)", "images waiting for actions", "missed frames", "restarts"} <= set(newest("/local_node"))
-    assert to_ns(diagnostics[-1].header.stamp) in (0, *(graph.stamp_ns(step) for step in range(7)))
+    } <= said("/ngo_node")  # fmt: skip
+    graph.probe.spin_until(
+        lambda: {"input rate (Hz)", "images waiting for actions", "missed frames", "restarts"} <= said("/local_node"),
+        "local_node's diagnostics",
+    )
+    newest = graph.diagnostics.arrays("/ngo_node")[-1]
+    assert to_ns(newest.header.stamp) == graph.stamp_ns(6)
 
 
 def test_sigint_ends_both_with_code_zero_and_no_traceback(graph: Graph) -> None:
@@ -342,9 +339,15 @@ def test_switches_names_and_the_3d_world(weights: Path) -> None:
         probe.spin_until(pose_arrived, "a pose")
         assert poses[0].header.frame_id == "world"
         assert relative_poses[0].header.frame_id == "robot"
-        for name in ("local_node", "ngo_node"):
-            published = dict(probe.node.get_publisher_names_and_types_by_node(name, "/red"))
-            assert not {"/tf", "/red/odom"} & set(published)
+        for name, topic in (("local_node", "/red/relative_pose"), ("ngo_node", "/red/ngo/pose")):
+
+            def published(name: str = name) -> set[str]:
+                if (name, "/red") not in probe.node.get_node_names_and_namespaces():
+                    return set()
+                return {topic for topic, _ in probe.node.get_publisher_names_and_types_by_node(name, "/red")}
+
+            probe.spin_until(lambda topic=topic, published=published: topic in published(), f"{name} in the graph")
+            assert not {"/tf", "/red/odom"} & published()
         (info,) = probe.node.get_subscriptions_info_by_topic("/red/camera/image")
         assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         for process in (local, ngo):
@@ -384,12 +387,20 @@ ngo_node   weights:=/nowhere       there is no folder '/nowhere'
 """
 
 
+def assert_refused(process: NodeProcess, pattern: str) -> None:
+    """The node ends with exit code 2 and with one line, which matches the pattern."""
+    assert process.wait() == 2, process.log
+    assert len(process.lines) == 1 and re.search(pattern, process.log), process.log
+
+
 def test_bad_parameters_end_the_start_with_one_line_and_code_two() -> None:
-    for executable, argument, pattern in (line.split(maxsplit=2) for line in BAD_STARTS.strip().splitlines()):
-        with NodeProcess("ngo_estimator", executable, None, ("-p", argument)) as process:
-            assert process.wait() == 2, process.log
-            process.wait_for_log(pattern)
-            assert len(process.lines) == 1, process.log
+    with ExitStack() as stack:  # at once, on all cores
+        started = [
+            (stack.enter_context(NodeProcess("ngo_estimator", executable, None, ("-p", argument))), pattern)
+            for executable, argument, pattern in (line.split(maxsplit=2) for line in BAD_STARTS.strip().splitlines())
+        ]
+        for process, pattern in started:
+            assert_refused(process, pattern)
 
 
 def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp_path: Path) -> None:
@@ -403,8 +414,13 @@ def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp
         ("local_node", "maze2d", weights / "maze3d"): "was trained for the world 'maze3d'; expected 'maze2d'",
         ("ngo_node", "maze3d", weights): "cannot be read",
     }
-    for (executable, world, folder), pattern in cases.items():
-        with NodeProcess("ngo_estimator", executable, {"world": world, "weights": str(folder)}) as process:
-            assert process.wait() == 2, process.log
-            process.wait_for_log(pattern)
-            assert len(process.lines) == 1, process.log
+    with ExitStack() as stack:
+        started = [
+            (
+                stack.enter_context(NodeProcess("ngo_estimator", executable, {"world": world, "weights": str(folder)})),
+                pattern,
+            )
+            for (executable, world, folder), pattern in cases.items()
+        ]
+        for process, pattern in started:
+            assert_refused(process, pattern)

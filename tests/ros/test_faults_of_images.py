@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import rclpy
 import torch
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset
@@ -28,7 +27,7 @@ from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
 
 from .estimator_graph import RUN_NS, STEP_NS, Graph, image_message, scan
-from .processes import NodeProcess, Probe
+from .processes import Diagnostics, NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -65,19 +64,6 @@ def graph(parameters: dict[str, Any]) -> Iterator[Graph]:
                 assert process.running and "Traceback" not in process.log, process.log
 
 
-def wait_for_problem(probe: Probe, node: str, diagnostics: list[DiagnosticArray], *texts: str) -> None:
-    """Wait until a node's diagnostics warn with these texts."""
-
-    def found() -> bool:
-        statuses = [status for array in diagnostics for status in array.status if status.name == node]
-        return any(
-            status.level == DiagnosticStatus.WARN and all(text in status.message for text in texts)
-            for status in statuses
-        )
-
-    probe.spin_until(found, f"a warning of {node} with {texts}")
-
-
 def test_a_burst_of_images_is_taken_whole(graph: Graph) -> None:
     graph.start_run()
     graph.play(*range(300))
@@ -99,7 +85,7 @@ def test_images_of_200_hz_are_taken_as_they_come(graph: Graph) -> None:
 
 def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Graph) -> None:
     """Killed and back half a minute later: the odometry goes on, and says how little it knows of the time between."""
-    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.diagnostics.clear()
     graph.start_run()
     graph.play(*range(6))
     graph.action(299)
@@ -122,8 +108,8 @@ def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Grap
     assert (std[5] > 10 * std[4]).all()
     corrected = [np.sqrt(pose.pose.covariance[0]) for pose in graph.out.poses]
     assert corrected[5] > 20.0 > corrected[4]
-    wait_for_problem(graph.probe, "/local_node", diagnostics, "294 frames missing between images")
-    wait_for_problem(graph.probe, "/ngo_node", diagnostics, "lost: the standard deviation of the position is")
+    graph.diagnostics.wait_for_problem("/local_node", "294 frames missing between images")
+    graph.diagnostics.wait_for_problem("/ngo_node", "lost: the standard deviation of the position is")
 
 
 def test_reset_of_local_node_is_a_new_origin(graph: Graph) -> None:
@@ -137,7 +123,7 @@ def test_reset_of_local_node_is_a_new_origin(graph: Graph) -> None:
 
 
 def test_of_two_cameras_on_one_topic_the_first_is_held_and_both_are_named(graph: Graph) -> None:
-    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.diagnostics.clear()
     graph.start_run()
     graph.play(*range(3))
     graph.wait_for_step(2)
@@ -146,15 +132,22 @@ def test_of_two_cameras_on_one_topic_the_first_is_held_and_both_are_named(graph:
     try:
         second.spin_until(lambda: images.get_subscription_count() == 1, "a match")
         with graph.probe.patient("local_node", SOURCE_TIMEOUT_S):
-            for step in range(3, 20):
+            step, both = 2, "/probe and /second_camera publish on '/image'"
+
+            def named() -> bool:
+                nonlocal step
+                step += 1
                 graph.play(step)
                 images.publish(image_message(scan(1000 + step), graph.stamp_ns(step) + 1 - RUN_NS * (step % 2)))
                 graph.wait_for_step(step)
-        assert graph.steps() == [(step, step + 1) for step in range(19)]
-        for estimate, message in zip(graph.expected(*range(20)), graph.out.relative_poses, strict=True):
+                # The node may hear of a publisher before it hears of its name.
+                return step >= 19 and f"dropped message on image: {both}" in graph.local.log
+
+            graph.probe.spin_until(named, "a warning that names both")
+        assert graph.steps() == [(k, k + 1) for k in range(step)]
+        for estimate, message in zip(graph.expected(*range(step + 1)), graph.out.relative_poses, strict=True):
             np.testing.assert_allclose(message.odom_x, estimate.odom_xyyaw[0], atol=1e-6)
-        wait_for_problem(graph.probe, "/local_node", diagnostics, "/probe and /second_camera publish on '/image'")
-        graph.local.wait_for_log("dropped message on image: /probe and /second_camera publish on '/image'")
+        graph.diagnostics.wait_for_problem("/local_node", both)
     finally:
         second.node.destroy_publisher(images)
         second.close()
@@ -174,7 +167,7 @@ def test_an_image_publisher_of_another_qos_is_named(graph: Graph) -> None:
 
 def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, parameters: dict[str, Any]) -> None:
     """Started twice by mistake: ngo_node used to begin anew with every message."""
-    diagnostics = graph.probe.collect(DiagnosticArray, "/diagnostics")
+    graph.diagnostics.clear()
     graph.start_run()
     graph.play(0, 1, 2)
     graph.wait_for_step(2)
@@ -200,7 +193,7 @@ def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, p
 
         with graph.probe.patient("ngo_node", SOURCE_TIMEOUT_S):
             graph.probe.spin_until(refused, "a warning that names both")
-        wait_for_problem(graph.probe, "/ngo_node", diagnostics, "/local_node and /twin publish on '/relative_pose'")
+        graph.diagnostics.wait_for_problem("/ngo_node", "/local_node and /twin publish on '/relative_pose'")
     assert graph.ngo.log.count("restarted, so") == restarts
     assert [to_ns(pose.header.stamp) for pose in graph.out.poses] == [graph.stamp_ns(k) for k in range(1, step)]
 
@@ -229,14 +222,13 @@ def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
             images = probe.node.create_publisher(Image, "/broken/image", 100)
             actions = probe.node.create_publisher(DiscreteAction, "/broken/action", 100)
             relative_poses = probe.collect(RelativePose, "/broken/relative_pose")
-            diagnostics = probe.collect(DiagnosticArray, "/diagnostics")
+            diagnostics = Diagnostics(probe)
 
             def spin_until(condition: Callable[[], object], what: str) -> None:
                 probe.spin_until(lambda: executor.spin_once(timeout_sec=0.01) or condition(), what)
 
-            ends = images.get_subscription_count, actions.get_subscription_count
-            spin_until(lambda: all(end() for end in ends), "the node's subscriptions")
-            spin_until(lambda: probe.node.count_publishers("/broken/relative_pose"), "the node's publisher")
+            ends = images, actions, node._relative_pose
+            spin_until(lambda: all(end.get_subscription_count() for end in ends), "both sides' subscriptions")
             for step in range(6):
                 action = DiscreteAction(action=0)
                 action.header.stamp = to_time(RUN_NS + step * STEP_NS)
@@ -246,11 +238,8 @@ def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
             spin_until(lambda: relative_poses and to_ns(relative_poses[-1].header.stamp) == last_ns, "the last step")
             assert broken_ns not in {to_ns(message.header.stamp) for message in relative_poses}
 
-            def counted() -> bool:
-                values = {pair.key: pair.value for message in diagnostics for pair in message.status[0].values}
-                return values.get("dropped: message on 'image'") == "1"
-
-            spin_until(counted, "the dropped frame among the diagnostics")
+            dropped = "dropped: message on 'image'"
+            spin_until(lambda: diagnostics.values("/broken/local_node").get(dropped) == "1", "the frame in diagnostics")
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

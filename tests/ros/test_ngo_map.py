@@ -27,7 +27,7 @@ from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan
 
 from .processes import NodeProcess, Probe
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 STEP_NS, BEGIN_NS = 100_000_000, 50_000_000_000
@@ -164,7 +164,7 @@ def test_small_changes_are_sent_as_updates_where_everybody_takes_them(mapper: Ma
     """A few poses that move change a part; the whole goes out again for one who takes no updates."""
     updates: list[OccupancyGridUpdate] = []
     taking = mapper.probe.node.create_subscription(OccupancyGridUpdate, "map_updates", updates.append, 10)
-    mapper.probe.spin_until(lambda: mapper.probe.node.count_publishers("/map_updates") == 1, "the topic of updates")
+    mapper.probe.meet("ngo_map")
     moved = poses(30)
     moved[-3:, :2] += 0.3
     mapper.maps.clear()
@@ -222,7 +222,7 @@ def test_a_saved_map_is_there_again_after_a_restart(mapper: Mapper, tmp_path: Pa
         answer = mapper.probe.call(SaveState, "ngo_map/save_state", SaveState.Request(path=name))
         assert answer.success == (said == "wrote ") and answer.message.startswith(said)
     with running("/again", state=str(tmp_path / "scans")) as again:
-        assert "they wait for their trajectory" in again.process.log
+        again.process.wait_for_log("they wait for their trajectory")
         again.trajectories.publish(trajectory(CORRECTED))
         again.wait_for_map(expected(30, CORRECTED))
     with NodeProcess(

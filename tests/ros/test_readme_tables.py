@@ -1,7 +1,9 @@
 """The tables of parameters, topics and services in docs/reference match the nodes."""
 
 import re
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -16,13 +18,23 @@ from .readme_tables import (
     table_rows,
 )
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+
+DISCOVERY_S = 30.0
 
 
 @pytest.fixture(scope="module")
 def nodes() -> Iterator[dict[str, NodeFacts]]:
     with running_nodes() as facts:
         yield facts
+
+
+def once_equal(look: Callable[[], set[Any]], expected: set[Any]) -> set[Any]:
+    """What is seen once it is what is expected, or at last: discovery tells of a node's ends one after another."""
+    deadline_s = time.monotonic() + DISCOVERY_S
+    while (seen := look()) != expected and time.monotonic() < deadline_s:
+        time.sleep(0.1)
+    return seen
 
 
 def test_parameters(nodes: dict[str, NodeFacts]) -> None:
@@ -36,8 +48,9 @@ def test_parameters(nodes: dict[str, NodeFacts]) -> None:
 
 
 def test_topics(nodes: dict[str, NodeFacts]) -> None:
-    declared = set().union(*(node.endpoints() for node in nodes.values()))
-    assert sorted(documented_endpoints(TOPICS_AND_SERVICES.read_text())) == sorted(declared)
+    documented = documented_endpoints(TOPICS_AND_SERVICES.read_text())
+    declared = once_equal(lambda: set().union(*(node.endpoints() for node in nodes.values())), documented)
+    assert sorted(documented) == sorted(declared)
 
 
 def test_services(nodes: dict[str, NodeFacts]) -> None:
@@ -46,4 +59,4 @@ def test_services(nodes: dict[str, NodeFacts]) -> None:
         name = re.sub("^~", "/" + node.strip("`"), service.strip("`"))
         package, short = kind.strip("`").split("/")
         documented.add((name, f"{package}/srv/{short}"))
-    assert documented == set().union(*(node.services() for node in nodes.values()))
+    assert documented == once_equal(lambda: set().union(*(node.services() for node in nodes.values())), documented)

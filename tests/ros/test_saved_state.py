@@ -79,9 +79,13 @@ class Loaded:
 
     def take(self, steps: list[RelativePose]) -> None:
         """Publish relative poses."""
-        self.probe.spin_until(lambda: self._publisher.get_subscription_count() == 1, "ngo_node's subscription")
+        self.wait_for_subscriptions(1)
         for step in steps:
             self._publisher.publish(step)
+
+    def wait_for_subscriptions(self, count: int) -> None:
+        """Wait until as many subscriptions of relative poses are known."""
+        self.probe.spin_until(lambda: self._publisher.get_subscription_count() == count, f"{count} subscriptions")
 
     def load(self, path: str = "office", mode: int = LoadState.Request.CONTINUE) -> LoadState.Response:
         """Call the service."""
@@ -121,6 +125,7 @@ def test_a_state_is_loaded_where_the_node_runs_already(loaded: Loaded, drive: Dr
     node = Managed(loaded.probe, "ngo_node")
     if state == "inactive":
         assert node.change(Transition.TRANSITION_DEACTIVATE)
+        loaded.wait_for_subscriptions(0)
     response = loaded.load()
     assert response.success, response.message
     assert response.message.startswith("loaded 61 poses from ") and response.message.endswith("/office")

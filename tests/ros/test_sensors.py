@@ -23,7 +23,7 @@ from tests.unit.ngo_estimator.samples import SCAN
 
 from .processes import NodeProcess, Probe
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
 
 FRAMES = 25
 STEP_NS = 100_000_000
@@ -40,6 +40,13 @@ def probe() -> Iterator[Probe]:
         yield probe
 
 
+def let_begin(simulator: NodeProcess, probe: Probe) -> None:
+    """Subscribe to the image, for which the simulator waits, when it has long known who listens to its scans."""
+    simulator.wait_for_log("ready: ")
+    probe.meet("maze2d")
+    probe.collect(Image, "image")
+
+
 def assert_same_motion(core: LocalOdometry, message: RelativePose, image: np.ndarray, twist: np.ndarray | None) -> None:
     estimate = core.update(to_ns(message.header.stamp), image, None, twist)
     assert estimate is not None and to_ns(message.from_stamp) == estimate.from_stamp_ns
@@ -52,13 +59,13 @@ def test_the_simulators_laser_becomes_odometry(probe: Probe, tmp_path: Path) -> 
     core = LocalOdometry.load(tmp_path, "our_robot")
     scans, odometry = probe.collect(LaserScan, "scan"), probe.collect(Odometry, "odom")
     relative_poses = probe.collect(RelativePose, "relative_pose")
-    probe.collect(Image, "image")  # last: the simulator waits for this one
     settings = {"world": "our_robot", "weights": str(tmp_path), **RELIABLE}
     maze = {"frames": FRAMES, "rate": 0.0, "flow_control_topics": ["odom"], **WAITING}
     with NodeProcess("ngo_estimator", "local_node", settings) as local:
         local.wait_for_log("ready: /local_node, our_robot, LaserScan on '/scan'")
-        probe.spin_until(lambda: probe.node.count_publishers("odom"), "the estimator")
+        probe.meet("local_node")
         with NodeProcess("ngo_sim", "maze2d", maze) as simulator:
+            let_begin(simulator, probe)
             probe.spin_until(lambda: len(odometry) == len(relative_poses) == FRAMES - 1, "odometry of every scan")
             probe.spin_until(lambda: len(scans) == FRAMES, "every scan")
             assert simulator.wait() == 0, simulator.log
@@ -89,13 +96,10 @@ def test_compressed_pictures_and_velocities_become_odometry(probe: Probe, tmp_pa
     with NodeProcess("ngo_estimator", "local_node", settings) as local:
         local.wait_for_log("ready: /local_node, our_robot, CompressedImage on '/camera/compressed'")
         probe.spin_until(
-            lambda: (
-                images.get_subscription_count()
-                and twists.get_subscription_count()
-                and probe.node.count_publishers("relative_pose")
-            ),
+            lambda: images.get_subscription_count() and twists.get_subscription_count(),
             "the estimator",
         )
+        probe.meet("local_node")
         for step, pixels in enumerate(pictures):
             for part, speed in ((0.5, step), (1.0, step + 1.0)):  # two velocities in each step
                 message = TwistStamped()
@@ -129,7 +133,6 @@ def test_the_shipped_lidar_follows_the_simulator(probe: Probe) -> None:
     frames = 160
     truth, odometry = probe.collect(Odometry, "ground_truth"), probe.collect(Odometry, "odom")
     poses = probe.collect(PoseWithCovarianceStamped, "ngo/pose")
-    probe.collect(Image, "image")  # last: the simulator waits for this one
     maze = {"frames": frames, "rate": 0.0, "seed": 1500, **WAITING}
     with (
         NodeProcess("ngo_estimator", "local_node", {"world": "scan", **RELIABLE}) as local,
@@ -137,7 +140,9 @@ def test_the_shipped_lidar_follows_the_simulator(probe: Probe) -> None:
     ):
         local.wait_for_log("ready: /local_node, scan")
         ngo.wait_for_log("ready: /ngo_node, scan")
+        probe.meet("local_node", "ngo_node")
         with NodeProcess("ngo_sim", "maze2d", maze) as simulator:
+            let_begin(simulator, probe)
             probe.spin_until(lambda: len(odometry) == len(poses) == frames - 1, "a pose for every scan")
             probe.spin_until(lambda: len(truth) == frames, "the truth")
             assert simulator.wait() == 0, simulator.log

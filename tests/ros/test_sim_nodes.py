@@ -83,7 +83,8 @@ class Run:
             probe.spin_until(lambda: len(self.images) == FRAMES, "all images")
             self.topics = dict(probe.node.get_topic_names_and_types())
             probe.spin_until(lambda: not node.running, "the simulator's end")
-            probe.spin_until(lambda: len(self.sensor) == len(self.truth) == FRAMES, "everything else")
+            probe.spin_until(lambda: len(self.sensor) == len(self.truth) == len(self.clock) == FRAMES, "the rest")
+            probe.spin_until(lambda: len(self.actions) == FRAMES - 1, "all actions")
             assert node.wait() == 0, node.log
 
     def check(self, episode: Episode, period_s: float) -> None:
@@ -193,7 +194,8 @@ def test_goes_on_without_a_consumer_that_never_answers(probe: Probe) -> None:
 
 
 def test_without_a_driver_each_command_is_one_step(probe: Probe) -> None:
-    images, actions = probe.collect(Image, "image"), probe.collect(DiscreteAction, "action")
+    actions = probe.collect(DiscreteAction, "action")
+    images = probe.collect(Image, "image")  # last: the simulator waits for this one
     command = probe.node.create_publisher(DiscreteAction, "action_command", 10)
     wanted = [0, 1, 2, 2, 1, 0, 0]
     with simulator("maze2d", driver="none", frames=len(wanted) + 1, rate=0, wait_for_subscribers=1) as node:
@@ -212,11 +214,16 @@ def test_commands_take_over_from_the_driver_until_their_timeout(probe: Probe) ->
     actions = probe.collect(DiscreteAction, "action")
     command = probe.node.create_publisher(DiscreteAction, "action_command", 10)
     with simulator("maze2d", driver="random", rate=100, action_timeout_s=0.3):
-        probe.spin_until(lambda: command.get_subscription_count() == 1 and len(actions) > 20, "the driver")
-        assert len({message.action for message in actions}) == 3
-        command.publish(DiscreteAction(action=DiscreteAction.TURN_LEFT))
+        probe.spin_until(lambda: command.get_subscription_count() == 1, "the simulator to listen")
+        probe.spin_until(lambda: len({message.action for message in actions}) == 3, "the driver")
         held = 15  # the driver alone would do that once in 10 million times
-        probe.spin_until(lambda: [m.action for m in actions[-held:]] == [DiscreteAction.TURN_LEFT] * held, "commands")
+
+        def taken_over() -> bool:
+            """Again and again: a slow machine makes few steps until the timeout."""
+            command.publish(DiscreteAction(action=DiscreteAction.TURN_LEFT))
+            return [m.action for m in actions[-held:]] == [DiscreteAction.TURN_LEFT] * held
+
+        probe.spin_until(taken_over, "commands")
         probe.spin_until(lambda: len({m.action for m in actions[-9:]}) == 3, "the driver again")
 
 
@@ -260,8 +267,8 @@ def latched() -> QoSProfile:
 def test_two_robots_share_tf_static(probe: Probe, latched: QoSProfile) -> None:
     """Their frames differ by the prefix, and a subscriber that comes later gets the transforms of both."""
     robots = ("red", "blue")
-    images = {name: probe.collect(Image, f"/{name}/image") for name in robots}
     truth = {name: probe.collect(Odometry, f"/{name}/ground_truth") for name in robots}
+    images = {name: probe.collect(Image, f"/{name}/image") for name in robots}  # last: the simulators wait for these
     with ExitStack() as stack:
         for seed, name in enumerate(robots):
             frames = {"frame_prefix": f"{name}/", "truth_parent_frame": "map"}
@@ -343,8 +350,12 @@ def test_bad_parameters_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
         (("-p", "rows"), {}, "-p rows"),
         (("--", "seed:=3"), {}, "argument 'seed:=3' is unknown; parameters are given as --ros-args -p NAME:=VALUE"),
     ]
-    for arguments, parameters, expected in cases:
-        with NodeProcess("ngo_sim", "maze2d", {}, (*parameter_arguments(parameters), *arguments)) as node:
+    with ExitStack() as stack:  # at once, on all cores
+        nodes = [
+            stack.enter_context(simulator("maze2d", *parameter_arguments(parameters), *arguments))
+            for arguments, parameters, _ in cases
+        ]
+        for node, (_, _, expected) in zip(nodes, cases, strict=True):
             assert node.wait() == 2, node.log
             assert len(node.lines) == 1, node.log
             assert node.lines[0].startswith("[FATAL]") and expected in node.lines[0]

@@ -24,7 +24,7 @@ from ngo_sim.episodes import record_episode
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.maze3d import Maze3D
 
-from .processes import NodeProcess, wait_until
+from .processes import TIMEOUT_S, NodeProcess, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -37,6 +37,15 @@ def counts(world: str) -> dict[str, int]:
     topics = {"/image", "/ground_truth", "/clock", SENSORS[world]}
     latched = {"/tf_static": 1} if world == "maze3d" else {}
     return {"/action": FRAMES - 1, **latched, **dict.fromkeys(topics, FRAMES)}
+
+
+def written(path: Path, topic: str) -> int:
+    """How many messages of a topic a recording under way has by now."""
+    try:
+        with open_recording([path]) as recording:
+            return recording.topics[topic].count if topic in recording.topics else 0
+    except RecordingError:  # there is no file yet, or not its first byte
+        return 0
 
 
 def record(world: str, path: Path, **parameters: Any) -> None:
@@ -84,11 +93,7 @@ def test_a_killed_recording_is_readable_to_its_last_chunk(tmp_path: Path) -> Non
 
         def has_images() -> bool:
             assert node.running, node.log
-            try:
-                with open_recording([path]) as recording:
-                    return "/image" in recording.topics and recording.topics["/image"].count > 100
-            except RecordingError:  # there is no file yet, or not its first byte
-                return False
+            return written(path, "/image") > 100
 
         wait_until(has_images, "the first second on the file", poll_s=0.2)
         node.send(signal.SIGKILL)
@@ -130,8 +135,9 @@ def test_the_recorder_script_gets_the_same_bytes_over_dds(tmp_path: Path) -> Non
             parameters = {"frames": FRAMES, "rate": 100.0, "wait_for_subscribers": 1, "record": str(own)}
             with NodeProcess("ngo_sim", "maze2d", parameters) as node:
                 assert node.wait() == 0, node.log
+            wait_until(lambda: written(heard, "/image") == FRAMES, "the recorder to write all images", poll_s=0.1)
             recorder.send_signal(signal.SIGINT)
-            assert recorder.wait(30) == 0, (tmp_path / "log").read_text()
+            assert recorder.wait(TIMEOUT_S) == 0, (tmp_path / "log").read_text()
         finally:
             recorder.kill()
     text = (tmp_path / "log").read_text()
@@ -172,7 +178,7 @@ def test_a_full_disk_ends_the_recorder_with_one_line(tmp_path: Path) -> None:
         recorder = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     with recorder, NodeProcess("ngo_sim", "maze2d", {"rate": 500.0}):
         try:
-            _, errors = recorder.communicate(timeout=60)
+            _, errors = recorder.communicate(timeout=TIMEOUT_S)
         finally:
             recorder.kill()
     assert recorder.returncode == 1

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from sensor_msgs.msg import Image
 
@@ -22,7 +21,7 @@ from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig, l
 from ngo_estimator.nodes.messages import to_time
 
 from .estimator_graph import FIRST_RUN_NS, STEP_NS, image_message, scan
-from .processes import NodeProcess, Probe
+from .processes import Diagnostics, NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -48,10 +47,10 @@ def test_frames_that_repeat_are_named_in_diagnostics_and_have_a_large_covariance
         images = probe.node.create_publisher(Image, "image", 100)
         actions = probe.node.create_publisher(DiscreteAction, "action", 100)
         steps = probe.collect(RelativePose, "relative_pose")
-        diagnostics = probe.collect(DiagnosticArray, "/diagnostics")
+        diagnostics = Diagnostics(probe)
         ends = images.get_subscription_count, actions.get_subscription_count
         probe.spin_until(lambda: all(end() for end in ends), "subscriptions")
-        probe.spin_until(lambda: probe.node.count_publishers("relative_pose"), "the node's publisher")
+        probe.meet("local_node")
         for number in range(8):
             stamp = FIRST_RUN_NS + number * STEP_NS
             action = DiscreteAction(action=0)
@@ -61,13 +60,6 @@ def test_frames_that_repeat_are_named_in_diagnostics_and_have_a_large_covariance
         probe.spin_until(lambda: len(steps) == 7, "all steps")
         assert [step.unlikeness > 1.0 for step in steps] == [False] * 4 + [True] * 3
         assert min(step.covariance[0] for step in steps[4:]) > 0.1**2
-
-        def named() -> bool:
-            found = [status for array in diagnostics for status in array.status if status.name == "/local_node"]
-            values = {pair.key: pair.value for status in found for pair in status.values}
-            return values.get("repeated frames") == "3" and any(
-                status.level == DiagnosticStatus.WARN and "repeat the one before" in status.message for status in found
-            )
-
-        probe.spin_until(named, "the repeated frames in diagnostics")
+        diagnostics.wait_for_problem("/local_node", "repeat the one before")
+        diagnostics.wait_for_value("/local_node", "repeated frames", "3".__eq__)
         assert node.running and "Traceback" not in node.log

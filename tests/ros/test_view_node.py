@@ -17,7 +17,7 @@ from visualization_msgs.msg import MarkerArray
 
 from tests.unit.ngo_estimator.view.free_ports import free_ports
 
-from .processes import NodeProcess, Probe
+from .processes import TIMEOUT_S, NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -50,7 +50,7 @@ def test_it_shows_a_graph() -> None:
     with Probe() as probe, NodeProcess("ngo_estimator", "view_node", settings) as node:
         publishers = {name: probe.node.create_publisher(kind, name, qos) for name, (kind, qos) in topics.items()}
         node.wait_for_log("ready: /view_node, open http://127.0.0.1:")
-        with urllib.request.urlopen(f"http://127.0.0.1:{web}/", timeout=20) as page:
+        with urllib.request.urlopen(f"http://127.0.0.1:{web}/", timeout=TIMEOUT_S) as page:
             assert b"Rerun" in page.read()
         probe.spin_until(
             lambda: all(publisher.get_subscription_count() == 1 for publisher in publishers.values()), "the view"

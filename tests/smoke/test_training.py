@@ -279,6 +279,7 @@ def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(two_proce
     assert training["command"].startswith("python -m training.train_local --accelerator cpu --devices 2 --strategy ddp")
 
 
+@pytest.mark.timeout(600)  # two processes are started three times
 def test_two_machines_train_as_two_processes_and_go_on_after_one_is_lost(two_processes: Path, tmp_path: Path) -> None:
     """Groups of processes stand for the machines."""
 

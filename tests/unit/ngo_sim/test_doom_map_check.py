@@ -91,10 +91,10 @@ def test_what_is_wrong_with_a_binary_map_is_named(changes: dict[str, bytes], com
 
 @pytest.mark.parametrize("text", ["/*" * 10**6, '"\\' * 10**6, "linedef " * 10**6, "a" * 10**6, " " * 10**6 + "}"])
 def test_no_text_takes_long(text: str) -> None:
-    began = time.monotonic()
+    began = time.process_time()
     with pytest.raises(ValueError, match="its text cannot be read"):
         check_map(text_map(text))
-    assert time.monotonic() - began < 2.0
+    assert time.process_time() - began < 2.0
 
 
 def test_a_file_that_repeats_its_bytes_without_end_is_refused(tmp_path: Path) -> None:

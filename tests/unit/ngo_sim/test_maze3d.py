@@ -97,7 +97,7 @@ def engines(folder: Path) -> list[int]:
 
 def wait_until_gone(folder: Path) -> None:
     """Until no engine and no file is left below a folder."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while left := [*map(str, engines(folder)), *map(str, folder.iterdir())]:
         assert time.monotonic() < deadline, f"left: {left}"
         time.sleep(0.02)

@@ -23,6 +23,13 @@ def test_is_what_an_episode_records() -> None:
             simulation.advance(action)
 
 
+def test_a_maze_of_another_seed_keeps_start_and_driver_of_the_seed() -> None:
+    own, other, mixed = (Simulation(Maze2D(), *of) for of in ((3, "corners"), (8, "corners"), (3, "corners", 8)))
+    assert (mixed.world.maze.walls == other.world.maze.walls).all()  # type: ignore[union-attr]
+    assert (mixed.frame.pose_xyyaw == own.frame.pose_xyyaw).all()
+    assert (mixed.frame.pose_xyyaw != other.frame.pose_xyyaw).any()
+
+
 def test_auto_is_the_driver_that_the_world_names() -> None:
     runs = [Simulation(Maze2D(), seed=3, driver=driver) for driver in ("auto", "corners")]
     for _ in range(50):

@@ -218,7 +218,7 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
             seed = int(self.np_random.integers(2**31))
         if self._level is not None:
             if "maze_seed" in options:
-                raise ValueError("options has 'maze_seed'; a Doom map has no maze of a seed")
+                raise ValueError(f"maze_seed is {options['maze_seed']}; a Doom map has no maze of a seed")
             drawn = bool(options.get("drawn_start", False))
             if drawn or self._start_was_drawn or not self._engine.running:
                 level = with_drawn_start(self._level, _generator(seed, stream=4)) if drawn else self._level

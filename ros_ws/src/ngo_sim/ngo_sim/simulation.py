@@ -62,12 +62,13 @@ class Simulation:
     """Frame after frame of one seed.
 
     driver: a name for make_driver, "auto": the world's own choice, or "none": only actions from outside move it.
+    maze_seed: seed of the maze and its textures, where it is another one. Raises ValueError where there is no maze.
     """
 
-    def __init__(self, world: World, seed: int, driver: str) -> None:
+    def __init__(self, world: World, seed: int, driver: str, maze_seed: int | None = None) -> None:
         self.world = world
         self.external = ExternalActions()
-        observation, info = world.reset(seed=seed)
+        observation, info = world.reset(seed=seed, options=None if maze_seed is None else {"maze_seed": maze_seed})
         name = world.default_driver if driver == "auto" else driver
         self._driver: Driver | None = None if name == "none" else make_driver(name, world.maze, driver_generator(seed))
         self.frame = Frame(0, observation, info["pose_xyyaw"], np.zeros(3))

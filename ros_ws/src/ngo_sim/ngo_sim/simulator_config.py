@@ -17,6 +17,13 @@ class SimulatorConfig(FramedSettings):
     seed: int = setting(
         0, "Seed of everything random: maze, textures, start, noise and driver.", minimum=0, maximum=_MOST
     )
+    maze_seed: int = setting(
+        -1,
+        "Seed of the maze and its textures alone; start, noise and driver remain those of seed. -1: seed. Not on a "
+        "Doom map.",
+        minimum=-1,
+        maximum=_MOST,
+    )
     rate: float = setting(
         10.0,
         "Frames a second of wall time; 0: as fast as the subscribers take them, none lost.",

@@ -134,14 +134,14 @@ def test_the_nearest_return_stands_for_a_lost_ray(
 
 @pytest.mark.parametrize("rays", [2, 600_000])
 def test_no_increment_makes_a_scan_expensive(rays: int) -> None:
-    began = time.monotonic()
+    began = time.process_time()
     for increment in (1e-9, 1e-12, 5e-324, -1e-7):
         with pytest.raises(ValueError, match="an increment from 1e-05 to below pi"):
             scan_image(EIGHT, np.full(rays, np.inf), 0.0, increment, 0.0, 30.0)
     for increment in (1e-5, -1e-5, 3.0):
         scan_image(EIGHT, np.full(rays, np.inf), 0.0, increment, 0.0, 30.0)
         scan_image(EIGHT, np.where(np.arange(rays) % 2, 1.0, np.inf), 0.0, increment, 0.0, 30.0)
-    assert time.monotonic() - began < 2.0
+    assert time.process_time() - began < 2.0
 
 
 def test_between_two_rays_one_surface_is_interpolated_and_an_edge_is_not() -> None:

@@ -1,10 +1,11 @@
 """Covariances of poses: against sampling, and against what is known."""
 
 import numpy as np
+import pytest
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_covariance import propagate, to_spatial
+from ngo_estimator.geometry.planar_covariance import bounded, propagate, to_spatial
 
 
 def test_propagation_agrees_with_sampled_steps() -> None:
@@ -34,3 +35,16 @@ def test_spatial_form_has_x_y_and_yaw_in_their_places() -> None:
     assert spatial[1].tolist() == [4.0, 5.0, 0.0, 0.0, 0.0, 6.0]
     assert spatial[5].tolist() == [7.0, 8.0, 0.0, 0.0, 0.0, 9.0]
     assert not spatial[2:5].any()
+
+
+@pytest.mark.parametrize("exponents", [(-4, -4, -6), (-12, 0, 0), (-10, -10, -10), (0, 0, 5), (-9, 3, -9)])
+def test_a_bounded_covariance_keeps_its_axes(exponents: tuple[int, int, int]) -> None:
+    """Variances from 1e-10 to 1e4 stay, others become the nearer of these."""
+    generator = np.random.default_rng(5)
+    for _ in range(20):
+        axes = np.linalg.qr(generator.standard_normal((3, 3)))[0]
+        variances = 10.0 ** np.array(exponents) * generator.uniform(1.0, 3.0, 3)
+        expected = (axes * np.clip(variances, 1e-10, 1e4)) @ axes.T
+        assert bounded((axes * variances) @ axes.T) == pytest.approx(
+            expected, rel=1e-6, abs=1e-3 * 1e-10 + 1e-14 * variances.max()
+        )

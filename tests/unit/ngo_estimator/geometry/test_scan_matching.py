@@ -1,10 +1,12 @@
 """Scans of known poses are registered to each other."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, likelihood_field, search
 from ngo_estimator.geometry.line_map import line_map
 from ngo_estimator.geometry.planar_motion import Array, between, rotated, transformed
@@ -47,6 +49,34 @@ def test_a_corridor_leaves_the_way_along_it_open() -> None:
     assert found.pose[0] == pytest.approx(mean[0], abs=0.02)
     assert 0.07 < deviations[0] <= 0.081
     assert deviations[1] < 0.01 and deviations[2] < 0.01
+
+
+def test_noisy_normals_tell_no_motion_along_a_corridor() -> None:
+    """Normals that scatter by 10 degrees slope against the corridor. The walls hold nothing along it all the same."""
+    generator, truth = np.random.default_rng(1), np.array((0.2, 0.0, 0.0))
+
+    def noisy(scan: KeyScan) -> KeyScan:
+        turns = np.radians(10.0) * generator.standard_normal(len(scan.points))
+        turned = [rotated(turn, normal[None])[0] for turn, normal in zip(turns, scan.normals, strict=True)]
+        return replace(scan, normals=np.stack(turned))
+
+    for _ in range(5):
+        walls, seen = (noisy(scan_at(HALLWAY, pose, angles=fan(361, 360.0))) for pose in (IDENTITY, truth))
+        prior = (IDENTITY, np.diag((0.15**-2, 0.15**-2, 0.1**-2)))
+        found = icp(line_map([walls], [IDENTITY]), seen.points, seen.normals, IDENTITY, prior, open_share=0.01)
+        assert math.sqrt(found.covariance[0, 0]) > 0.1
+        assert abs(found.pose[1]) < 0.02
+
+
+def test_normals_that_agree_count() -> None:
+    """In a room the test for noise changes little."""
+    walls, scan = (scan_at(ROOM, pose, angles=fan(361, 270.0)) for pose in (A, B))
+    prior = (B, np.diag((0.15**-2, 0.15**-2, 0.1**-2)))
+    found = [
+        icp(line_map([walls], [A]), scan.points, scan.normals, B, prior, open_share=share) for share in (0.0, 0.01)
+    ]
+    assert found[1].pose == pytest.approx(B, abs=2e-3)
+    assert found[1].covariance.diagonal() == pytest.approx(found[0].covariance.diagonal(), rel=0.5)
 
 
 def test_a_turned_corridor_has_a_whole_covariance() -> None:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance
 from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
@@ -15,31 +16,68 @@ SURE = np.diag((1e-6, 1e-6, 1e-8))
 
 def driven(steps: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """The motion that is expected next, after steps with covariances."""
-    prior = MotionPrior(MotionPriorConfig())
-    prior.begin(0, np.zeros(3), None)
+    prior, pose = MotionPrior(MotionPriorConfig()), np.zeros(3)
+    prior.begin(0, pose, None)
     for k, (step, covariance) in enumerate(steps, 1):
-        prior.predict(k * PERIOD_NS, np.zeros(3), np.zeros((3, 3)), None)
-        prior.accept(k * PERIOD_NS, np.zeros(3), step, covariance, False, False)
-    return prior.predict((len(steps) + 1) * PERIOD_NS, np.zeros(3), np.zeros((3, 3)), None).mean
+        prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
+        pose = compose(pose, step)
+        prior.accept(k * PERIOD_NS, pose, turned_covariance(pose[2], covariance), step, covariance, False, False, False)
+    return between(pose, prior.predict((len(steps) + 1) * PERIOD_NS, pose, np.zeros((3, 3)), None).mean)
 
 
 def test_a_measured_velocity_goes_on() -> None:
-    assert driven([(STEP, SURE)] * 3) == pytest.approx(STEP, abs=1e-4)
+    assert driven([(STEP, SURE)] * 30) == pytest.approx(STEP, abs=2e-3)
 
 
 def test_an_open_direction_tells_no_velocity() -> None:
-    """Along a corridor the step is a guess: the speed stays, and the measured turn counts."""
-    along = np.diag((1.0, 1e-6, 1e-8))
-    expected = driven([(STEP, SURE)] * 3 + [(np.array((0.4, 0.0, 0.03)), along)] * 3)
-    assert expected[0] == pytest.approx(STEP[0], abs=0.03)
-    assert expected[2] == pytest.approx(0.03, abs=1e-3)
+    """In a corridor the walls hold nothing along it: the pose stays as predicted there, and the turn counts."""
+    prior, pose = MotionPrior(MotionPriorConfig()), np.zeros(3)
+    prior.begin(0, pose, None)
+    for k in range(1, 21):
+        prediction = prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
+        step, covariance = STEP, SURE
+        if k > 10:
+            step = between(pose, prediction.mean)
+            step[2] = 0.03
+            covariance = np.diag((prediction.covariance[0, 0], 1e-6, 1e-8))
+        pose = compose(pose, step)
+        prior.accept(k * PERIOD_NS, pose, covariance, step, covariance, False, k % 3 == 0, False)
+    expected = between(pose, prior.predict(21 * PERIOD_NS, pose, np.zeros((3, 3)), None).mean)
+    assert math.hypot(*expected[:2]) == pytest.approx(STEP[0], abs=0.01)
+    assert expected[2] == pytest.approx(0.03, abs=2e-3)
+
+
+@pytest.mark.parametrize("keys", [1, 4, 1000])
+def test_an_error_of_the_velocity_adds_up_over_key_scans(keys: int) -> None:
+    """Along a corridor errors of 120 drives are as large as the sum of what their key scans say, however many."""
+    config = MotionPriorConfig(acceleration_m_s2=0.5, largest_m_s=1.0)
+    random, errors, variance = np.random.default_rng(keys), [], 0.0
+    for _ in range(120):
+        prior, pose, truth, speed = MotionPrior(config), np.zeros(3), 0.0, 0.4
+        prior.begin(0, pose, None)
+        total = 0.0
+        for k in range(1, 41):
+            speed += 0.025 * random.standard_normal()
+            truth += 0.1 * speed + config.still_m * random.standard_normal()
+            before, prediction = pose, prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
+            open_ahead = k > 10
+            covariance = np.diag((prediction.covariance[0, 0] if open_ahead else 1e-6, 1e-6, 1e-8))
+            pose = np.array((prediction.mean[0] if open_ahead else truth, 0.0, 0.0))
+            is_key = k % keys == 0 or k in (10, 40)
+            shared = prior.accept(k * PERIOD_NS, pose, covariance, pose - before, covariance, False, is_key, False)
+            total += (covariance + shared)[0, 0] if is_key else 0.0
+        errors.append(pose[0] - truth)
+        variance = total
+    assert np.std(errors) == pytest.approx(math.sqrt(variance), rel=0.15)
 
 
 def test_fast_scans_that_are_noisy_are_averaged() -> None:
-    noise = np.random.default_rng(0).normal(0.0, 0.01, (40, 3)) * (1.0, 1.0, 0.1)
+    """Noise of the poses, and not of the steps: each pose is measured anew."""
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (41, 3)) * (1.0, 1.0, 0.1)
     covariance = np.diag((1e-4, 1e-4, 1e-6))
-    last = [driven([(STEP + each, covariance) for each in noise[:count]]) - STEP for count in range(20, 40)]
-    assert np.std(last, axis=0)[0] < 0.9 * 0.01
+    steps = [STEP + after - before for before, after in zip(noise[:-1], noise[1:], strict=True)]
+    last = [driven([(step, covariance) for step in steps[:count]]) - STEP for count in range(20, 40)]
+    assert np.std(last, axis=0)[0] < math.sqrt(2.0) * 0.01
 
 
 def followed(counted: list[np.ndarray], measured: list[np.ndarray]) -> list[Prediction]:
@@ -50,7 +88,8 @@ def followed(counted: list[np.ndarray], measured: list[np.ndarray]) -> list[Pred
     for k in range(1, len(counted)):
         wheels.add(k * PERIOD_NS, counted[k])
         predictions.append(prior.predict(k * PERIOD_NS, measured[k - 1], np.eye(3) * 1e-4, wheels))
-        prior.accept(k * PERIOD_NS, measured[k], measured[k] - measured[k - 1], SURE, k % 8 == 0, False)
+        step = measured[k] - measured[k - 1]
+        prior.accept(k * PERIOD_NS, measured[k], SURE, step, SURE, False, k % 8 == 0, False)
     return predictions
 
 

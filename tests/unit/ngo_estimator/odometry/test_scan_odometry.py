@@ -70,6 +70,21 @@ def test_negative_increments_and_holes() -> None:
     assert position < 0.05 and heading < 0.02
 
 
+@pytest.mark.parametrize(("degrees", "most"), [(360.0, 1), (180.0, 25)])
+@pytest.mark.parametrize("with_wheels", [False, True])
+def test_turning_on_the_spot_makes_no_key_scans_of_what_is_known(degrees: float, most: int, with_wheels: bool) -> None:
+    """Four turns on the spot, then on: the first turn shows all there is."""
+    turns = [np.array((2.0, 2.0, math.remainder(math.radians(6.0) * k, math.tau))) for k in range(241)]
+    poses = np.array([*turns, *(np.array((2.0 + 0.1 * k, 2.0, 0.0)) for k in range(1, 11))])
+    wheels = poses * (1.0, 1.0, 1.0) if with_wheels else None
+    estimates, _ = drive(scans_along(ROOM, poses, fan(int(degrees), degrees)), wheels)
+    assert sum(estimate.is_key for estimate in estimates[:241]) <= most
+    assert any(estimate.is_key for estimate in estimates[241:])
+    position, heading = off(estimates, poses)
+    assert position < 0.03 and heading < 0.015
+    assert all(math.sqrt(estimate.since_key_covariance[2, 2]) < math.radians(1.0) for estimate in estimates)
+
+
 def test_fast_turns_are_searched() -> None:
     """Up to 25 degrees and 0.4 m a scan, from rest."""
     poses = round_trip(40, period=20)

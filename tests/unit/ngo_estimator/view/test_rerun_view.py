@@ -16,7 +16,7 @@ def test_everything_is_drawn_and_the_page_is_served(capfd: pytest.CaptureFixture
     web, data, other = free_ports(3)
     view = RerunView(web, data, 64, open_browser=False)
     assert view.url.startswith(f"http://127.0.0.1:{web}/") and str(data) in view.url
-    with urllib.request.urlopen(f"http://127.0.0.1:{web}/", timeout=10) as page:
+    with urllib.request.urlopen(f"http://127.0.0.1:{web}/", timeout=60) as page:
         assert b"Rerun" in page.read()
     view.at(1.5)
     view.look_at(Window(1.0, 2.0, 5.0))

@@ -33,9 +33,22 @@ def propagate(
 
 def bounded(covariance: np.ndarray) -> np.ndarray:
     """The symmetric covariance ``(3, 3)`` whose variances, along all axes, are between as good as exact and unknown."""
-    values, vectors = np.linalg.eigh(0.5 * covariance + 0.5 * covariance.T)
+    symmetric = 0.5 * covariance + 0.5 * covariance.T
+    # Most are within the limits, which the trace and the determinant tell without eigenvalues.
+    if _is_within(symmetric):
+        return symmetric
+    values, vectors = np.linalg.eigh(symmetric)
     result: np.ndarray = (vectors * np.clip(values, *_VARIANCES)) @ vectors.T
     return result
+
+
+def _is_within(symmetric: np.ndarray) -> bool:
+    """Whether a symmetric matrix ``(3, 3)`` surely has eigenvalues within the limits."""
+    (a, b, c), (_, d, e), (_, _, f) = symmetric.tolist()
+    minor, trace = a * d - b * b, a + d + f
+    determinant = f * minor - a * e * e - d * c * c + 2.0 * b * c * e
+    # The least eigenvalue is over the determinant by the square of half the trace. Rounding is far below the rest.
+    return a > 0.0 and minor > 0.0 and trace < _VARIANCES[1] and determinant > 2.0 * _VARIANCES[0] * trace * trace
 
 
 def to_spatial(covariance: np.ndarray) -> np.ndarray:

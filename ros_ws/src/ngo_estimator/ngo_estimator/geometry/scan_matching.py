@@ -25,7 +25,7 @@ class IcpConfig:
     ``facing_deg``. ``fit_m`` is the distance within which a point counts as fitted. ``noise_m`` is the least deviation
     of a distance; larger residuals raise it. ``correlation`` is the number of neighbouring points that share one error:
     calibration, uneven walls and wrong pairs repeat from point to point, so that n points tell no more than
-    n / ``correlation`` independent ones.
+    n / ``correlation`` independent ones. ``normal_deviations`` of the scatter of noisy normals are no information.
     """
 
     steps: int = 16
@@ -38,6 +38,7 @@ class IcpConfig:
     fit_m: float = 0.10
     noise_m: float = 0.015
     correlation: float = 8.0
+    normal_deviations: float = 2.0
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.annealing_steps < 1:
@@ -52,10 +53,10 @@ class IcpConfig:
                 f"first_gate_m, last_gate_m are {self.first_gate_m}, {self.last_gate_m}; expected positive lengths, "
                 f"the last no larger than the first, the first at most {CELL_M}"
             )
-        if not (0.0 < self.facing_deg <= 90.0 and self.correlation >= 1.0):
+        if not (0.0 < self.facing_deg <= 90.0 and self.correlation >= 1.0 and 0.0 <= self.normal_deviations < math.inf):
             raise ValueError(
-                f"facing_deg, correlation are {self.facing_deg}, {self.correlation}; expected over 0 to 90, and at "
-                "least 1"
+                f"facing_deg, correlation, normal_deviations are {self.facing_deg}, {self.correlation}, "
+                f"{self.normal_deviations}; expected over 0 to 90, at least 1, and at least 0"
             )
         if not (0.0 < self.fit_m < math.inf and 0.0 < self.noise_m < math.inf):
             raise ValueError(f"fit_m, noise_m are {self.fit_m}, {self.noise_m}; expected positive lengths")
@@ -93,8 +94,9 @@ def icp(
         prior: mean ``(3,)`` and information ``(3, 3)`` of the pose; without it directions that no line holds keep
             their start, at a deviation of 1 m and 1 rad.
         config: settings.
-        open_share: a direction of motion is open, and left to the prior, where the lines' mean squared slope against
-            it is below this: there the noise of normals speaks, and not the walls.
+        open_share: over 0 the direction of motion that the lines hold least counts as far as the normals of both sides
+            agree on it: their noise is independent. It is open, and left to the prior, where the mean squared slope of
+            the lines against it is below this share.
 
     Raises:
         ValueError: a shape is wrong or a number is not finite.
@@ -133,7 +135,7 @@ def icp(
         config.fit_m,
         config.noise_m,
         config.correlation,
-        open_share,
+        (config.normal_deviations, open_share),
     )
     covariance = np.linalg.inv(total).astype(np.float64)
     return Registration(pose, covariance, data, fitted / max(tried, 1), int(fitted))
@@ -160,13 +162,14 @@ def _icp(
     fit: float,
     noise: float,
     correlation: float,
-    open_share: float,
+    noisy: tuple[float, float],
 ) -> tuple[Array, Array, Array, int, int]:
     pose = start.copy()
     data = np.zeros((3, 3))
     total = prior.copy()
     fitted, tried = 0, 0
     variance = noise * noise
+    normal_deviations, open_share = noisy
     for step in range(steps + 1):
         done = min(step / annealing, 1.0)
         kernel = kernels[0] * (kernels[1] / kernels[0]) ** done
@@ -174,6 +177,7 @@ def _icp(
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         g0, g1, g2 = 0.0, 0.0, 0.0
+        c00, c01, c11, e00, e01, e11 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # of normals that agree, of those that do not
         squares, weights = 0.0, 0.0
         fitted, tried = 0, 0
         for i in range(len(points)):
@@ -183,9 +187,9 @@ def _icp(
             tried += 1
             arm_x, arm_y = cos * points[i, 0] - sin * points[i, 1], sin * points[i, 0] + cos * points[i, 1]
             x, y = arm_x + pose[0], arm_y + pose[1]
+            turned_x, turned_y = cos * nx - sin * ny, sin * nx + cos * ny
             best = _nearest(
-                map_points, map_normals, first, corner, rows, columns, x, y,
-                cos * nx - sin * ny, sin * nx + cos * ny, facing,
+                map_points, map_normals, first, corner, rows, columns, x, y, turned_x, turned_y, facing
             )  # fmt: skip
             if best < 0:
                 continue
@@ -205,6 +209,13 @@ def _icp(
             h11 += weight * my * my
             h12 += weight * my * lever
             h22 += weight * lever * lever
+            off_x, off_y = mx - turned_x, my - turned_y
+            c00 += weight * mx * turned_x
+            c01 += 0.5 * weight * (mx * turned_y + my * turned_x)
+            c11 += weight * my * turned_y
+            e00 += weight * off_x * off_x
+            e01 += weight * off_x * off_y
+            e11 += weight * off_y * off_y
             g0 += weight * mx * distance
             g1 += weight * my * distance
             g2 += weight * lever * distance
@@ -213,13 +224,20 @@ def _icp(
         scale = 1.0 / (variance * correlation)
         data = np.array(((h00, h01, h02), (h01, h11, h12), (h02, h12, h22))) * scale
         slope = np.array((g0, g1, g2)) * scale
-        half_gap = math.hypot(0.5 * (h00 - h11), h01)
-        if 0.5 * (h00 + h11) - half_gap < open_share * weights:
+        if open_share > 0.0 and weights > 0.0:
+            # The direction that the walls hold least: what both scans' normals say of it, and how far they disagree.
             direction = 0.5 * math.atan2(2.0 * h01, h00 - h11)
-            along = np.array((-math.sin(direction), math.cos(direction), 0.0))
-            data -= np.outer(along, along @ data)
-            data -= np.outer(data @ along, along)
-            slope -= along * (along @ slope)
+            x, y = -math.sin(direction), math.cos(direction)
+            claimed = h00 * x * x + 2.0 * h01 * x * y + h11 * y * y
+            agreed = c00 * x * x + 2.0 * c01 * x * y + c11 * y * y
+            apart = e00 * x * x + 2.0 * e01 * x * y + e11 * y * y
+            agreed -= normal_deviations * 0.5 * apart * math.sqrt(correlation / weights)
+            held = 0.0 if agreed < open_share * weights else min(agreed / claimed, 1.0)
+            if held < 1.0:
+                along = np.array((x, y, 0.0))
+                data -= (1.0 - math.sqrt(held)) * np.outer(along, along @ data)
+                data -= (1.0 - math.sqrt(held)) * np.outer(data @ along, along)
+                slope -= (1.0 - held) * along * (along @ slope)
         total = data + prior
         if step == steps:
             break

@@ -141,19 +141,26 @@ def range_noise(angles: Array, ranges: Array) -> float:
     """
     if len(ranges) < _LEAST_TRIPLES + 2:
         return 0.0
-    left, right = angles[1:-1] - angles[:-2], angles[2:] - angles[1:-1]
-    near = (left > 0.0) & (right > 0.0) & (left + right < _WIDEST_TRIPLE_RAD)
-    if np.count_nonzero(near) < _LEAST_TRIPLES:
+    return min(_range_noise(angles, ranges), _LARGEST_NOISE_M)
+
+
+@njit(cache=True)
+def _range_noise(angles: Array, ranges: Array) -> float:
+    off, count = np.empty(len(ranges) - 2), 0
+    for k in range(1, len(ranges) - 1):
+        left, right = angles[k] - angles[k - 1], angles[k + 1] - angles[k]
+        if not (left > 0.0 and right > 0.0 and left + right < _WIDEST_TRIPLE_RAD):
+            continue
+        before, after, both = ranges[k - 1], ranges[k + 1], math.sin(left + right)
+        share_before, share_after = math.sin(right) / both, math.sin(left) / both
+        expected = 1.0 / (share_before / before + share_after / after)
+        # Sensitivities of the expected range to both neighbours.
+        of_before, of_after = share_before * (expected / before) ** 2, share_after * (expected / after) ** 2
+        off[count] = abs(ranges[k] - expected) / math.sqrt(1.0 + of_before**2 + of_after**2)
+        count += 1
+    if count < _LEAST_TRIPLES:
         return 0.0
-    left, right = left[near], right[near]
-    before, middle, after = ranges[:-2][near], ranges[1:-1][near], ranges[2:][near]
-    both = np.sin(left + right)
-    share_before, share_after = np.sin(right) / both, np.sin(left) / both
-    expected = 1.0 / (share_before / before + share_after / after)
-    # Sensitivities of the expected range to both neighbours.
-    of_before, of_after = share_before * (expected / before) ** 2, share_after * (expected / after) ** 2
-    off = np.abs(middle - expected) / np.sqrt(1.0 + of_before**2 + of_after**2)
-    return min(float(np.quantile(off, 0.25)) / _QUARTER, _LARGEST_NOISE_M)
+    return float(np.quantile(off[:count], 0.25)) / _QUARTER
 
 
 def _checked(angles: Array, ranges: Array, range_limits: tuple[float, float]) -> tuple[Array, Array]:

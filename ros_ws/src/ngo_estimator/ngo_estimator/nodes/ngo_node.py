@@ -1,5 +1,6 @@
 """Node that re-optimises the whole trajectory with every relative pose, and publishes it corrected."""
 
+import contextlib
 import sys
 import traceback
 from dataclasses import replace
@@ -32,15 +33,18 @@ from ngo_estimator.nodes.trajectory_report import TrajectoryReport
 from ngo_estimator.nodes.weights import load_trajectory
 
 if TYPE_CHECKING:
+    from ngo_estimator.data.relative_step import RelativeStep
     from ngo_estimator.nodes.file_services import Loaded
     from ngo_estimator.online.map_localisation import LocalisedStep
+    from ngo_estimator.online.session import Session
     from ngo_estimator.online.tf_smoothing import SmoothedCorrection
     from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
 _SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
-_PENDING_S = 0.3
+_PENDING_S = 1.0
+_SEARCH_LINE_S = 10.0
 _STARTS = 80  # relative poses until compiled functions are loaded
 _SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
 
@@ -83,7 +87,7 @@ class NgoNode(ManagedNode):
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
         self._core = load_trajectory(settings)
-        self._origin_of = MapOrigin
+        self._origin_of, self._session_of = MapOrigin, Session
         self._paused = False
         self._report = TrajectoryReport()
         self._live.lock()
@@ -98,7 +102,7 @@ class NgoNode(ManagedNode):
             settings.save_directory,
             settings.mode == "localization",
             self._trajectory,
-            lambda: Session(settings.world, self._core, self._origin, self._out.smoothing),
+            self._session,
             self._take,
         )
         if settings.state:
@@ -158,6 +162,9 @@ class NgoNode(ManagedNode):
         name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
         self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
+    def _session(self) -> "Session":
+        return self._session_of(self._settings.world, self._core, self._origin, self._out.smoothing)
+
     def _begin_anew(self) -> None:
         """Reset the state that belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
@@ -172,6 +179,7 @@ class NgoNode(ManagedNode):
         try:
             step = messages.relative_step(message)
             with self._status.timed("time an update"):
+                self._look_again(step)
                 if self._search is not None:
                     found = self._search.update(step)
                     update = found.joined
@@ -195,6 +203,19 @@ class NgoNode(ManagedNode):
             self._on_found(found, step.tf_odom_xyyaw, publish=update is None)
         if update is not None:
             self._on_update(update, step.tf_odom_xyyaw)
+
+    def _look_again(self, step: "RelativeStep") -> None:
+        """Keep the map where the odometry begins anew, if the robot is to be found in it."""
+        if self._settings.state_mode != "relocalise" or self._search is not None or not self._core.begins_anew(step):
+            return
+        with contextlib.suppress(ValueError):  # a map that shows no places yet
+            if not self._paused and (update := self._core.finish()) is not None:
+                self._latest = update
+                self._whole.changed(loops=True)
+            self._pending.cancel()
+            self._search, self._covariance = PoseSearch(self._session().joining()), np.zeros((3, 3))
+            self._out.smoothing.reset()
+            self.get_logger().info("the relative poses have a new origin: looks for the robot in the map, which stays")
 
     def _on_update(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
         """Publish what a step changed in the trajectory."""
@@ -235,6 +256,8 @@ class NgoNode(ManagedNode):
         if found.lost:
             self.get_logger().warning("not localised: the pose in the map is lost")
         self._covariance = np.zeros((3, 3)) if found.covariance is None else found.covariance
+        if found.pose_xyyaw is None and self._search is not None:
+            self.get_logger().info("; ".join(self._search.problems()), throttle_duration_sec=_SEARCH_LINE_S)
         if found.pose_xyyaw is None or found.covariance is None or step.map_from_odom_xyyaw is None:
             return
         if publish:

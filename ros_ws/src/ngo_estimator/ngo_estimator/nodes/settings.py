@@ -163,7 +163,7 @@ class NgoNodeSettings(EstimatorSettings):
     state_mode: str = setting(
         "continue",
         "continue: the odometry that was saved goes on. relocalise: another one begins; the robot is looked for in the "
-        "map of state, and the map grows on from where it is found.",
+        "map of state, and the map grows on from where it is found; the same at each restart of local_node.",
         choices=("continue", "relocalise"),
     )
     mode: str = setting(

@@ -9,12 +9,15 @@ from ngo_estimator.geometry import branch_and_bound
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import LikelihoodField, SearchConfig, draw, joined, likelihood_field
 from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points
-from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
+from ngo_estimator.geometry.planar_motion import Array, rotated, transformed, wrap
 
 _REDRAWN_SCANS = 10
 _REDRAWN_M = 5.0
 """The field is drawn anew after so many scans or metres; scans that left the submap stay in it until then."""
 
+
+_ALL_ROUND_RAD = math.radians(345.0)
+"""Between the first and the last ray."""
 
 _WIDE_SCANS = 10
 """So many of the newest scans make the grid of wide searches."""
@@ -26,6 +29,7 @@ class LocalSubmap:
     def __init__(self, most_scans: int, search: SearchConfig) -> None:
         self._points: deque[Array] = deque(maxlen=most_scans)
         self._normals: deque[Array] = deque(maxlen=most_scans)
+        self._poses: deque[tuple[Array, bool]] = deque(maxlen=most_scans)
         self._search = search
         self._last = np.zeros(2)
         self._middle = np.zeros(2)
@@ -39,9 +43,22 @@ class LocalSubmap:
         """Add a scan whose base frame has the pose ``(3,)``; the oldest leaves where there are too many."""
         self._points.append(transformed(pose, scan.points))
         self._normals.append(rotated(pose[2], scan.normals))
+        self._poses.append((pose, _sees_all_round(scan)))
         self._last = pose[:2].copy()
         self._lines = self._grid = None
         self._undrawn += 1
+
+    def knows(self, scan: KeyScan, pose: Array, distance_m: float, turn_rad: float) -> bool:
+        """Whether a scan at a pose ``(3,)`` shows nothing new: one of these was taken near there, and turned alike.
+
+        Scanners that see all round may be turned as they like.
+        """
+        round_view = _sees_all_round(scan)
+        return any(
+            math.dist(pose[:2], other[:2]) < distance_m
+            and ((round_view and round_too) or abs(wrap(pose[2] - other[2])) < turn_rad)
+            for other, round_too in self._poses
+        )
 
     @property
     def lines(self) -> LineMap:
@@ -71,3 +88,7 @@ class LocalSubmap:
             draw(self._field, self._points[-self._undrawn], self._normals[-self._undrawn])
             self._drawn, self._undrawn = self._drawn + 1, self._undrawn - 1
         return self._field
+
+
+def _sees_all_round(scan: KeyScan) -> bool:
+    return len(scan.angles) > 1 and scan.angles[-1] - scan.angles[0] > _ALL_ROUND_RAD

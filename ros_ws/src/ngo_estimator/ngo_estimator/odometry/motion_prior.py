@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array, compose, wrap
+from ngo_estimator.odometry.constant_velocity import ConstantVelocity
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
 
@@ -20,9 +21,10 @@ class MotionPriorConfig:
 
     Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
     ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
-    zero. Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or
-    ``doubt_deg`` and ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most
-    ``longest_freeze_s``, while constant velocity moves by ``frozen_m``.
+    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Wheels are doubted
+    where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or ``doubt_deg`` and
+    ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most ``longest_freeze_s``, while constant
+    velocity moves by ``frozen_m``.
     """
 
     still_m: float = 0.03
@@ -32,6 +34,8 @@ class MotionPriorConfig:
     largest_m: float = 1.0
     largest_deg: float = 45.0
     longest_s: float = 1.5
+    largest_m_s: float = 0.3
+    largest_rad_s: float = 1.0
     doubt_m: float = 0.1
     doubt_m_s2: float = 4.0
     doubt_deg: float = 10.0
@@ -66,8 +70,8 @@ class MotionPrior:
     def __init__(self, config: MotionPriorConfig) -> None:
         self.config = config
         self._stamp_ns = 0
-        self._velocity = np.zeros(3)
-        self._velocity_covariance = np.zeros((3, 3))
+        self._motion = ConstantVelocity(np.array((config.largest_m_s, config.largest_m_s, config.largest_rad_s)))
+        self._expected: Array | None = None  # by the velocity alone
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None
         self._last_wheels: Array | None = None
@@ -88,11 +92,14 @@ class MotionPrior:
         back to a key scan.
         """
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
-        constant = self._velocity * elapsed if elapsed <= self.config.longest_s else np.zeros(3)
+        if elapsed > self.config.longest_s:
+            self._motion.forget()
+        constant = self._motion.velocity * elapsed
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
-            return self._without_wheels(last, covariance, constant, elapsed)
+            return self._without_wheels(last, constant, elapsed)
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
+        self._expected = None
         starts = [compose(last, step)]
         off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
         turn_doubt = math.radians(self.config.doubt_deg) + self.config.acceleration_rad_s2 * elapsed**2
@@ -129,37 +136,56 @@ class MotionPrior:
         )
         return not step.any() and moves and still_s <= config.longest_freeze_s
 
-    def _without_wheels(self, last: Array, covariance: Array, constant: Array, elapsed: float) -> Prediction:
+    def _without_wheels(self, last: Array, constant: Array, elapsed: float) -> Prediction:
         config = self.config
-        position = min(config.still_m + 0.5 * config.acceleration_m_s2 * elapsed**2, config.largest_m)
-        heading = math.radians(config.still_deg) + 0.5 * config.acceleration_rad_s2 * elapsed**2
-        deviations = np.array((position, position, min(heading, math.radians(config.largest_deg))))
-        mean = compose(last, constant)
-        total = np.diag(deviations**2) + covariance
+        still = np.array((config.still_m, config.still_m, math.radians(config.still_deg)))
+        largest = np.array((config.largest_m, config.largest_m, math.radians(config.largest_deg)))
+        self._expected = mean = compose(last, constant)
+        changes = np.minimum(0.5 * self._changes(elapsed), largest / elapsed)
+        total = self._motion.predict(last[2], elapsed, still, changes)
         information = np.linalg.inv(total).astype(np.float64)
         return Prediction(mean, total, information, (mean,))
 
-    def accept(self, stamp_ns: int, pose: Array, step: Array, covariance: Array, is_key: bool, unsure: bool) -> None:
+    def accept(
+        self,
+        stamp_ns: int,
+        pose: Array,
+        covariance: Array,
+        step: Array,
+        step_covariance: Array,
+        passes: bool,
+        is_key: bool,
+        unsure: bool,
+    ) -> Array:
         """The scan that was predicted last had this pose ``(3,)``, a step ``(3,)`` after the one before.
 
-        ``covariance`` ``(3, 3)`` is that of the step: a direction that the walls leave open tells no velocity. A step
-        that is ``unsure`` is no measured velocity: without wheels the last one is believed less and less.
+        ``covariance`` and ``step_covariance`` ``(3, 3)`` are those of both: a direction that the walls leave open tells
+        no velocity. A step that is ``unsure`` is no measured velocity: without wheels the last one is believed less and
+        less. The next priors count from a scan that ``passes``, or ``is_key``, of which the covariances count.
+
+        Returns:
+            The covariance ``(3, 3)`` that the pose's lacks in a sum of independent steps, along the odometry's axes.
         """
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
-        if not unsure or self._now_wheels is not None:
-            self._measure_velocity(step / elapsed, covariance / elapsed**2, elapsed)
+        if self._expected is None:
+            self._motion.measure(step / elapsed, step_covariance / elapsed**2, self._changes(elapsed))
         else:
-            self._velocity = 0.5 * self._velocity
+            change = pose - self._expected
+            change[2] = wrap(change[2])
+            self._motion.update(change, covariance)
+            if unsure:
+                self._motion.velocity = 0.5 * self._motion.velocity
+        shared = self._motion.shared()
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
-        if is_key:
-            self._anchor, self._anchor_wheels, self._anchor_covariance = pose, self._now_wheels, np.zeros((3, 3))
+        if passes or is_key:
+            self._anchor, self._anchor_wheels = pose, self._now_wheels
+            self._anchor_covariance = np.zeros((3, 3)) if is_key else covariance
             self._doubted = False
+        if is_key:
+            self._motion.begin_at_key()
+        return shared
 
-    def _measure_velocity(self, measured: Array, covariance: Array, elapsed: float) -> None:
-        """A step of a Kalman filter with accelerations as its noise."""
+    def _changes(self, elapsed: float) -> Array:
+        """Deviations ``(3,)`` of the change of a velocity."""
         config = self.config
-        changes = np.array((config.acceleration_m_s2, config.acceleration_m_s2, config.acceleration_rad_s2)) * elapsed
-        before = self._velocity_covariance + np.diag(changes**2)
-        gain = np.linalg.solve((before + covariance).T, before.T).T
-        self._velocity = self._velocity + gain @ (measured - self._velocity)
-        self._velocity_covariance = (np.eye(3) - gain) @ before
+        return elapsed * np.array((config.acceleration_m_s2, config.acceleration_m_s2, config.acceleration_rad_s2))

@@ -25,18 +25,19 @@ from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 class ScanOdometryConfig:
     """How scans become odometry.
 
-    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one; ``submap_scans`` of these are what
-    the next scan is registered to. A search precedes the registration where the prediction may be ``poor_m`` or
-    ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
-    ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
-    where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
-    ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that is
-    ``farthest_deviations`` from the prediction is no better than it. Where no wheels lead, one of less than
-    ``sure_share`` after a search is as likely as the prediction.
+    A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one, unless another was taken within
+    ``known_m`` of it and turned alike. The last ``submap_scans`` of these are what the next scan is registered to. A
+    search precedes the registration where the prediction may be ``poor_m`` or ``poor_deg`` wrong (one deviation); its
+    window is ``search_deviations`` wide to each side, at most ``largest_window_m`` and ``largest_window_deg``. Where
+    fewer than ``good_share`` of the points lie on lines, or where no wheels lead and the prediction may be ``wide_m``
+    wrong, a ``wide`` search follows. Where fewer than ``least_share`` do, or ``least_points``, the prediction stands. A
+    registration of less than ``good_share`` that is ``farthest_deviations`` from the prediction is no better than it.
+    Where no wheels lead, one of less than ``sure_share`` after a search is as likely as the prediction.
     """
 
     key_distance_m: float = 0.3
     key_turn_deg: float = 15.0
+    known_m: float = 0.3
     submap_scans: int = 30
     poor_m: float = 0.1
     poor_deg: float = 5.0
@@ -57,8 +58,8 @@ class ScanOdometryConfig:
 
     def __post_init__(self) -> None:
         positive = (
-            self.key_distance_m, self.key_turn_deg, self.poor_m, self.poor_deg, self.search_deviations, self.wide_m,
-            self.farthest_deviations, self.largest_window_m, self.largest_window_deg,
+            self.key_distance_m, self.key_turn_deg, self.known_m, self.poor_m, self.poor_deg, self.search_deviations,
+            self.wide_m, self.farthest_deviations, self.largest_window_m, self.largest_window_deg,
         )  # fmt: skip
         if not all(0.0 < value < math.inf for value in positive):
             raise ValueError(f"the distances, angles and deviations are {positive}; expected positive numbers")
@@ -118,6 +119,7 @@ class ScanOdometry:
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
         self._key = np.zeros(3)
+        self._passed = np.zeros(3)  # of the last key scan, or of a later scan that would be one in an unknown place
         self._stamp_ns: int | None = None
 
     def update(self, scan: KeyScan, wheels: WheelOdometry | None = None) -> ScanEstimate:
@@ -244,17 +246,23 @@ class ScanOdometry:
             both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
         if wheels is not None and not unsure and found.share >= self.config.good_share:
             wheels.observe_turn(self._stamp_ns, scan.stamp_ns, float(step[2]))
-        distance, turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
-        is_key = distance >= self.config.key_distance_m or turn >= math.radians(self.config.key_turn_deg)
+        distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
+        passed = between(self._passed, pose)
+        passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
+        # Where the robot may be elsewhere, nobody knows what it would see.
+        certain = float(max(covariance[0, 0], covariance[1, 1])) < self.config.poor_m**2
+        is_key = passes and not (certain and self._submap.knows(scan, pose, self.config.known_m, turn_rad))
         evidence = step_evidence(since_key, found, prediction, searched, unsure)
         factors = np.ones(3) if self._scaling is None else self._scaling.factors(evidence)
+        turned = turned_covariance(-self._pose[2], both)
+        shared = self._prior.accept(scan.stamp_ns, pose, covariance, step, turned, passes, is_key, unsure)
         estimate = ScanEstimate(
             scan.stamp_ns,
             step,
-            turned_covariance(-self._pose[2], both) * np.outer(factors, factors),
+            turned * np.outer(factors, factors),
             pose,
             since_key,
-            turned_covariance(-self._key[2], covariance),
+            turned_covariance(-self._key[2], covariance + shared),
             is_key,
             found.share,
             searched,
@@ -262,8 +270,9 @@ class ScanOdometry:
             evidence,
             factors,
         )
-        self._prior.accept(scan.stamp_ns, pose, step, turned_covariance(-self._pose[2], both), is_key, unsure)
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
+        if passes:
+            self._passed = pose
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
             self._submap.add(scan, pose)

@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array
 
@@ -94,10 +95,8 @@ class WheelLag:
             stamps_s, (at_s - 2.0 * self.config.largest_s, at_s + 2.0 * self.config.largest_s)
         )
         first, last = max(int(first) - 1, 0), int(last) + 1
-        stamps_s, yaws = stamps_s[first:last], yaws[first:last]
-        period_s = min(float(np.median(np.diff(stamps_s))), self.config.largest_s) if len(stamps_s) > 1 else 0.0
-        times_s = (at_s - self._lags)[:, None] + period_s * _WITHIN
-        averaged: Array = np.interp(times_s, stamps_s, yaws).mean(axis=1)
+        near = np.ascontiguousarray(stamps_s[first:last]), np.ascontiguousarray(yaws[first:last])
+        averaged: Array = _averages(at_s - self._lags.astype(np.float64), *near, self.config.largest_s)
         return averaged
 
     def _decide(self) -> bool:
@@ -114,3 +113,15 @@ class WheelLag:
             return False
         self.lag_s = float(lag)
         return True
+
+
+@njit(cache=True)
+def _averages(times_s: Array, stamps_s: Array, yaws: Array, longest_s: float) -> Array:
+    """Yaws ``(times,)`` averaged around times over two periods of the stamps, of ``longest_s`` at most."""
+    period_s = 0.0
+    if len(stamps_s) > 1:
+        period_s = min(float(np.median(stamps_s[1:] - stamps_s[:-1])), longest_s)
+    averages = np.empty(len(times_s))
+    for k in range(len(times_s)):
+        averages[k] = np.interp(times_s[k] + period_s * _WITHIN, stamps_s, yaws).mean()
+    return averages

@@ -232,6 +232,10 @@ class CorrectedTrajectory(ABC):
         relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
         return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
 
+    def begins_anew(self, step: RelativeStep) -> bool:
+        """Whether a step is of another odometry, so that ``update`` would forget this trajectory."""
+        return self._log.is_restart(step)
+
     def may_join(self, step: RelativeStep) -> bool:
         """Whether the trajectory can go on with another odometry from this step's frame."""
         return self._log.steps > 0

@@ -50,7 +50,8 @@ def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarra
     count = len(poses)
     chain = np.arange(count - 1)
     # Each pair once: a sparse array sums what it is given twice.
-    across = np.unique(loops[np.abs(loops[:, 1] - loops[:, 0]) > 1], axis=0)
+    across = loops[np.abs(loops[:, 1] - loops[:, 0]) > 1]
+    across = across[np.unique(across[:, 0] * count + across[:, 1], return_index=True)[1]]
     nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), across))
     lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
     # An edge of no length would be none.

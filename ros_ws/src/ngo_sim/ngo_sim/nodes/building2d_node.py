@@ -12,7 +12,6 @@ from collections.abc import Callable
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -101,7 +100,7 @@ class Building2dNode(Node):
                 self._name_watch.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
-                    self._scan.publisher.wait_for_all_acked(Duration(seconds=5))
+                    self.outputs.wait_for_all_acked()
                     self.get_logger().info(f"published all {self._published} scans")
                     return
                 idle_s = _IDLE_S

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -19,6 +21,8 @@ from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import BadParameter
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.writer import RecordingWriter
+
+_ACKED_S = 5.0
 
 
 class Output:
@@ -67,6 +71,7 @@ class Outputs:
         self._node, self._qos = node, qos
         self.topic_names: list[str] = []
         """The resolved names of all topics."""
+        self._publishers: list[Publisher] = []
         self._recording: Recording | None = None
         if record:
             path = Path(record).expanduser()
@@ -87,6 +92,7 @@ class Outputs:
         with checked_overrides():
             publisher = self._node.create_publisher(message_type, topic, qos, qos_overriding_options=overridable())
         self.topic_names.append(publisher.topic_name)
+        self._publishers.append(publisher)
         if self._recording is not None:
             package = message_type.__module__.partition(".")[0]
             type_name = f"{package}/msg/{message_type.__name__}"
@@ -109,6 +115,12 @@ class Outputs:
         if self._recording is not None:
             with _disk_errors():
                 self._recording.writer.flush_if_due()
+
+    def wait_for_all_acked(self) -> None:
+        """Wait until every reliable subscriber has every message, for 5 s at most."""
+        deadline_s = time.monotonic() + _ACKED_S
+        for publisher in self._publishers:
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline_s - time.monotonic())))
 
     def close(self) -> None:
         """End the recording."""

@@ -11,7 +11,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
-from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -62,7 +61,9 @@ class SimulatorNode(Node):
         self._clock_out = self.outputs.create(Clock, "/clock") if self.config.publish_clock else None
         self.create_subscription(DiscreteAction, "action_command", self._on_command, QoSProfile(depth=100))
         try:
-            self.simulation = Simulation(self.make_world(), self.config.seed, self.config.driver)
+            config = self.config
+            maze_seed = None if config.maze_seed < 0 else config.maze_seed
+            self.simulation = Simulation(self.make_world(), config.seed, config.driver, maze_seed)
         except ValueError as error:  # an error that only the files or the world can show
             raise BadParameter(str(error)) from None
         self._pacer = Pacer()
@@ -122,7 +123,7 @@ class SimulatorNode(Node):
                 self._name_watch.look()
             if 0 < self.config.frames <= self._published:
                 if self._consumers.drained(now_s, self.config.stall_timeout_s):
-                    self.image_publisher.wait_for_all_acked(Duration(seconds=5))
+                    self.outputs.wait_for_all_acked()
                     self.get_logger().info(f"published all {self._published} frames")
                     return
                 idle_s = _IDLE_S
