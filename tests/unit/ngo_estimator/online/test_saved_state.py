@@ -117,6 +117,23 @@ def test_the_round_trip_holds_where_an_optimisation_is_in_progress_and_key_frame
     assert_same(core, loaded)
 
 
+def test_the_round_trip_holds_at_each_frame_of_a_meta_pose_where_updates_go_on_from_the_last_solution(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    core, steps, resumed = networks("loops", 1, window_frames=160), make_steps(150), []
+    drive(core, steps[:120], range(0))
+    iterate = core._optimizer.iterate
+    monkeypatch.setattr(core._optimizer, "iterate", lambda *given: (resumed.append(given[-1]), iterate(*given))[1])
+    others = []
+    for step in steps[120:136]:
+        for other in [core, *others]:
+            other.update(step)
+        others.append(networks("loops", 1, window_frames=160).restored(core.state()))
+    assert {solution is None for solution in resumed} == {True, False}
+    for other in others:
+        assert_same(core, other)
+
+
 @pytest.mark.parametrize("when", ["while nothing runs", "while it optimises", "after scans are forgotten"])
 def test_the_round_trip_of_a_lidar_is_exact(tmp_path: Path, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = ScanGraphConfig(most_scans=100) if when == "after scans are forgotten" else ScanGraphConfig()

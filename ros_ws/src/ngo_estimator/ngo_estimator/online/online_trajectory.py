@@ -79,7 +79,7 @@ class OnlineTrajectory(CorrectedTrajectory):
         work = self._new_graph().work
         # An update must be done when the next one begins, a block later.
         least = -(-work // max(1, block - 1))
-        super().__init__(max(iterations_per_step, least) if iterations_per_step else work)
+        super().__init__(max(iterations_per_step, least) if iterations_per_step else 2 * work)  # one counts for two at most
 
     @classmethod
     def load(
