@@ -27,7 +27,7 @@ from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan
 
 from .processes import NodeProcess, Probe
 
-pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+pytestmark = pytest.mark.processes
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 STEP_NS, BEGIN_NS = 100_000_000, 50_000_000_000
