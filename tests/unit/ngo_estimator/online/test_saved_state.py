@@ -229,6 +229,23 @@ def test_other_settings_weights_and_formats_are_refused(
     assert refusal(folder, core) == f"{path}: is of format 3; expected 4"
 
 
+def test_the_scans_of_a_map_are_no_session_and_neither_replaces_the_other(tmp_path: Path) -> None:
+    core, of_a_map = networks(), {"map": "maze2d", "max_range": 0.0}
+    drive(core, make_steps(20), range(0))
+    session, scans_folder, arrays = tmp_path / "office", tmp_path / "scans", {"stamps_ns": np.arange(3)}
+    write_state(session, core.identity, core.state())
+    write_state(scans_folder, of_a_map, arrays)
+    expected = f"{scans_folder}/state.json: is the scans of an ngo_map; expected the state of an ngo_node"
+    assert refusal(scans_folder, core) == expected
+    with pytest.raises(StateError, match="is the state of an ngo_node; expected the scans of an ngo_map"):
+        read_state(session, of_a_map)
+    with pytest.raises(StateError, match="office: holds the state of an ngo_node; save the scans of an ngo_map in a"):
+        write_state(session, of_a_map, arrays)
+    core.restored(read_state(session, core.identity))
+    (scans_folder / "state.json").write_text("damaged")
+    write_state(scans_folder, core.identity, core.state())  # nothing is lost there
+
+
 def test_a_lidars_other_settings_are_named(tmp_path: Path) -> None:
     core = scans()
     drive(core, list(lidar_drive()[:5]), range(0))

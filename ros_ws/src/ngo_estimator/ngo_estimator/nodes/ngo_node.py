@@ -86,7 +86,7 @@ class NgoNode(ManagedNode):
         from ngo_estimator.online.session import Session
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
-        self._core = load_trajectory(settings)
+        self._core = load_trajectory(settings, self.get_logger())
         self._origin_of, self._session_of = MapOrigin, Session
         self._paused = False
         self._report = TrajectoryReport()

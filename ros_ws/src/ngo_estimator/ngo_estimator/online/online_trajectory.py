@@ -108,6 +108,11 @@ class OnlineTrajectory(CorrectedTrajectory):
         return self._block
 
     @property
+    def feature_sizes(self) -> tuple[int, int]:
+        """Lengths of a step's motion feature and place code, 0 where codes are not used."""
+        return self._optimizer.config.aggregation.motion_feature_size, self._code_length or 0
+
+    @property
     def window_frames(self) -> int:
         """Steps that are optimised together."""
         return self._window
