@@ -40,10 +40,14 @@ Frame = Sequence[tuple[str, Any]]
 
 @dataclass(frozen=True)
 class Latencies:
-    """Of a node at ``RATE_HZ``: ``milliseconds`` of each frame, and frames/s before, at a pace of the node's own."""
+    """Of a node at ``RATE_HZ``: ``milliseconds`` of each frame, and frames/s before, at a pace of the node's own.
+
+    ``resident_mb`` is its memory after all frames.
+    """
 
     milliseconds: list[float]
     frames_per_s: float
+    resident_mb: float
 
     def percentile(self, percent: float) -> float:
         """In ms."""
@@ -198,4 +202,6 @@ def _measured(
             sent = feed.connect(frames[:first], again)
             frames_per_s = feed.fast(frames[sent:first])
             milliseconds = feed.paced(frames[first:])
-    return Latencies(milliseconds, frames_per_s)
+            status = Path(f"/proc/{graph.pid(spec.executable)}/status").read_text()
+            resident_mb = int(status.split("VmRSS:")[1].split()[0]) / 1024.0
+    return Latencies(milliseconds, frames_per_s, resident_mb)

@@ -37,6 +37,9 @@ BARS = {
     "everything_to_gtsam_lm": 0.35,
     "longest_to_median": 3.0,
     "ngo_node_p99_to_median": 2.5,
+    "local_node_p99_to_median": 2.5,
+    "ngo_node_resident_mb": 350.0,
+    "local_node_resident_mb": 350.0,
 }
 """What is to be below."""
 
@@ -102,7 +105,6 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         "cpu_everything_to_gtsam_lm": core["update"]["cpu_ms"] / core["gtsam_lm"]["cpu_ms"],
         "longest_to_median": float(np.max(core_ms) / np.median(core_ms)),
         "cpu_longest_to_median": float(np.max(core_cpu_ms) / np.median(core_cpu_ms)),
-        "ngo_node_p99_to_median": ngo.percentile(99) / ngo.percentile(50),
         "cpu_s_a_minute_at_10_hz": 0.6 * float(np.mean(core_cpu_ms)),
         "end_to_end_frames_per_s": end_to_end(world, arguments),
         "times_bound": core["update"]["ms"] / core["work"]["bound_ms"],
@@ -119,6 +121,8 @@ def _named(node: str, latencies: Latencies, core_ms: list[float]) -> dict[str, f
         f"{node}_max_ms": latencies.percentile(100),
         f"{node}_core_share": float(np.sum(core_ms) / np.sum(latencies.milliseconds)),
         f"{node}_frames_per_s": latencies.frames_per_s,
+        f"{node}_p99_to_median": latencies.percentile(99) / latencies.percentile(50),
+        f"{node}_resident_mb": latencies.resident_mb,
     }
 
 
@@ -171,7 +175,10 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
         bar = f"{BARS[key]:g}" if key in BARS else ""
         row(f"{name} (by the clock, by cpu)", lambda r, k=key: f"{r[k]:.2f}, {r[f'cpu_{k}']:.2f}", bar)
     row("loops in the window", lambda r: str(r["loops"]))
-    row("ngo_node: p99 / median", lambda r: f"{r['ngo_node_p99_to_median']:.2f}", f"{BARS['ngo_node_p99_to_median']:g}")
+    for node in ("ngo_node", "local_node"):
+        ratio, memory = f"{node}_p99_to_median", f"{node}_resident_mb"
+        row(f"{node}: p99 / median", lambda r, k=ratio: f"{r[k]:.2f}", f"{BARS[ratio]:g}")
+        row(f"{node}: resident memory (MB)", lambda r, k=memory: f"{r[k]:.0f}", f"{BARS[memory]:g}")
     row("the core, cpu s in a minute at 10 Hz", lambda r: f"{r['cpu_s_a_minute_at_10_hz']:.2f}")
     errors = ("odometry", "ours", "gtsam_lm", "isam2", "isam2_default")
     row(f"RMSE: {', '.join(errors)} (m)", lambda r: ", ".join(f"{r['rmse_m'][name]:.3f}" for name in errors))

@@ -27,7 +27,7 @@ from ngo_sim.mazes import Maze
 from training.common.runs import WEIGHTS
 from training.recordings.recorder import Recorder
 
-START_TIMEOUT_S = 90.0
+START_TIMEOUT_S = 180.0  # the first start after an installation compiles
 SILENCE_TIMEOUT_S = 60.0
 """How long nothing at all may come through before a run counts as stuck."""
 
@@ -61,8 +61,8 @@ class SessionConfig:
         except ValueError:
             return False  # a node says what is wrong with them
 
-    def estimators(self) -> list[NodeSpec]:
-        """The estimator nodes; the image comes reliably, because a demo must not depend on luck."""
+    def estimators(self, out: Path) -> list[NodeSpec]:
+        """The estimator nodes, which may write below ``out``; images come reliably: a demo must not depend on luck."""
         weights = {} if self.weights is None else {"weights": str(self.weights.resolve())}
         window = {"window_frames": max(2000, self.frames), "relative_pose_depth": max(2000, self.frames)}
         local = {
@@ -71,7 +71,8 @@ class SessionConfig:
             "relative_pose_depth": window["relative_pose_depth"],
         }
         depth = {"relative_pose_depth": window["relative_pose_depth"]}
-        mapper = {"world": self.world, "map_update_interval": MAP_INTERVAL_S, **depth, **weights}
+        writes = {"map_update_interval": MAP_INTERVAL_S, "save_directory": str(out.absolute())}
+        mapper = {"world": self.world, **writes, **depth, **weights}
         return [
             # A path after every frame, for the latency.
             NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
@@ -119,7 +120,7 @@ class Session:
             recorder.listen("ngo/path", self._on_path)
             recorder.listen("image", self._image_times)
             show("loading the networks", 0)
-            for spec in config.estimators():
+            for spec in config.estimators(self._out):
                 graph.start(spec)
             draws_map = config.draws_map
             # The recorder subscribes relative_pose and image, too: the estimators are up when there are more of each.

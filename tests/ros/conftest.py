@@ -7,8 +7,9 @@ import torch
 
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.offline import warm_up
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
 
-from .relative_poses import write_weights
+from .relative_poses import WORLD, write_weights
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +20,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def compiled() -> None:
-    """A lidar's estimators and maps, compiled: in a fresh clone a node takes longer to start than tests wait for it."""
+@pytest.fixture(scope="session", autouse=True)
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Estimators and maps, compiled: in a fresh clone a node takes longer to start than tests wait for it."""
     warm_up.warm_up()
     scan_map.warm_up()
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("compiled")
+    write_weights(folder)
+    warm_up.warm_up_networks(OnlineTrajectory.load(folder, 32, WORLD))

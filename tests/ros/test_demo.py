@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 from ngo_estimator.checkpoint import write_untrained
 
-pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+pytestmark = pytest.mark.processes
 
 DEMO = Path(__file__).parents[2] / "demo" / "run.py"
 FRAMES = 30

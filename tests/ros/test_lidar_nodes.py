@@ -29,7 +29,7 @@ from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 from .processes import NodeProcess, Probe
 
-pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+pytestmark = pytest.mark.processes
 
 FRAMES = 60
 STEP_NS = 100_000_000

@@ -11,7 +11,7 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav2_msgs.srv import SaveMap
 from nav_msgs.msg import OccupancyGrid
 from ngo_msgs.msg import RelativePose, Trajectory
-from ngo_msgs.srv import SaveState
+from ngo_msgs.srv import LoadState, SaveState
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
@@ -27,7 +27,7 @@ from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan
 
 from .processes import NodeProcess, Probe
 
-pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+pytestmark = pytest.mark.processes
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 STEP_NS, BEGIN_NS = 100_000_000, 50_000_000_000
@@ -230,6 +230,19 @@ def test_a_saved_map_is_there_again_after_a_restart(mapper: Mapper, tmp_path: Pa
     ) as other:
         assert other.wait() == 2
         assert len(other.lines) == 1 and "was saved with max_range 1.0; here it is 2.0" in other.log
+
+
+def test_a_saved_map_is_loaded_where_the_node_runs_already(mapper: Mapper, tmp_path: Path) -> None:
+    mapper.wait_for_map(expected(30, poses(30)))
+    folder = tmp_path / "scans"
+    assert mapper.probe.call(SaveState, "ngo_map/save_state", SaveState.Request(path=str(folder))).success
+    mapper.drive(1, 10, poses(10))
+    mapper.process.wait_for_log("the trajectory began anew, and so does the map")
+    for path, said in ((tmp_path / "nothing", "cannot be read (No such file or directory)"), (folder, "loaded ")):
+        answer = mapper.probe.call(LoadState, "ngo_map/load_state", LoadState.Request(path=str(path)))
+        assert answer.success == (path == folder) and said in answer.message
+    mapper.trajectories.publish(trajectory(CORRECTED))
+    mapper.wait_for_map(expected(30, CORRECTED))
 
 
 def test_bad_messages_are_dropped_with_a_reason(mapper: Mapper) -> None:

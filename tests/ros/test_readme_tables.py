@@ -18,7 +18,7 @@ from .readme_tables import (
     table_rows,
 )
 
-pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+pytestmark = pytest.mark.processes
 
 DISCOVERY_S = 30.0
 

@@ -23,7 +23,7 @@ from tests.unit.ngo_estimator.samples import SCAN
 
 from .processes import NodeProcess, Probe
 
-pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("compiled")]
+pytestmark = pytest.mark.processes
 
 FRAMES = 25
 STEP_NS = 100_000_000

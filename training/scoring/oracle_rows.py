@@ -15,7 +15,7 @@ from torch import Tensor
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses
+from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines.graph_settings import load_settings
 from training.baselines.loop_factors import LoopFactors, smoothed_odometry
@@ -148,10 +148,14 @@ class InformedOptimizer(NeuralGraphOptimizer):
         self._truth = truth
 
     def iterate(
-        self, steps: MetaSteps, loops: Loops | None = None, corrections: Sequence[Correction] | None = None
+        self,
+        steps: MetaSteps,
+        loops: Loops | None = None,
+        corrections: Sequence[Correction] | None = None,
+        solution: Solution | None = None,
     ) -> Iterator[OptimizedMetaPoses]:
         exact = None if loops is None else exact_loops(loops, self._truth, self.block)
-        return super().iterate(steps, exact, corrections)
+        return super().iterate(steps, exact, corrections, solution)
 
     def overlaps(self, steps: MetaSteps, loops: Loops, poses: Tensor) -> Loops | None:
         found = super().overlaps(steps, loops, poses)

@@ -1,10 +1,48 @@
-"""What a lidar's nodes compile before the first scan comes."""
+"""What nodes compile before the first frame comes."""
 
-from ngo_estimator.geometry import branch_and_bound, scan_matching, scan_points
-from ngo_estimator.offline.warm_up import warm_up
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ngo_estimator.geometry import branch_and_bound, scan_matching, scan_points, scan_registration_kernels
+from ngo_estimator.offline.warm_up import warm_up, warm_up_networks
+from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.optimizer import block_cholesky, compiled_closing, shared_views_kernel
+from tests.unit.ngo_estimator.online.test_online_trajectory import make_steps
+from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
+
+WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 
 
 def test_registration_and_the_search_for_loops_are_compiled() -> None:
     warm_up()
     for function in (scan_points._thinned, scan_points._normals, scan_matching._icp, branch_and_bound._best_first):
         assert function.signatures, function
+
+
+@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
+def test_all_that_an_update_of_the_shipped_networks_runs_is_compiled(world: str) -> None:
+    online = OnlineTrajectory.load(WEIGHTS / world, 2000, world, 128, 1)
+    warm_up_networks(online)
+    assert online.trajectory() is None
+    views = [shared_views_kernel.share_views] if world == "maze3d" else []
+    closing = [compiled_closing._add_loops, compiled_closing._channels, compiled_closing._deviate]
+    solver = [block_cholesky.factorise, block_cholesky.solve, scan_registration_kernels.register_pairs]
+    for function in (*closing, *solver, *views):
+        assert function.signatures, function
+
+
+@pytest.mark.parametrize("form", ["loops", "paper"])
+def test_a_trajectory_is_as_new_behind_it(form: str) -> None:
+    new, warm = (
+        OnlineTrajectory(small_optimizer(form, trained=True), None if form == "paper" else small_pair_head(), 32, 2, 1)
+        for _ in range(2)
+    )
+    warm_up_networks(warm)
+    for step in make_steps(40):
+        ours, theirs = new.update(step), warm.update(step)
+        assert not theirs.fault
+        np.testing.assert_array_equal(theirs.pose_xyyaw, ours.pose_xyyaw)
+    ours, theirs = new.state(), warm.state()
+    assert all(theirs[name].tobytes() == array.tobytes() for name, array in ours.items())

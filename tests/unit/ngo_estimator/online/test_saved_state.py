@@ -117,6 +117,23 @@ def test_the_round_trip_holds_where_an_optimisation_is_in_progress_and_key_frame
     assert_same(core, loaded)
 
 
+def test_the_round_trip_holds_at_each_frame_of_a_meta_pose_where_updates_go_on_from_the_last_solution(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    core, steps, resumed = networks("loops", 1, window_frames=160), make_steps(150), []
+    drive(core, steps[:120], range(0))
+    iterate = core._optimizer.iterate
+    monkeypatch.setattr(core._optimizer, "iterate", lambda *given: (resumed.append(given[-1]), iterate(*given))[1])
+    others = []
+    for step in steps[120:136]:
+        for other in [core, *others]:
+            other.update(step)
+        others.append(networks("loops", 1, window_frames=160).restored(core.state()))
+    assert {solution is None for solution in resumed} == {True, False}
+    for other in others:
+        assert_same(core, other)
+
+
 @pytest.mark.parametrize("when", ["while nothing runs", "while it optimises", "after scans are forgotten"])
 def test_the_round_trip_of_a_lidar_is_exact(tmp_path: Path, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = ScanGraphConfig(most_scans=100) if when == "after scans are forgotten" else ScanGraphConfig()
@@ -210,6 +227,23 @@ def test_other_settings_weights_and_formats_are_refused(
     assert refusal(folder, scans()).startswith(f"{path}: was saved with graph null; here it is ")
     monkeypatch.setattr(saved_state, "FORMAT", 4)
     assert refusal(folder, core) == f"{path}: is of format 3; expected 4"
+
+
+def test_the_scans_of_a_map_are_no_session_and_neither_replaces_the_other(tmp_path: Path) -> None:
+    core, of_a_map = networks(), {"map": "maze2d", "max_range": 0.0}
+    drive(core, make_steps(20), range(0))
+    session, scans_folder, arrays = tmp_path / "office", tmp_path / "scans", {"stamps_ns": np.arange(3)}
+    write_state(session, core.identity, core.state())
+    write_state(scans_folder, of_a_map, arrays)
+    expected = f"{scans_folder}/state.json: is the scans of an ngo_map; expected the state of an ngo_node"
+    assert refusal(scans_folder, core) == expected
+    with pytest.raises(StateError, match="is the state of an ngo_node; expected the scans of an ngo_map"):
+        read_state(session, of_a_map)
+    with pytest.raises(StateError, match="office: holds the state of an ngo_node; save the scans of an ngo_map in a"):
+        write_state(session, of_a_map, arrays)
+    core.restored(read_state(session, core.identity))
+    (scans_folder / "state.json").write_text("damaged")
+    write_state(scans_folder, core.identity, core.state())  # nothing is lost there
 
 
 def test_a_lidars_other_settings_are_named(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: ``se2`` without torch.
 
-Poses have the shape ``(3,)``. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies in ``(-pi, pi]``.
+Poses have the shape ``(3,)`` where nothing else is said. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies
+in ``(-pi, pi]``.
 """
 
 import math
@@ -31,6 +32,15 @@ def between(a: Array, b: Array) -> Array:
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x, y = b[0] - a[0], b[1] - a[1]
     return np.array((cos * x + sin * y, -sin * x + cos * y, wrap(b[2] - a[2])))
+
+
+@njit(cache=True)
+def all_between(a: Array, b: Array) -> Array:
+    """``between`` of poses ``(n, 3)``, row by row; either may be a single one ``(1, 3)`` for all rows of the other."""
+    result = np.empty((len(b) if len(a) == 1 else len(a), 3))
+    for k in range(len(result)):
+        result[k] = between(a[0 if len(a) == 1 else k], b[0 if len(b) == 1 else k])
+    return result
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from nav2_msgs.srv import SaveMap
 from ngo_msgs.msg import RelativePose, Trajectory
-from ngo_msgs.srv import SaveState
+from ngo_msgs.srv import LoadState, SaveState
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -56,6 +56,7 @@ class NgoMap(Node):
             self._create_topics(settings)
         self.create_service(SaveMap, "~/save_map", self._on_save)
         self.create_service(SaveState, "~/save_state", self._on_save_state)
+        self.create_service(LoadState, "~/load_state", self._on_load_state)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(settings.map_update_interval, self._follow, clock=steady)
         self._live.on_change(self._on_settings)
@@ -187,6 +188,18 @@ class NgoMap(Node):
             response.message = " ".join(str(error).split()) or repr(error)
             return response
         response.success, response.message = True, f"wrote {len(arrays['stamps_ns'])} scans to {folder}"
+        return response
+
+    def _on_load_state(self, request: LoadState.Request, response: LoadState.Response) -> LoadState.Response:
+        """Take saved scans in place of the map; the mode says nothing here: the trajectory decides where they lie."""
+        try:
+            folder = folder_inside(Path(self._settings.save_directory), request.path)
+            self._map.restore(read_state(folder, self._identity))
+        except Exception as error:  # the caller of the service gets an answer in any case
+            response.message = " ".join(str(error).split()) or repr(error)
+            return response
+        self._due = self._trajectory is not None
+        response.success, response.message = True, f"loaded {self._map.waiting} scans from {folder}"
         return response
 
     def _on_settings(self, settings: MapNodeSettings) -> None:

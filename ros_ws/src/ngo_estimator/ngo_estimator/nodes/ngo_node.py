@@ -20,6 +20,7 @@ from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.code_memory import release_code
 from ngo_estimator.nodes.file_services import FileServices
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.managed_node import ManagedNode
@@ -44,6 +45,7 @@ _DEPTH = 100
 _SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
 _PENDING_S = 1.0
 _SEARCH_LINE_S = 10.0
+_STARTS = 80  # relative poses until compiled functions are loaded
 _SUMMARY = "Publishes the corrected trajectory and map -> odom from relative poses."
 
 
@@ -84,7 +86,7 @@ class NgoNode(ManagedNode):
         from ngo_estimator.online.session import Session
         from ngo_estimator.online.tf_smoothing import SmoothedCorrection
 
-        self._core = load_trajectory(settings)
+        self._core = load_trajectory(settings, self.get_logger())
         self._origin_of, self._session_of = MapOrigin, Session
         self._paused = False
         self._report = TrajectoryReport()
@@ -155,6 +157,8 @@ class NgoNode(ManagedNode):
             self._whole.changed(loops=True)
         self._status.idle = ""
         listening.callback(setattr, self._status, "idle", "inactive")
+        self._starts = _STARTS
+        release_code()
         name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
         self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
@@ -192,6 +196,9 @@ class NgoNode(ManagedNode):
             self._status.dropped("relative pose", "internal error", warn=False)
             return
         self._status.received(step.stamp_ns)
+        self._starts -= 1
+        if self._starts == 0:
+            release_code()
         if found is not None:
             self._on_found(found, step.tf_odom_xyyaw, publish=update is None)
         if update is not None:

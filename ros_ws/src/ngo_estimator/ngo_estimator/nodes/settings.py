@@ -242,6 +242,8 @@ class MapNodeSettings(StepSettings):
     trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory, from ngo_node.")
     map_topic: str = topic("map", "Map; changes of a part of it go to a topic of this name with _updates behind it.")
     save_directory: str = setting(
-        "", "Folder in which ~/save_map and ~/save_state may write; empty: the working directory of the node."
+        "",
+        "Folder in which ~/save_map and ~/save_state may write, and ~/load_state may read; empty: the working "
+        "directory of the node.",
     )
     state: str = setting("", "Folder of the scans of a saved map, relative to save_directory; empty: none.")

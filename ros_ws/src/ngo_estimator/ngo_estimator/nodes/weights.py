@@ -1,10 +1,13 @@
 """Loading the weights that a node's parameters name."""
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from ament_index_python.packages import get_package_share_directory
+from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.lidar_file import is_lidar
@@ -14,6 +17,22 @@ if TYPE_CHECKING:
     from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 
 Core = TypeVar("Core")
+
+_SILENT_S = 5.0
+
+
+@contextmanager
+def compiling(logger: RcutilsLogger) -> Iterator[None]:
+    """Around a warm-up: says what takes so long where it takes long, which is once after an installation."""
+    said = threading.Timer(
+        _SILENT_S, logger.info, ("compiles, once after an installation: this takes from ten seconds to two minutes",)
+    )
+    said.daemon = True
+    said.start()
+    try:
+        yield
+    finally:
+        said.cancel()
 
 
 def weights_folder(settings: StepSettings) -> Path:
@@ -37,19 +56,26 @@ def load_core(load: Callable[[Path, str], Core], settings: EstimatorSettings) ->
         raise StartError(str(error)) from error
 
 
-def load_trajectory(settings: NgoNodeSettings) -> "CorrectedTrajectory":
-    """An empty trajectory with the weights that ``settings`` name; raises ``StartError`` where they cannot be used."""
+def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "CorrectedTrajectory":
+    """An empty trajectory with the weights that ``settings`` name; raises ``StartError`` where they cannot be used.
+
+    All that it runs is compiled by then, which ``logger`` tells where it takes long.
+    """
     # Imported here because torch takes seconds: a bad parameter is said at once.
-    from ngo_estimator.offline.warm_up import warm_up
+    from ngo_estimator.offline.warm_up import warm_up, warm_up_networks
     from ngo_estimator.online.online_trajectory import OnlineTrajectory
     from ngo_estimator.online.scan_trajectory import ScanTrajectory
 
     def load(folder: Path, world: str) -> "CorrectedTrajectory":
         if is_lidar(folder):
-            warm_up()
+            with compiling(logger):
+                warm_up()
             return ScanTrajectory.load(folder, world, settings.iterations_per_step)
-        return OnlineTrajectory.load(
+        online = OnlineTrajectory.load(
             folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
         )
+        with compiling(logger):
+            warm_up_networks(online)
+        return online
 
     return load_core(load, settings)

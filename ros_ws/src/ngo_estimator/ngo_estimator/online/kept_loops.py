@@ -39,13 +39,15 @@ class KeptLoops:
     """``n`` loops between nodes that count the blocks from the beginning of the trajectory.
 
     ``loops`` are a batch of one, in float64, without ``embeddings``; its ``most_drift`` is infinite if the odometry
-    tells enough. ``weight`` ``(n,)`` is the optimizer's last weight, ``UNWEIGHED`` before it had one; ``overlap``
-    ``(n,)`` says whether the loop was found by poses, not by its place.
+    tells enough. ``weight`` ``(n,)`` is the optimizer's last weight, ``UNWEIGHED`` before it had one, and
+    ``information`` ``(n, 3)`` what it gave the loop; ``overlap`` ``(n,)`` says whether the loop was found by poses, not
+    by its place.
     """
 
     loops: Loops
     weight: np.ndarray
     overlap: np.ndarray
+    information: np.ndarray
 
     @classmethod
     def none(cls) -> KeptLoops:
@@ -80,7 +82,7 @@ class KeptLoops:
             embeddings=torch.zeros(1, 0, 0),
             most_drift=torch.full((1, count, 3), torch.inf, dtype=torch.float64),
         )
-        return cls(loops, np.full(count, UNWEIGHED), np.full(count, overlap))
+        return cls(loops, np.full(count, UNWEIGHED), np.full(count, overlap), np.full((count, 3), UNWEIGHED))
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -107,11 +109,14 @@ class KeptLoops:
 
     def where(self, which: np.ndarray) -> KeptLoops:
         """The loops of a boolean mask or of indices."""
-        return KeptLoops(self.loops.where(torch.from_numpy(which)), self.weight[which], self.overlap[which])
+        loops = self.loops.where(torch.from_numpy(which))
+        return KeptLoops(loops, self.weight[which], self.overlap[which], self.information[which])
 
     def and_also(self, others: KeptLoops) -> KeptLoops:
         """These and, behind them, the others."""
-        both = [(self.weight, others.weight), (self.overlap, others.overlap)]
+        both = [
+            (self.weight, others.weight), (self.overlap, others.overlap), (self.information, others.information)
+        ]  # fmt: skip
         return KeptLoops(self.loops.and_also(others.loops), *(np.concatenate(pair) for pair in both))
 
     def best(self, numbers: np.ndarray, most: int) -> np.ndarray:
@@ -135,18 +140,19 @@ class KeptLoops:
     def state(self) -> Arrays:
         """All of it, for ``from_state``."""
         record = {name: getattr(self.loops, name)[0].numpy() for name in _FIELDS}
-        return {**record, "weight": self.weight, "overlap": self.overlap}
+        return {**record, "weight": self.weight, "overlap": self.overlap, "information": self.information}
 
     @classmethod
     def from_state(cls, arrays: Arrays) -> KeptLoops:
         """The loops of a ``state()``; raises ``StateError``."""
         weight = taken(arrays, "weight", np.float64, -1)
         overlap, count = taken(arrays, "overlap", np.bool_, len(weight)), len(weight)
+        information = taken(arrays, "information", np.float64, count, 3)
         record = {name: taken(arrays, name, dtype, count, *shape) for name, (dtype, shape) in _FIELDS.items()}
         forward = (record["start"] >= 0) & (record["start"] <= record["end"]) & (record["frame"] >= -1)
         require(bool(forward.all()), "a loop does not lead from an earlier node to a later one")
         tensors = {name: torch.from_numpy(values).unsqueeze(0) for name, values in record.items()}
-        return cls(Loops(**tensors, embeddings=torch.zeros(1, 0, 0)), weight, overlap)  # type: ignore[arg-type]
+        return cls(Loops(**tensors, embeddings=torch.zeros(1, 0, 0)), weight, overlap, information)  # type: ignore[arg-type]
 
     def for_optimizer(self, keys: np.ndarray, first: int, embeddings: np.ndarray) -> Loops:
         """The record in float32, numbered as the optimizer counts: key frames, and the nodes of the window behind them.

@@ -23,7 +23,7 @@ from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.online.step_log import StepLog
-from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses
+from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 from ngo_estimator.optimizer.registered_odometry import registered_steps
@@ -56,15 +56,20 @@ _LEAST_INFORMATION = 1e-12
 
 @dataclass
 class _Running:
-    """An optimisation in progress, of which so many iterations are ``left``."""
+    """An optimisation in progress, of which so many results were ``taken``."""
 
     iterations: Iterator[OptimizedMetaPoses]
-    left: int
     keys: np.ndarray
     first: int
     numbers: np.ndarray
     runs_network: bool
+    taken: int = 0
     result: OptimizedMetaPoses | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether the result is the last one."""
+        return self.result is not None and self.result.left == 0
 
 
 @dataclass(frozen=True)
@@ -482,12 +487,20 @@ class MetaGraph:
         )
         if (fixed := self._fixed.slice(first)).any():
             steps = replace(steps, fixed=torch.from_numpy(fixed.copy()).unsqueeze(0))
-        loops, numbers = None, np.zeros(0, np.int64)
+        loops, numbers, solution = None, np.zeros(0, np.int64), None
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
-        iterations = self._optimizer.iterate(steps, loops, corrections)
+            # Across blind stretches the poses are not those of the solution.
+            if corrections is not None and not self._blind.values[first:].any():
+                solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
+        iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         runs_network = self._optimizer.config.network and corrections is None
-        self._running = _Running(iterations, self._optimizer.config.iterations, keys, first, numbers, runs_network)
+        self._running = _Running(iterations, keys, first, numbers, runs_network)
+
+    def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
+        """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
+        nodes = torch.from_numpy(self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))])
+        return se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
 
     def _remembered(self) -> list[Correction] | None:
         """What the network gave lately; None where it is time to run it, or where there is none."""
@@ -498,6 +511,16 @@ class MetaGraph:
         new = self.blocks - known.first - seen
         # A short trajectory changes a lot with each block.
         return None if new >= min(self._network_every, 1 + seen // 8) else known.for_blocks(self._first, self.blocks)
+
+    def _iterate(self) -> int:
+        """Prepare an optimisation, or run its next iteration; how many iterations that counts for."""
+        if self._running is None:
+            self._prepare()
+            return 1
+        self._running.result = next(self._running.iterations)
+        self._running.taken += 1
+        # With the network it takes twice as long, and has a step of its own where the block has enough of them.
+        return _LONG if self._running.runs_network and self._running.result.left <= self._steps_left else 1
 
     @torch.inference_mode()
     def advance(self, iterations: int) -> bool:
@@ -514,28 +537,28 @@ class MetaGraph:
                 self._do(self._work.pop(0))
                 iterations -= _LONG
                 continue
-            if self._running is None:
-                self._prepare()
-            elif self._running.left:
-                self._running.result = next(self._running.iterations)
-                self._running.left -= 1
-            else:
+            if self._running is not None and self._running.done:
                 break
-            iterations -= 1
+            iterations -= self._iterate()
         self._begun_s += time.perf_counter() - began
         running = self._running
-        if running is None or running.left or running.result is None:
+        if running is None or running.result is None or not running.done:
             return False
         end = self._scale * running.result.end_covariance()[0].numpy()
         poses = running.result.meta_relative[-1]
         if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
         self._running, self._begun, self.took_s = None, False, self._begun_s
-        moved = self._apply(running, running.result)
+        moved = self._apply(running, running.result, end)
         end = end + np.outer(moved, moved)
         self._pose, self._covariance = self._newest(end)
         self.optimized = True
         return True
+
+    @property
+    def _steps_left(self) -> int:
+        """Steps to come before the one that completes the next block, less one that is kept free."""
+        return max(0, self._block - 2 - (len(self.odometry) - 1) % self._block)
 
     @property
     def unfinished(self) -> bool:
@@ -545,16 +568,21 @@ class MetaGraph:
     def finish(self) -> bool:
         """Do what is left of an optimisation that has begun; returns whether there was one."""
         self._settle()
-        return self._begun and self.advance(1 + self._optimizer.config.iterations)
+        if not self._begun:
+            return False
+        while not self.advance(1):
+            pass
+        return True
 
-    def _apply(self, running: "_Running", result: OptimizedMetaPoses) -> np.ndarray:
+    def _apply(self, running: "_Running", result: OptimizedMetaPoses, end: np.ndarray) -> np.ndarray:
         """Take the result; how far the last node is from it ``(3,)``, as unfamiliar frames make corrections unsure."""
         keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
-            self.loop_std = result.loop_information[0].double().clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
+            information = result.loop_information[0].double()
+            self.loop_std = information.clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
             self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(running.numbers, self.loop_weights)
+            self._loops.weigh(running.numbers, self.loop_weights, information.numpy())
         poses = se2.r2g(result.meta_relative[-1][0].double())
         poses[:, 2] = se2.wrap(poses[:, 2])
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
@@ -562,7 +590,7 @@ class MetaGraph:
         moved = self._shrink(poses.numpy())
         self._nodes.values[self._active[1:]] = poses.numpy()
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
-        self._end, self._information = self._scale * result.end_covariance()[0].numpy(), result.equations
+        self._end, self._information = end, result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
         if running.runs_network and self._network_every > 1:
             self._corrections = _Corrections.of(first, result.corrections)
@@ -574,10 +602,10 @@ class MetaGraph:
             return np.zeros(3)
         active, log = self._active, self._log().odometry.values
         odometry = se2.between(torch.from_numpy(log[0]), torch.from_numpy(log[active * self._block])).numpy()
-        weighed = self._loops.weighed() if self._loops is not None else (np.zeros((0, 2), np.int64), np.zeros(0))
+        ties = self._loops.ties() if self._loops is not None else (np.zeros((0, 2), np.int64), np.zeros(0))
         variance = summed_variances(self._blind.values, active)
-        joined = np.searchsorted(active, weighed[0])
-        shrunk = shrunk_corrections(np.vstack((np.zeros(3), poses)), odometry, variance, joined, weighed[1])
+        joined = np.searchsorted(active, ties[0])
+        shrunk = shrunk_corrections(np.vstack((np.zeros(3), poses)), odometry, variance, joined, ties[1])
         moved: np.ndarray = shrunk[-1] - poses[-1]
         poses[:] = shrunk[1:]
         return moved
@@ -655,7 +683,7 @@ class MetaGraph:
         changed.
         """
         running, code = self._running, self._origin_code
-        iterated = 0 if running is None else 1 + self._optimizer.config.iterations - running.left
+        iterated = 0 if running is None else 1 + running.taken
         known = self._corrections
         arrays = {
             "odometry": self.odometry.values,
@@ -739,8 +767,9 @@ class MetaGraph:
         self._begun = bool(taken(arrays, "begun", np.bool_))
         require(self._begun or not iterated, "an optimisation has not begun, and iterated")
         require(not (left and iterated), "an optimisation has iterated before its time")
-        if iterated:
-            self.advance(iterated)
+        with torch.inference_mode():
+            for _ in range(iterated):
+                self._iterate()
 
     def _restored_corrections(self, arrays: Arrays) -> _Corrections:
         first, iterations = taken_integer(arrays, "first"), self._optimizer.config.iterations

@@ -15,6 +15,7 @@ from torch import Tensor
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, under
 from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import all_between
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
@@ -236,7 +237,7 @@ class OnlineLoops:
             views = self._views(pairs, end, OVERLAP_VIEWS)
             of_ranges = views._replace(a=self._ranges(views.a), b=self._ranges(views.b))
             measurement, registered = measure_overlaps(scans, of_ranges, relative[chosen], self._search.registrations)
-            embeddings = [self._pair_head.embed(codes[0]) for codes in (views.a, views.b)]
+            embeddings = self._pair_head.embed(torch.stack((views.a[0], views.b[0])))
             found = KeptLoops.found(
                 earlier[chosen],
                 end,
@@ -310,12 +311,16 @@ class OnlineLoops:
         at_ends = self._embeddings.slice(first * self._block, blocks * self._block)[self._block - 1 :: self._block]
         return kept.where(numbers).for_optimizer(keys, first, at_ends), numbers
 
-    def weigh(self, numbers: np.ndarray, weights: np.ndarray) -> None:
-        """Keep the optimizer's weights of the loops of ``loops``."""
-        self._kept.weight[:] = 0.0
-        self._kept.weight[numbers] = weights
+    def weigh(self, numbers: np.ndarray, weights: np.ndarray, information: np.ndarray) -> None:
+        """Keep the optimizer's weights ``(n,)`` and information ``(n, 3)`` of the loops of ``loops``."""
+        self._kept.weight[:], self._kept.information[:] = 0.0, -1.0
+        self._kept.weight[numbers], self._kept.information[numbers] = weights, information
 
-    def weighed(self) -> tuple[np.ndarray, np.ndarray]:
+    def weighed(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What ``weigh`` was given last, of these loops; a weight is negative where it was not given any."""
+        return self._kept.weight[numbers], self._kept.information[numbers]
+
+    def ties(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that each loop joins ``(n, 2)``, the earlier one first, and its last weight ``(n,)``."""
         return np.stack((self._kept.start, self._kept.end), axis=1), self._kept.weight
 
@@ -327,11 +332,11 @@ class OnlineLoops:
 
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
-        kept = self._kept.where(numbers)
-        odometry = torch.from_numpy(self._odometry.values)
-        offset = se2.between(odometry[kept.start * self._block], odometry[kept.frame + 1])
-        measured = se2.compose(se2.inverse(offset), kept.measured)
-        return np.stack((kept.frame + 1, kept.end * self._block), axis=1), measured.numpy()
+        kept, odometry = self._kept, self._odometry.values
+        frame = kept.frame[numbers] + 1
+        offset = all_between(odometry[kept.start[numbers] * self._block], odometry[frame])
+        measured = all_between(offset, kept.measured.numpy()[numbers])
+        return np.stack((frame, kept.end[numbers] * self._block), axis=1), measured
 
 
 def _at(offsets: _Offsets, which: int) -> np.ndarray:
@@ -339,4 +344,4 @@ def _at(offsets: _Offsets, which: int) -> np.ndarray:
 
 
 def _seen_from(poses: np.ndarray, others: np.ndarray) -> np.ndarray:
-    return se2.between(torch.from_numpy(poses), torch.from_numpy(others)).numpy()
+    return all_between(*(np.ascontiguousarray(rows, np.float64).reshape(-1, 3) for rows in (poses, others)))

@@ -77,9 +77,9 @@ class OnlineTrajectory(CorrectedTrajectory):
         self._key_frames = key_frames
         self._network_every = _NETWORK_EVERY if iterations_per_step else 1
         work = self._new_graph().work
-        # An update must be done when the next one begins, a block later.
+        # An update must be done when the next one begins, a block later. Each iteration counts for two at most.
         least = -(-work // max(1, block - 1))
-        super().__init__(max(iterations_per_step, least) if iterations_per_step else work)
+        super().__init__(max(iterations_per_step, least) if iterations_per_step else 2 * work)
 
     @classmethod
     def load(
@@ -106,6 +106,11 @@ class OnlineTrajectory(CorrectedTrajectory):
     def block(self) -> int:
         """Steps in a meta-pose: the optimizer runs once in so many steps."""
         return self._block
+
+    @property
+    def feature_sizes(self) -> tuple[int, int]:
+        """Lengths of a step's motion feature and place code, 0 where codes are not used."""
+        return self._optimizer.config.aggregation.motion_feature_size, self._code_length or 0
 
     @property
     def window_frames(self) -> int:

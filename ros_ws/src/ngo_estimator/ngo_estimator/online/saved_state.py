@@ -24,10 +24,11 @@ _KEYS = {"format", "identity", "arrays", "arrays_sha256", "sha256"}
 def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> None:
     """Write ``arrays`` of a trajectory with this ``identity``, all at once or not at all.
 
-    The folder is made where there is none; its parent must exist. A state in it is replaced.
+    The folder is made where there is none; its parent must exist. A state in it is replaced if it is of this kind:
+    that of ``ngo_node`` and the scans of ``ngo_map`` need a folder each.
 
     Raises:
-        StateError: the folder holds other files, or cannot be written.
+        StateError: the folder holds other files or a state of the other kind, or cannot be written.
     """
     content = save(arrays)
     digest = hashlib.sha256(content).hexdigest()
@@ -36,6 +37,8 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
     try:
         made = not folder.exists()
         old = set() if made else _files_of_a_state(folder)
+        if DESCRIPTION in old:
+            _refuse_the_other_kind(folder, identity)
         folder.mkdir(exist_ok=True)
         try:
             if name not in old:
@@ -63,6 +66,8 @@ def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
     path = folder / DESCRIPTION
     description = _description(path)
     saved, here = description["identity"], json.loads(json.dumps(identity))
+    if _kind(saved) != _kind(here):
+        raise StateError(f"{path}: is {_kind(saved)}; expected {_kind(here)}")
     for key in {**here, **saved}:
         if saved.get(key) != here.get(key):
             raise StateError(f"{path}: was saved with {_difference(key, saved.get(key), here.get(key))}")
@@ -74,6 +79,19 @@ def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
         return load(content)
     except safetensors.SafetensorError as error:
         raise StateError(f"{arrays}: is no safetensors file ({error})") from error
+
+
+def _kind(identity: Mapping[str, Any]) -> str:
+    return "the scans of an ngo_map" if "map" in identity else "the state of an ngo_node"
+
+
+def _refuse_the_other_kind(folder: Path, identity: Mapping[str, Any]) -> None:
+    try:
+        there = _description(folder / DESCRIPTION)["identity"]
+    except StateError:  # it is damaged, or of another format: nothing is lost
+        return
+    if _kind(there) != _kind(identity):
+        raise StateError(f"{folder}: holds {_kind(there)}; save {_kind(identity)} in a folder of its own")
 
 
 def _files_of_a_state(folder: Path) -> set[str]:

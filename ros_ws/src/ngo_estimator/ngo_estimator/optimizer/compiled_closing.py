@@ -19,7 +19,7 @@ from ngo_estimator.optimizer.block_cholesky import Array
 from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER, LoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
-from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
+from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure, add_factor
 
 _GATE_INPUTS = 11
@@ -64,7 +64,7 @@ class CompiledClosing(LoopClosing):
         )
         self._constants = torch.cat([part.double() for part in constants], dim=-1).numpy()
 
-    def look(self, state: GraphState, iteration: int) -> Tensor:
+    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
         """As ``LoopClosing.look``."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._take(self._loops.and_also(overlaps))
@@ -84,6 +84,9 @@ class CompiledClosing(LoopClosing):
             hidden = np.maximum(hidden @ weight + bias, 0.0)
         belief = hidden @ self._head[0] + self._head[1]
         _gates(self._constants, belief, squared, self._noise_2, self._weights, self._information)
+        if solution is not None:
+            known = solution.known
+            self._weights[known], self._information[known] = solution.weights[known], solution.information[known]
         channels = np.empty((self._steps.blocks, CHANNELS), np.float32)
         _channels(self._poses, deviation, self._nodes, self._residuals, self._weights, self._unit, channels)
         return torch.from_numpy(channels).unsqueeze(0)

@@ -16,7 +16,7 @@ from ngo_estimator.optimizer.gauss_newton import chain_factors, gauss_newton_ste
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances, spread_over_span
-from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
+from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -44,7 +44,7 @@ class NoLoopClosing:
 
     closed = None
 
-    def look(self, state: GraphState, iteration: int) -> Tensor:
+    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
         """No channels."""
         return state.features[..., :0]
 
@@ -85,8 +85,10 @@ class LoopClosing:
             raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
         return self._closed
 
-    def look(self, state: GraphState, iteration: int) -> Tensor:
+    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
         """Judge the loops under the current poses; the third iteration adds overlaps to them.
+
+        With an earlier ``solution``, its belief in the loops that it knew stays.
 
         Returns:
             The loops for the convolutions ``(batch, blocks, CHANNELS)``.
@@ -99,6 +101,10 @@ class LoopClosing:
         if loops.most_drift is not None:
             expected = torch.minimum(expected, loops.most_drift)
         weights, information = self._gate(loops, residuals, expected, iteration)
+        if solution is not None:
+            known, before = (torch.from_numpy(part) for part in (solution.known, solution.information))
+            weights = torch.where(known, torch.from_numpy(solution.weights), weights)
+            information = torch.where(known.unsqueeze(-1), before, information)
         self._gated = _GatedLoops(poses, loops, residuals, weights, information)
         return self._channels(state, residuals, weights)
 

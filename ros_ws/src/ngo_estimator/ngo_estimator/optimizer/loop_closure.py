@@ -95,7 +95,8 @@ class Loops:
 
     def where(self, which: Tensor) -> Loops:
         """The loops of a boolean mask or of indices ``(n,)``, the same for the whole batch."""
-        return self._with({name: value[:, which] for name, value in self._per_loop().items()})
+        index = which.nonzero().squeeze(-1) if which.dtype == torch.bool else which
+        return self._with({name: value.index_select(1, index) for name, value in self._per_loop().items()})
 
     def and_also(self, others: Loops) -> Loops:
         """These and, behind them, others of the same trajectories; both have the same optional fields."""

@@ -14,6 +14,7 @@ from ngo_estimator.optimizer.gauss_newton import chain_factors, node_covariance,
 from ngo_estimator.optimizer.loop_closure import Loops
 
 if TYPE_CHECKING:
+    from ngo_estimator.optimizer.block_cholesky import Array
     from ngo_estimator.optimizer.normal_equations import FactorisedInformation
 
 
@@ -88,6 +89,24 @@ class ClosedLoops:
     equations: FactorisedInformation | None
 
 
+class Solution(NamedTuple):
+    """Where an earlier optimisation of one trajectory ended.
+
+    ``relative`` ``(1, poses, 3)``, float64. ``weights`` ``(loops,)`` and ``information`` ``(loops, 3)`` of the loops
+    that the optimizer is given now, both negative for those that it was not given then.
+    """
+
+    relative: Tensor
+    weights: Array
+    information: Array
+
+    @property
+    def known(self) -> Array:
+        """Which loops it was given then ``(loops,)``."""
+        known: Array = self.information[:, 0] >= 0.0
+        return known
+
+
 class Correction(NamedTuple):
     """What the network gives in one iteration: adjustments ``(batch, blocks, 3)``, and the stiffness of this shape."""
 
@@ -101,13 +120,14 @@ class OptimizedMetaPoses:
 
     ``meta_relative``: one ``(batch, poses, 3)`` for each iteration, first to last. ``step_std`` ``(batch, poses, 3)``:
     the deviations with which the odometry is believed. ``closed``: the loops of the last iteration, None for an
-    optimizer without loops. ``corrections``: what the network gave in each iteration.
+    optimizer without loops. ``corrections``: what the network gave in each iteration. ``left``: iterations to come.
     """
 
     meta_relative: list[Tensor]
     step_std: Tensor
     closed: ClosedLoops | None
     corrections: list[Correction] = field(default_factory=list)
+    left: int = 0
 
     @property
     def loops(self) -> Loops | None:

@@ -10,6 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import (
@@ -29,6 +30,7 @@ from ngo_estimator.optimizer.meta_poses import (
     MetaSteps,
     OptimizedMetaPoses,
     OptimizedTrajectory,
+    Solution,
 )
 from ngo_estimator.optimizer.odometry_test import without_contradictions
 from ngo_estimator.optimizer.overlaps import find_overlaps
@@ -207,13 +209,19 @@ class NeuralGraphOptimizer(AttentionNetwork):
         return last
 
     def iterate(
-        self, steps: MetaSteps, loops: Loops | None = None, corrections: Sequence[Correction] | None = None
+        self,
+        steps: MetaSteps,
+        loops: Loops | None = None,
+        corrections: Sequence[Correction] | None = None,
+        solution: Solution | None = None,
     ) -> Iterator[OptimizedMetaPoses]:
         """Run the M iterations one by one, and yield the result of ``optimize`` after each.
 
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
                 running it.
+            solution: of an optimisation that took these corrections, to go on from: there is a single result then,
+                after two iterations. Its belief in loops stays; only new loops are judged.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -221,8 +229,11 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
-        phases = self._phases(steps, loops, corrections)
         closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops)
+        if corrections is not None and solution is not None:
+            yield self._resumed(steps, closing, corrections, solution)
+            return
+        phases = self._phases(steps, loops, corrections)
         state, results = GraphState.initial(steps), []
         made: list[Correction] = []
         for iteration in range(self.config.iterations):
@@ -235,7 +246,31 @@ class NeuralGraphOptimizer(AttentionNetwork):
                 made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
             state = closing.close(state, stiffness)
             results.append(state.relative.to(steps.relative.dtype))
-            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made)
+            left = self.config.iterations - 1 - iteration
+            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made, left)
+
+    def _resumed(
+        self,
+        steps: MetaSteps,
+        closing: LoopClosing | NoLoopClosing,
+        corrections: Sequence[Correction],
+        solution: Solution,
+    ) -> OptimizedMetaPoses:
+        """The result that begins at an earlier solution.
+
+        New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last
+        one. Others keep what an annealing of all loops gave them.
+        """
+        before = GraphState.initial(steps)
+        adjusted = before.adjusted.clone()
+        for adjustment, _ in corrections:
+            adjusted[:, steps.key_frames :] += adjustment
+        state, stiffness = _without_fixed(before, replace(before, adjusted=adjusted), corrections[-1].stiffness, steps)
+        state = replace(state, deviation=se2.wrapped(solution.relative - state.adjusted.double()))
+        for iteration in (0, self.config.iterations - 1):
+            closing.look(state, iteration, solution)
+            state = closing.close(state, stiffness)
+        return OptimizedMetaPoses([state.relative.to(steps.relative.dtype)], state.step_std, closing.closed)
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
