@@ -22,6 +22,19 @@ def off_walls(points: Array) -> Array:
     return np.hypot(*np.moveaxis(points[:, None] - foot, -1, 0)).min(axis=1)
 
 
+def test_noise_does_not_turn_the_normals_of_a_wall() -> None:
+    """A narrow scanner with dense rays beside one wall: normals ahead and behind are the wall's in the mean."""
+    rng, angles = np.random.default_rng(0), fan(1440, 90.0)
+    true = 1.2 / np.cos(angles)  # a wall across the middle ray
+    turned: dict[str, list[float]] = {"ahead": [], "behind": []}
+    for _ in range(20):
+        scan = key_scan(0, angles, true + rng.normal(0.0, 0.02, len(angles)), LIMITS, AHEAD)
+        known, y = np.abs(scan.normals).sum(axis=1) > 0.0, scan.points[:, 1]
+        for where, there in (("ahead", y > 0.6), ("behind", y < -0.6)):
+            turned[where].extend(np.degrees(np.arctan2(-scan.normals[:, 1], -scan.normals[:, 0]))[known & there])
+    assert all(len(angles_deg) > 100 and abs(np.mean(angles_deg)) < 1.0 for angles_deg in turned.values())
+
+
 @pytest.mark.parametrize("rays", [90, 361, 1080, 3000])
 @pytest.mark.parametrize(
     "mounting", [AHEAD, Mounting(np.array((0.2, -0.1, 1.2))), Mounting(np.array((0.2, 0.1, -0.5)), upside_down=True)]

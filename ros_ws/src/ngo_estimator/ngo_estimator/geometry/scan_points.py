@@ -18,6 +18,9 @@ _WIDEST_TRIPLE_RAD = 0.2
 _QUARTER = 0.3186
 """Deviations within which a quarter of a normal distribution lies."""
 
+_WITHIN_NOISE = 3.0
+"""Deviations of a range within which two ranges tell no distance: else noise would choose which points begin a mean."""
+
 _LARGEST_NOISE_M = 0.06
 """Larger estimates come from clutter."""
 
@@ -123,7 +126,8 @@ def key_scan(
     polar, distance = angles[seen], ranges[seen]
     ends = np.stack((distance * np.cos(polar), distance * np.sin(polar)), axis=-1)
     noise_m = range_noise(polar, distance)
-    thin = _thinned(ends, max(config.spacing_m, config.spacing_noise * noise_m), config.most_points)
+    spacing_m = max(config.spacing_m, config.spacing_noise * noise_m)
+    thin = _thinned(ends, spacing_m, _WITHIN_NOISE * noise_m, config.most_points)
     thickness_m = max(config.thickness_m, config.thickness_noise * noise_m)
     normals = _normals(thin, config.neighbours, thickness_m, config.thickness_share, config.edge_on)
     turn = np.array((0.0, 0.0, mounting.sensor_xyyaw[2]))
@@ -200,15 +204,21 @@ def _without_motion(angles: Array, ranges: Array, sensor: Array, sweep: Sweep) -
 
 
 @njit(cache=True)
-def _thinned(points: Array, spacing: float, most: int) -> Array:
-    """Means of neighbouring points ``(n, 2)`` that lie within the spacing, which grows until there are few enough."""
+def _thinned(points: Array, spacing: float, noise: float, most: int) -> Array:
+    """Means of neighbouring points ``(n, 2)`` that lie within the spacing, which grows until there are few enough.
+
+    Of their distance along the ray the ``noise`` does not count.
+    """
     result = np.empty_like(points)
     while True:
         count, first = 0, 0
         for i in range(1, len(points) + 1):
             if i < len(points):
-                away = math.hypot(points[i, 0] - points[first, 0], points[i, 1] - points[first, 1])
-                if away < spacing:
+                one, other = math.hypot(points[first, 0], points[first, 1]), math.hypot(points[i, 0], points[i, 1])
+                squared = (points[i, 0] - points[first, 0]) ** 2 + (points[i, 1] - points[first, 1]) ** 2
+                along = abs(other - one)
+                across = squared - along * along  # of points as far away as each other
+                if across + max(along - noise, 0.0) ** 2 < spacing * spacing:
                     continue
             x, y = 0.0, 0.0
             for j in range(first, i):
