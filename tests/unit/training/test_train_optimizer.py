@@ -43,9 +43,11 @@ def test_the_papers_form_does_not_smooth_by_itself() -> None:
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None:
     shipped = load_optimizer(WEIGHTS / world, world)[0].config
-    # What picks the loops of doom on validation maps trains no network (training/tune_doom.py).
+    # What picks the loops of doom on validation maps trains no network, and chooses how to search (tune_doom.py).
     arguments = Arguments(world=world, form="gauss_newton" if world == "doom" else "loops")
     made = config_of(arguments, world_named(world), shipped.correction_std, shipped.smoother)  # type: ignore[arg-type]
+    if world == "doom":
+        made = replace(made, search=shipped.search)
     assert replace(made, covariance_scale=shipped.covariance_scale) == shipped
     assert load_place(WEIGHTS / world, world)[0].config.registration == world_named(world).registration
     assert (shipped.smoother is not None) == choices(arguments, world_named(world)).smoothing
