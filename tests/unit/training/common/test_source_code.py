@@ -23,7 +23,7 @@ def test_the_digest_follows_imports_within_the_package(tmp_path: Path, monkeypat
     for name, source in sources.items():
         (package / f"{name}.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
-    top = importlib.import_module("house_of_tests.top")
+    top = importlib.import_module(f"{package.name}.top")
     try:
         before = code_digest((top,))
         (package / "other.py").write_text("VALUE = 2")
