@@ -127,7 +127,7 @@ def key_scan(
     ends = np.stack((distance * np.cos(polar), distance * np.sin(polar)), axis=-1)
     noise_m = range_noise(polar, distance)
     spacing_m = max(config.spacing_m, config.spacing_noise * noise_m)
-    thin = _thinned(ends, spacing_m, _WITHIN_NOISE * noise_m, config.most_points)
+    thin = _thinned(ends, distance, spacing_m, _WITHIN_NOISE * noise_m, config.most_points)
     thickness_m = max(config.thickness_m, config.thickness_noise * noise_m)
     normals = _normals(thin, config.neighbours, thickness_m, config.thickness_share, config.edge_on)
     turn = np.array((0.0, 0.0, mounting.sensor_xyyaw[2]))
@@ -204,7 +204,7 @@ def _without_motion(angles: Array, ranges: Array, sensor: Array, sweep: Sweep) -
 
 
 @njit(cache=True)
-def _thinned(points: Array, spacing: float, noise: float, most: int) -> Array:
+def _thinned(points: Array, ranges: Array, spacing: float, noise: float, most: int) -> Array:
     """Means of neighbouring points ``(n, 2)`` that lie within the spacing, which grows until there are few enough.
 
     Of their distance along the ray the ``noise`` does not count.
@@ -214,9 +214,8 @@ def _thinned(points: Array, spacing: float, noise: float, most: int) -> Array:
         count, first = 0, 0
         for i in range(1, len(points) + 1):
             if i < len(points):
-                one, other = math.hypot(points[first, 0], points[first, 1]), math.hypot(points[i, 0], points[i, 1])
                 squared = (points[i, 0] - points[first, 0]) ** 2 + (points[i, 1] - points[first, 1]) ** 2
-                along = abs(other - one)
+                along = abs(ranges[i] - ranges[first])
                 across = squared - along * along  # of points as far away as each other
                 if across + max(along - noise, 0.0) ** 2 < spacing * spacing:
                     continue
