@@ -11,7 +11,6 @@ there is. A scan without an answer is an error.
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 from array import array
@@ -27,6 +26,7 @@ from std_msgs.msg import Header
 
 from benchmarks.node_latency import Feed, Frame
 from benchmarks.pinned import running_on, two_cores
+from benchmarks.process_use import cpu_s, memory_mb
 from demo.graph import Graph, NodeSpec
 from ngo_estimator.nodes.messages import to_time
 from ngo_sim.building2d import Building2d
@@ -72,18 +72,6 @@ def frames_of(arguments: Arguments) -> list[Frame]:
         message.ranges = array("f", ranges.astype(np.float32).tobytes())
         frames.append([("scan", message)])
     return frames
-
-
-def cpu_s(pid: int) -> float:
-    """Processor time of a process so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def memory_mb(pid: int) -> float:
-    """Memory that a process alone has resident."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return next(int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("RssAnon:"))
 
 
 def measure(arguments: Arguments, logs: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ bytes of the stored path: stamps, odometry, its deviations, poses as first publi
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -27,6 +28,7 @@ from tqdm import tqdm
 
 from benchmarks.drives import CACHE, drive_of
 from benchmarks.pinned import in_process, two_cores
+from benchmarks.process_use import memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
@@ -102,7 +104,7 @@ def points(arguments: Arguments) -> list[Point]:
         wall_ms[at], cpu_ms[at] = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
         if number % arguments.every:
             continue
-        memory_mb, stored_mb = resident_mb(), stored_path_mb(core)
+        resident_mb, stored_mb = memory_mb(os.getpid()), stored_path_mb(core)
         begin = time.perf_counter()
         trajectory = core.trajectory()
         assert trajectory is not None
@@ -114,7 +116,7 @@ def points(arguments: Arguments) -> list[Point]:
             mean_ms=float(wall_ms.mean()),
             mean_cpu_ms=float(cpu_ms.mean()),
             p99_ms=float(np.percentile(wall_ms, 99)),
-            memory_mb=memory_mb,
+            memory_mb=resident_mb,
             stored_path_mb=stored_mb,
             path_ms=path_ms,
             odometry_rmse_m=_rmse_m(odometry[:number], so_far[1:]),
@@ -125,16 +127,10 @@ def points(arguments: Arguments) -> list[Point]:
         if len(found) % 5 == 0:
             tqdm.write(
                 f"{number:7d} frames: {point.mean_ms:.2f} ms a frame ({point.mean_cpu_ms:.2f} cpu), "
-                f"{memory_mb - stored_mb:.1f} MB, path {path_ms:.1f} ms, RMSE odometry {point.odometry_rmse_m:.2f}, "
+                f"{resident_mb - stored_mb:.1f} MB, path {path_ms:.1f} ms, RMSE odometry {point.odometry_rmse_m:.2f}, "
                 f"online {point.online_rmse_m:.3f}, optimised {point.optimised_rmse_m:.3f} m"
             )
     return found
-
-
-def resident_mb() -> float:
-    """Memory that this process alone has resident."""
-    status = Path("/proc/self/status").read_text()
-    return next(int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("RssAnon:"))
 
 
 def stored_path_mb(core: OnlineTrajectory) -> float:

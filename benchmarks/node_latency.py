@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from benchmarks.drives import CACHE, drive_of, episodes, stamp_ns
 from benchmarks.pinned import running_on
+from benchmarks.process_use import memory_mb
 from demo.graph import Graph, GraphError, NodeSpec
 from ngo_estimator.nodes.messages import relative_pose_message, to_time
 from ngo_estimator.odometry.local_odometry import LocalEstimate
@@ -202,6 +203,5 @@ def _measured(
             sent = feed.connect(frames[:first], again)
             frames_per_s = feed.fast(frames[sent:first])
             milliseconds = feed.paced(frames[first:])
-            status = Path(f"/proc/{graph.pid(spec.executable)}/status").read_text()
-            resident_mb = int(status.split("VmRSS:")[1].split()[0]) / 1024.0
+            resident_mb = memory_mb(graph.pid(spec.executable), "VmRSS")
     return Latencies(milliseconds, frames_per_s, resident_mb)

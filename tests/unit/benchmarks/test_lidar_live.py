@@ -4,7 +4,8 @@ import os
 
 import pytest
 
-from benchmarks.lidar_live import RATE_HZ, Arguments, cpu_s, frames_of, memory_mb
+from benchmarks.lidar_live import RATE_HZ, Arguments, frames_of
+from benchmarks.process_use import cpu_s, memory_mb
 from ngo_estimator.nodes.messages import to_ns
 
 

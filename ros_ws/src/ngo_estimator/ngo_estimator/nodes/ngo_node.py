@@ -35,7 +35,8 @@ from ngo_estimator.nodes.weights import load_trajectory
 if TYPE_CHECKING:
     from ngo_estimator.data.relative_step import RelativeStep
     from ngo_estimator.nodes.file_services import Loaded
-    from ngo_estimator.online.map_localisation import LocalisedStep
+    from ngo_estimator.online.joining import Joining
+    from ngo_estimator.online.map_localisation import LocalisedStep, MapLocalisation
     from ngo_estimator.online.session import Session
     from ngo_estimator.online.tf_smoothing import SmoothedCorrection
     from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
@@ -213,9 +214,12 @@ class NgoNode(ManagedNode):
                 self._latest = update
                 self._whole.changed(loops=True)
             self._pending.cancel()
-            self._search, self._covariance = PoseSearch(self._session().joining()), np.zeros((3, 3))
-            self._out.smoothing.reset()
+            self._look_for_the_robot(self._session().joining())
             self.get_logger().info("the relative poses have a new origin: looks for the robot in the map, which stays")
+
+    def _look_for_the_robot(self, search: "MapLocalisation | Joining") -> None:
+        self._search, self._covariance = PoseSearch(search), np.zeros((3, 3))
+        self._out.smoothing.reset()
 
     def _on_update(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
         """Publish what a step changed in the trajectory."""
@@ -310,10 +314,9 @@ class NgoNode(ManagedNode):
         pose = self._origin.poses(update.pose_xyyaw)
         self._covariance = self._origin.covariance_of(pose, update.covariance)
         self._report.begin_anew()
-        self._search = None if search is None else PoseSearch(search)
-        if self._search is not None:
-            self._out.smoothing.reset()
-            self._covariance = np.zeros((3, 3))
+        self._search = None
+        if search is not None:
+            self._look_for_the_robot(search)
         if self._inputs:
             self._pending.cancel()
         self._whole.changed(loops=True)
