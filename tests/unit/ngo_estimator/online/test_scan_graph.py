@@ -8,6 +8,7 @@ import pytest
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
+from tests.unit.ngo_estimator.optimizer.buildings import HALLWAY, ROUND, between, scan_at, way
 
 STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))
 
@@ -49,3 +50,20 @@ def test_a_key_scan_has_no_factors_by_default() -> None:
     key = KeyScanStep(no_scan(1), 0, STEP, COVARIANCE)
     np.testing.assert_array_equal(key.factors, 1.0)
     assert dataclasses.replace(key, factors=np.full(3, 2.0)).factors[0] == 2.0
+
+
+@pytest.mark.parametrize(("step_std", "believed"), [((0.02, 0.02, 0.005), True), ((0.5, 0.5, 0.005), False)])
+def test_a_loop_is_not_believed_where_the_robot_may_be_farther_away_than_was_searched(
+    step_std: tuple[float, float, float], believed: bool
+) -> None:
+    """The same scans at the same poses: steps that tell little leave room for a place that looks alike."""
+    graph, random, nothing = ScanGraph(ScanGraphConfig()), np.random.default_rng(1), np.zeros(0, np.float32)
+    poses, covariance = way(*ROUND, *ROUND, ROUND[0]), np.diag(np.square(step_std))
+    steps = between(poses[:-1], poses[1:])
+    scans = [dataclasses.replace(scan_at(HALLWAY, pose, random), stamp_ns=k) for k, pose in enumerate(poses)]
+    for k, step in enumerate(steps):
+        key = KeyScanStep(scans[k + 1], k, step, covariance)
+        if k == 0:
+            graph.begin_at(RelativeStep(1, 0, step, covariance, 0, step, nothing, nothing, origin_scan=scans[0]))
+        graph.append(step, covariance, key)
+    assert (len(graph.measurements()[1].nodes) > 0) == believed

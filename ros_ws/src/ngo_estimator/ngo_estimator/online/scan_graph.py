@@ -25,6 +25,7 @@ from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_
 from ngo_estimator.optimizer.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
 from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.optimizer.ways_through_graph import way_covariances
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
@@ -208,6 +209,7 @@ class ScanGraph:
 
     def _use(self, rows: np.ndarray) -> bool:
         """Take those newly accepted loops into the graph that it needs; returns whether one surprises."""
+        rows = rows[self._all_was_searched(rows)]
         loops, known, config = self._finder.loops[rows], self._finder.loops[self._used.values], self.config
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         off = (measured.residuals(self._nodes.values) ** 2).sum(1)
@@ -226,6 +228,24 @@ class ScanGraph:
         for row in rows[needed]:
             self._used.append(row)
         return bool(surprising.any())
+
+    def _all_was_searched(self, rows: np.ndarray) -> np.ndarray:
+        """Which loops ``(n,)`` were searched wherever the robot may have been by the way between their keys.
+
+        Of a robot that may be farther away, a place that looks right says little: nobody looked for another one.
+        """
+        loops, known, windows = self._finder.loops[rows], self._finder.loops[self._used.values], self.config.windows
+        chain = np.arange(self.keys - 1)
+        covariance = way_covariances(
+            self._nodes.values,
+            np.concatenate((np.stack((chain, chain + 1), axis=1), known.pairs)),
+            np.concatenate((self._step_covariance.values, known.covariance)),
+            loops.pairs,
+        )
+        metres = windows.deviations * np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+        turn = windows.deviations * np.sqrt(covariance[:, 2, 2])
+        within: np.ndarray = (metres <= windows.most_m) & (turn <= math.radians(windows.most_deg))
+        return within
 
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
