@@ -26,7 +26,6 @@ HALLWAY = np.concatenate(
         outline((4, 0), (4.3, 0.5), (5.5, 0.4), (5.6, 0)),
     )
 )
-ROUND = ((1.0, 1.0), (9.0, 1.0), (9.0, 7.0), (1.0, 7.0))
 
 
 def scan_at(walls: np.ndarray, pose: np.ndarray, random: np.random.Generator, farthest_m: float = 30.0) -> KeyScan:
@@ -54,6 +53,10 @@ def way(*corners: tuple[float, float], step_m: float = 0.3) -> np.ndarray:
         count = max(1, round(math.dist(start, end) / step_m))
         poses += [(*(np.array(start) + (np.array(end) - start) * k / count), heading) for k in range(count)]
     return np.array(poses)
+
+
+ROUND = ((1.0, 1.0), (9.0, 1.0), (9.0, 7.0), (1.0, 7.0))
+TWICE = way(*ROUND, *ROUND, ROUND[0])
 
 
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -18,9 +18,8 @@ from ngo_estimator.optimizer.scan_loop_candidates import (
     graph_distances,
 )
 from ngo_estimator.optimizer.scan_loops import EVIDENCE, ScanLoopConfig, ScanLoopFinder, ScanLoops
-from tests.unit.ngo_estimator.optimizer.buildings import HALLWAY, MOUNTING, ROUND, between, drifted, outline, scan_at, way
+from tests.unit.ngo_estimator.optimizer.buildings import HALLWAY, MOUNTING, TWICE, between, drifted, outline, scan_at, way
 
-TWICE = way(*ROUND, *ROUND, (1.0, 1.0))
 
 
 def scanned(walls: np.ndarray, poses: np.ndarray) -> list[KeyScan]:

@@ -18,18 +18,20 @@ def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray
             axes of its first key.
     """
     count, variance = len(poses), largest_variances(covariance)
-    graph = edge_graph(edges, variance, count)
-    order = np.argsort(-variance, kind="stable")
-    surest = dict(zip(map(tuple, np.sort(edges[order], axis=1).tolist()), order.tolist(), strict=True))
+    # Of several edges between two keys the way leads over the surest.
+    codes = edges.min(1) * count + edges.max(1)
+    order = np.lexsort((variance, codes))
+    known, first = np.unique(codes[order], return_index=True)
     later, which = np.unique(pairs[:, 1], return_inverse=True)
+    graph = edge_graph(edges, variance, count)
     _, before = dijkstra(graph, directed=False, indices=later, return_predecessors=True)
     result = np.zeros((len(pairs), 3, 3))
     for n, (key, end) in enumerate(pairs.tolist()):
-        way = []
-        while key != end:
-            towards = int(before[which[n], key])
-            way.append(surest[min(key, towards), max(key, towards)])
-            key = towards
+        towards, keys = before[which[n]], [key]
+        while keys[-1] != end:
+            keys.append(int(towards[keys[-1]]))
+        steps = np.stack((keys[:-1], keys[1:]), axis=1)
+        way = order[first[np.searchsorted(known, steps.min(1) * count + steps.max(1))]]
         start, pivot = poses[edges[way, 0]], poses[edges[way, 1]]
         # An edge's error moves and turns all that lies behind it, about its second key.
         moved = np.zeros((len(way), 3, 3))
