@@ -18,8 +18,16 @@ from ngo_estimator.optimizer.scan_loop_candidates import (
     graph_distances,
 )
 from ngo_estimator.optimizer.scan_loops import EVIDENCE, ScanLoopConfig, ScanLoopFinder, ScanLoops
-from tests.unit.ngo_estimator.optimizer.buildings import HALLWAY, MOUNTING, TWICE, between, drifted, outline, scan_at, way
-
+from tests.unit.ngo_estimator.optimizer.buildings import (
+    HALLWAY,
+    MOUNTING,
+    TWICE,
+    between,
+    drifted,
+    outline,
+    scan_at,
+    way,
+)
 
 
 def scanned(walls: np.ndarray, poses: np.ndarray) -> list[KeyScan]:

@@ -453,11 +453,12 @@ class ScanGraph:
             keys > 0 and len(self._scans) == len(frames) == keys and steps == {keys - 1},
             f"there are not {keys} key scans, and a step less",
         )
+        of_loops = (self._loop_rows, self._doubted, self._used.values)
         ordered = frames[0] == 0 and (np.diff(frames) > 0).all() and frames[-1] < len(self.odometry)
         require(
             bool(ordered)
             and 1 <= len(self._before) <= keys
-            and all(bool(((rows >= 0) & (rows < found)).all()) for rows in (self._loop_rows, self._doubted, self._used.values))
+            and all(bool(((rows >= 0) & (rows < found)).all()) for rows in of_loops)
             and bool(np.isin(self._joins.values, frames[1:]).all()),
             "frames, nodes or loops are named that are not there",
         )
