@@ -6,8 +6,8 @@
 
 The weights go beside those of the other networks. `train_optimizer` takes them from there where it smooths
 (`--smoothing True`), so train the smoother first. With `--memory` it corrects a step by those before it alone, and
-becomes part of the local network, whose odometry is better from then on: make the feature store anew after it. Run it
-again to continue after a stop.
+becomes part of the local network, whose odometry is better from then on: make the feature store anew after it. Both
+learn from the mirrored trajectories of `featurise --mirror` as well. Run it again to continue after a stop.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from training.common.command_line import run_command
 from training.common.precision import Precision
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
 from training.data.batches import Batch
-from training.data.data_source import TRAIN_STORE
+from training.data.data_source import MIRRORED_STORE, TRAIN_STORE
 from training.data.feature_store import training_stores
 from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
 from training.data.worlds import world_named
@@ -41,6 +41,7 @@ ERROR_WINDOWS = (1, 4, 16)
 
 _STORES = (TRAIN_STORE,)  # another driver's ways cost more on the first one's than they are worth
 _BLOCK = PoseAggregationConfig(1).block
+_LARGEST_OF_MEMORY = 2.0  # a robot that slides along a wall moves sideways faster than it usually does
 _OWN = ("format", "network", "world", "sha256", "config")  # of a description, which each file has of its own
 
 
@@ -134,7 +135,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     domain = world_named(name) if recorded is None else recorded.domain
     place, place_description = load_place(folder, domain.name)
     features = arguments.runs / domain.name / "features"
-    stores = training_stores(features, _STORES, domain, local_description, place_description)
+    mirrored = (features / MIRRORED_STORE).exists()
+    learned_from = (*_STORES, MIRRORED_STORE) if mirrored else _STORES
+    stores = training_stores(features, learned_from, domain, local_description, place_description)
     train, validation = (StoredTrajectories(some, None, place.pair_head, _BLOCK) for some in stores)
     made_with = {"local_pose_network_sha256": local_description["sha256"]}
     run = runs.Run(
@@ -145,7 +148,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         arguments.seed,
         best=None if recorded is None else "smoothed_m",
         data=None if recorded is None else recorded.sha256,
-        settings={"error_windows": ERROR_WINDOWS, "stores": _STORES, **made_with},
+        settings={"error_windows": ERROR_WINDOWS, "stores": learned_from, "trajectories": len(train), **made_with},
     )
     scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
     smoother, begun = initial_smoother(arguments, local.config)
@@ -201,7 +204,8 @@ def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[Odom
     Raises:
         RunError: the weights are of a smoother for other steps.
     """
-    config = SmootherConfig(local.feature_size, local.relative_std, causal=arguments.memory)
+    largest = _LARGEST_OF_MEMORY if arguments.memory else 1.0
+    config = SmootherConfig(local.feature_size, local.relative_std, causal=arguments.memory, largest=largest)
     began = arguments.recordings.from_weights
     if began is None:
         return OdometrySmoother(config), {}

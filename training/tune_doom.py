@@ -2,11 +2,11 @@
 
     python -m training.tune_doom
 
-The optimizer is the robust pose graph that an untrained one is, without a network. What is chosen: how many witnesses a
-loop needs, and how far deviations of steps and loops are stretched. A choice with which the error on a map is larger
-than that of its odometry, or on a drive much larger, is out, whatever it gains elsewhere. The optimizer's covariance is
-then fitted to its errors. The command writes ``neural_graph_optimizer.safetensors`` and
-``training/results/doom.gtsam.json``.
+The optimizer is the robust pose graph that an untrained one is, without a network, and smooths the odometry where the
+folder of the weights has a smoother. What is chosen: how many witnesses a loop needs, and how far deviations of steps
+and loops are stretched. A choice with which the error on a map is larger than that of its odometry, or on a drive much
+larger, is out, whatever it gains elsewhere. The optimizer's covariance is then fitted to its errors. The command writes
+``neural_graph_optimizer.safetensors`` and ``training/results/doom.gtsam.json``.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_place, save_checkpoint
+from ngo_estimator.checkpoint import OPTIMIZER, SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer.loop_closure import LoopSearch
@@ -134,7 +134,7 @@ def harmful(corrected: np.ndarray, odometry: np.ndarray, maps: list[Map]) -> boo
 
 
 def robust_graph(folder: Path, witnesses: int, step_scale: float, loop_scale: float) -> NeuralGraphOptimizer:
-    """An untrained optimizer without a network; arguments as of the grids above."""
+    """An untrained optimizer without a network, with the smoother if there is one; arguments as of the grids above."""
     network, world = load_local(folder, "doom")[0], world_named("doom")
     aggregation = PoseAggregationConfig(
         motion_feature_size=network.config.feature_size, relative_std=network.config.relative_std
@@ -142,6 +142,8 @@ def robust_graph(folder: Path, witnesses: int, step_scale: float, loop_scale: fl
     per_pose, most = CANDIDATES
     search = LoopSearch(per_pose=per_pose, most=most, views=world.loop_views, witnesses=witnesses)
     optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig(aggregation=aggregation, network=False, search=search))
+    if (folder / f"{SMOOTHER}.safetensors").exists():
+        optimizer = optimizer.with_smoother(load_smoother(folder, "doom")[0])
     with torch.no_grad():
         optimizer.log_scale.fill_(float(np.log(step_scale)))
         optimizer.loop_gate.head.bias.copy_(torch.tensor([BELIEF, loop_scale, HEADING_SCALE]))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 _UNIT = 0.1
-"""Correction of a step by a head that says 1, in units of ``relative_std``, of which one is the most."""
+"""Correction of a step by a head that says 1, in units of ``relative_std``."""
 _LARGEST_INPUT = 10.0
 """Steps of more ``relative_std``, as where frames were lost, look to their neighbours as if they had so many."""
 
@@ -22,7 +22,8 @@ class SmootherConfig:
 
     ``relative_std`` (m, m, rad), how much steps differ from each other, normalises the relative poses. ``dilations``
     holds one number a convolution, of ``width`` channels each. A ``causal`` one corrects a step by itself and those
-    before it alone, so that it works on the newest step, too. ``relative_bias`` (m, m, rad) is added to what it gives,
+    before it alone, so that it works on the newest step, too. ``largest`` is the largest correction, in
+    ``relative_std``. ``relative_bias`` (m, m, rad) is added to what it gives,
     and ``deviation_scale`` multiplies its deviations.
     """
 
@@ -31,6 +32,7 @@ class SmootherConfig:
     dilations: tuple[int, ...] = (1, 2, 4, 8, 16)
     width: int = 64
     causal: bool = False
+    largest: float = 1.0
     relative_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     deviation_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
@@ -42,6 +44,8 @@ class SmootherConfig:
             )
         if min(self.relative_std) <= 0.0:
             raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
+        if not self.largest > 0.0:
+            raise ValueError(f"largest is {self.largest}; expected a positive number")
         if min(self.deviation_scale) <= 0.0:
             raise ValueError(f"deviation_scale is {self.deviation_scale}; expected three positive numbers")
 
@@ -89,5 +93,7 @@ class OdometrySmoother(nn.Module):
             around = (2 * dilation, 0) if self.config.causal else (dilation, dilation)
             hidden = hidden + torch.relu(convolution(pad(norm(hidden).mT, around))).mT
         correction, scale = self.head(hidden).split(3, dim=-1)
-        smoothed = relative + self.relative_std * torch.tanh(_UNIT * correction) + self.relative_bias
+        largest = self.config.largest
+        correction = largest * torch.tanh(_UNIT / largest * correction)
+        smoothed = relative + self.relative_std * correction + self.relative_bias
         return smoothed, log_std + 2.0 * torch.tanh(0.5 * scale) + self.log_deviation_scale
