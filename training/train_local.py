@@ -238,9 +238,7 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch], steps: int = 1) ->
     )
 
 
-def lasting_deviation(
-    errors: Sequence[Tensor], variances: Sequence[Tensor], steps: int
-) -> tuple[float, float, float]:
+def lasting_deviation(errors: Sequence[Tensor], variances: Sequence[Tensor], steps: int) -> tuple[float, float, float]:
     """The factor of deviations with which errors ``(n, 3)`` of drives, summed over so many ``steps``, are as stated."""
     squares = [
         _sums(error, steps).square() / _sums(variance, steps) for error, variance in zip(errors, variances, strict=True)

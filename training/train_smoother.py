@@ -161,7 +161,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     smoother.cpu()
     about: dict[str, Any] = {"training": {**run.finish(metrics), **begun}, "metrics": {"validation": metrics}}
     if arguments.memory:
-        remembering = with_memory(local, smoother, data.validation, 1 if recorded else world_named(name).deviation_steps)
+        lasting = 1 if recorded is not None else world_named(name).deviation_steps
+        remembering = with_memory(local, smoother, data.validation, lasting)
         details = {k: v for k, v in local_description.items() if k not in _OWN} | {"memory": {**made_with, **about}}
         save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", remembering, LOCAL, domain.name, details)
     else:

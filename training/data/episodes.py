@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.data.batches import MIRRORED_ACTIONS
+from training.data.data_source import MIRRORED_ACTIONS
 from training.data.worlds import DRAWN, MazeSize, World
 
 if TYPE_CHECKING:

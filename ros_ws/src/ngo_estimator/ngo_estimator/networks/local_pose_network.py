@@ -73,9 +73,10 @@ class LocalPoseConfig:
             raise ValueError(
                 f"mirrored_actions is {self.mirrored_actions}; expected each of the {self.actions} actions once"
             )
-        if self.memory is not None and not (self.memory.causal and self.memory.motion_feature_size == self.feature_size):
+        memory = self.memory
+        if memory is not None and not (memory.causal and memory.motion_feature_size == self.feature_size):
             raise ValueError(
-                f"memory is {self.memory}; expected causal=True and motion_feature_size {self.feature_size}, as the "
+                f"memory is {memory}; expected causal=True and motion_feature_size {self.feature_size}, as the "
                 "network's features are"
             )
 
