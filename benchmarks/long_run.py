@@ -2,10 +2,11 @@
 
     python -m benchmarks.long_run
 
-One drive in one maze of the 2D world, on one core with one thread. The last line is one JSON object; exit code 1 where
-the last 10,000 frames take 1.2 times as long as those from 5,000 to 15,000, by processor time, or memory grows by 100
-MB from frame 10,000 on. Memory is what the process alone has resident (RssAnon), without mapped files and less the
-bytes of the stored path: stamps, odometry, its deviations, poses as first published, and nodes.
+One drive in one maze of the 2D world, on one core with one thread. With ``--world scan`` it is a lidar with wheels in
+one building, and both estimators run: a frame is a scan. The last line is one JSON object; exit code 1 where the last
+10,000 frames take 1.2 times as long as those from 5,000 to 15,000, by processor time, or memory grows by 100 MB from
+frame 10,000 on. Memory is what the process alone has resident (RssAnon), without mapped files and less the bytes of the
+stored path: stamps, odometry, its deviations, poses as first published, and nodes.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -26,33 +29,41 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from tqdm import tqdm
 
-from benchmarks.drives import CACHE, drive_of
+from benchmarks.drives import CACHE, drive_of, stamp_ns
 from benchmarks.pinned import in_process, two_cores
 from benchmarks.process_use import memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.nodes.path_message import PathWriter
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_recordings.scan_stream import LidarScan, WheelPose
 from training.common.runs import ROOT, WEIGHTS
+from training.data.batches import seen_from_first
+from training.data.building_drives import building_drive
+from training.data.lidar_drives import LidarDrive, TruePoses
 
 LONGEST_RATIO, MOST_GROWTH_MB = 1.2, 100.0
+_FAR_M = 100_000.0
 
 
 @dataclass(frozen=True)
 class Arguments:
     """What to drive."""
 
-    world: str = "maze2d"
+    world: Literal["maze2d", "maze3d", "scan"] = "maze2d"
     """World to drive in."""
     seed: int = 2000
-    """Maze to drive through."""
+    """Maze or building to drive through."""
     frames: int = 100_000
     """Frames of the drive, a multiple of ``every``."""
     every: int = 1000
     """Frames that are summed up in one point of the curves."""
     window: int = 2000
-    """Frames that are optimised together."""
+    """Frames that are optimised together; a lidar has no window."""
     key_frames: int = 128
-    """Key frames from before the window."""
+    """Key frames from before the window; a lidar has no window."""
     iterations_per_step: int = 1
     """Iterations of an optimisation that one frame pays for, as in ngo_node; 0: all at once."""
     plot: Path = ROOT / "docs" / "images" / "online_100000.png"
@@ -83,23 +94,28 @@ class Point:
     optimised_rmse_m: float
 
 
+@dataclass(frozen=True)
+class Run:
+    """A drive and what estimates it: each call of ``frames`` takes one frame.
+
+    ``truth`` and ``odometry`` ``(n, 3)`` at ``stamps_ns`` ``(n,)``;"""
+
+    core: CorrectedTrajectory
+    frames: Iterator[Callable[[], object]]
+    stamps_ns: np.ndarray
+    truth: np.ndarray
+
+
 def points(arguments: Arguments) -> list[Point]:
     """Drive, with one thread."""
     torch.set_num_threads(1)
-    drive = drive_of(arguments.world, arguments.seed, arguments.frames, arguments.cache)
-    core = OnlineTrajectory.load(
-        WEIGHTS / arguments.world,
-        arguments.window,
-        arguments.world,
-        arguments.key_frames,
-        arguments.iterations_per_step,
-    )
-    truth, odometry = np.concatenate((np.zeros((1, 3)), drive.truth)), drive.odometry()
+    run = _scan_run(arguments) if arguments.world == "scan" else _maze_run(arguments)
+    core = run.core
     wall_ms, cpu_ms = np.zeros(arguments.every), np.zeros(arguments.every)
     writer, found = PathWriter("map"), []
-    for number, step in enumerate(tqdm(drive.steps(), arguments.world, arguments.frames), 1):
+    for number, take in enumerate(tqdm(run.frames, arguments.world, arguments.frames), 1):
         cpu, wall = time.process_time(), time.perf_counter()
-        core.update(step)
+        take()
         at = (number - 1) % arguments.every
         wall_ms[at], cpu_ms[at] = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
         if number % arguments.every:
@@ -110,7 +126,8 @@ def points(arguments: Arguments) -> list[Point]:
         assert trajectory is not None
         writer.write(int(trajectory.stamps_ns[-1]), trajectory.stamps_ns, trajectory.poses_xyyaw)
         path_ms = 1e3 * (time.perf_counter() - begin)
-        so_far = truth[: number + 1]
+        # A scan that is of no use has no pose.
+        so_far = run.truth[np.searchsorted(run.stamps_ns, trajectory.stamps_ns)]
         point = Point(
             frames=number,
             mean_ms=float(wall_ms.mean()),
@@ -119,7 +136,7 @@ def points(arguments: Arguments) -> list[Point]:
             memory_mb=resident_mb,
             stored_path_mb=stored_mb,
             path_ms=path_ms,
-            odometry_rmse_m=_rmse_m(odometry[:number], so_far[1:]),
+            odometry_rmse_m=_rmse_m(trajectory.odometry_xyyaw, so_far),
             online_rmse_m=_rmse_m(trajectory.online_xyyaw, so_far),
             optimised_rmse_m=_rmse_m(trajectory.poses_xyyaw, so_far),
         )
@@ -133,7 +150,51 @@ def points(arguments: Arguments) -> list[Point]:
     return found
 
 
-def stored_path_mb(core: OnlineTrajectory) -> float:
+def _maze_run(arguments: Arguments) -> Run:
+    drive = drive_of(arguments.world, arguments.seed, arguments.frames, arguments.cache)
+    core = OnlineTrajectory.load(
+        WEIGHTS / arguments.world,
+        arguments.window,
+        arguments.world,
+        arguments.key_frames,
+        arguments.iterations_per_step,
+    )
+    stamps_ns = np.array([stamp_ns(frame) for frame in range(len(drive) + 1)])
+    truth = np.concatenate((np.zeros((1, 3)), drive.truth))
+    return Run(core, (partial(core.update, step) for step in drive.steps()), stamps_ns, truth)
+
+
+def _scan_run(arguments: Arguments) -> Run:
+    drive = building_drive(arguments.seed, _FAR_M, most_scans=arguments.frames)
+    assert isinstance(drive.reference, TruePoses)
+    core = ScanTrajectory.load(WEIGHTS / "scan", iterations_per_step=arguments.iterations_per_step)
+    odometry = LidarOdometry.load(WEIGHTS / "scan")
+    odometry.mounting = drive.mounting
+    truth = seen_from_first(drive.reference.poses_xyyaw)
+    return Run(core, _scans(drive, odometry, core), drive.reference.stamps_ns, truth)
+
+
+def _scans(drive: LidarDrive, odometry: LidarOdometry, core: ScanTrajectory) -> Iterator[Callable[[], None]]:
+    """One call for each scan of a drive and the wheel poses before it, through both estimators."""
+
+    def take(records: list[LidarScan | WheelPose]) -> None:
+        for record in records:
+            if isinstance(record, WheelPose):
+                odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+            else:
+                odometry.add_scan(record)
+            for step in odometry.ready():
+                core.update(step)
+
+    waiting: list[LidarScan | WheelPose] = []
+    for record in drive.records():
+        waiting.append(record)
+        if isinstance(record, LidarScan):
+            yield partial(take, waiting)
+            waiting = []
+
+
+def stored_path_mb(core: CorrectedTrajectory) -> float:
     """What of the trajectory has to be kept for every frame."""
     parts = (core, core._log, core._graph)
     rows = [value for part in parts for value in vars(part).values() if isinstance(value, GrowingRows)]
@@ -205,6 +266,7 @@ def main(arguments: Arguments) -> int:
     """Drive, plot, print everything as one line of JSON; return the exit code."""
     found = in_process(two_cores()[0], points, arguments)
     result = summary(found)
+    arguments.cache.mkdir(parents=True, exist_ok=True)
     (arguments.cache / "long_run.json").write_text(json.dumps([asdict(point) for point in found]))
     save_plot(arguments.plot, found, f"{arguments.world}, {arguments.frames:,} frames on one core")
     print(json.dumps(result))

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -64,9 +65,10 @@ def test_a_missed_bar_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert json.loads(last) == {"maze3d": result}
 
 
-def test_a_long_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("world", ["maze2d", "scan"])
+def test_a_long_run(world: Literal["maze2d", "scan"], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = long_run.Arguments(
-        frames=640, every=32, window=160, key_frames=8, plot=tmp_path / "curves.png", cache=tmp_path
+        world=world, frames=640, every=32, window=160, key_frames=8, plot=tmp_path / "curves.png", cache=tmp_path
     )
     code = long_run.main(arguments)
     result = json.loads(capsys.readouterr().out.splitlines()[-1])

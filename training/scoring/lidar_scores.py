@@ -16,7 +16,7 @@ from training.data import lidar_drives
 from training.data.lidar_drives import LidarDrive, TruePoses
 from training.scoring import lidar_errors as errors_module
 from training.scoring import metrics, relations
-from training.scoring.lidar_errors import Errors, lidar_errors, within_deviations
+from training.scoring.lidar_errors import Errors, covariance_errors, lidar_errors
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row, identity_of
 
 _ALWAYS = (lidar_drives, errors_module, metrics, relations)
@@ -102,8 +102,7 @@ def _errors(drive: LidarDrive, estimate: Estimate) -> Errors:
             found = lidar_errors(drive.reference, estimate.stamps_ns, poses)
             errors.update({f"{name}_{key}": values for key, values in found.items()})
     if isinstance(drive.reference, TruePoses) and estimate.online is not None and estimate.covariances is not None:
-        share = within_deviations(drive.reference, estimate.stamps_ns, estimate.online, estimate.covariances)
-        errors["within_three_deviations"] = np.array([share])
+        errors.update(covariance_errors(drive.reference, estimate.stamps_ns, estimate.online, estimate.covariances))
     if estimate.scans_per_s is not None:
         errors["scans_per_s"] = np.array([estimate.scans_per_s])
     errors.update({name: np.array([float(value)]) for name, value in estimate.facts.items()})

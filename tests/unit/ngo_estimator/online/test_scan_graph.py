@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
-from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
+from tests.unit.ngo_estimator.optimizer.buildings import HALLWAY, TWICE, between, scan_at
 
 STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))
 
@@ -49,3 +50,29 @@ def test_a_key_scan_has_no_factors_by_default() -> None:
     key = KeyScanStep(no_scan(1), 0, STEP, COVARIANCE)
     np.testing.assert_array_equal(key.factors, 1.0)
     assert dataclasses.replace(key, factors=np.full(3, 2.0)).factors[0] == 2.0
+
+
+def test_more_loops_must_agree_where_the_robot_may_be_farther_away_than_was_searched() -> None:
+    """The same scans at the same poses: steps that tell little leave room for a place that looks alike."""
+    sure, lost = (0.02, 0.02, 0.005), (0.5, 0.5, 0.005)
+    random = np.random.default_rng(1)
+    scans = [dataclasses.replace(scan_at(HALLWAY, pose, random), stamp_ns=k) for k, pose in enumerate(TWICE)]
+    usual, wary = ScanGraphConfig(), ScanGraphConfig(agreeing_beyond=1000)
+    at_once, _ = first_loop(scans, usual, sure)
+    late, agreeing = first_loop(scans, usual, lost)
+    assert at_once < late < len(scans) and agreeing >= usual.agreeing_beyond
+    assert first_loop(scans, wary, sure)[0] == at_once
+    assert first_loop(scans, wary, lost)[0] == len(scans)
+
+
+def first_loop(scans: list[KeyScan], config: ScanGraphConfig, step_std: tuple[float, float, float]) -> tuple[int, int]:
+    """Key scans until the graph has a loop, and how many then agree with it; all, and 0, where it never has any."""
+    graph, nothing, covariance = ScanGraph(config), np.zeros(0, np.float32), np.diag(np.square(step_std))
+    for k, step in enumerate(between(TWICE[:-1], TWICE[1:])):
+        key = KeyScanStep(scans[k + 1], k, step, covariance)
+        if k == 0:
+            graph.begin_at(RelativeStep(1, 0, step, covariance, 0, step, nothing, nothing, origin_scan=scans[0]))
+        graph.append(step, covariance, key)
+        if len(graph.measurements()[1].nodes):
+            return graph.keys, int(graph.used_loops.agreeing.max())
+    return len(scans), 0

@@ -17,6 +17,17 @@ def outline(*corners: tuple[float, float]) -> np.ndarray:
     return np.concatenate((ends, np.roll(ends, -1, axis=0)), axis=1)
 
 
+HALLWAY = np.concatenate(
+    (
+        outline((0, 0), (10, 0), (10, 8), (0, 8)),
+        outline((2, 2), (8, 2), (8, 6), (5, 6), (5, 5), (2, 5)),
+        outline((0, 3), (0.5, 3), (0.5, 4.2), (0, 4.2)),
+        outline((9.3, 5), (10, 5), (10, 6), (9.6, 6.2)),
+        outline((4, 0), (4.3, 0.5), (5.5, 0.4), (5.6, 0)),
+    )
+)
+
+
 def scan_at(walls: np.ndarray, pose: np.ndarray, random: np.random.Generator, farthest_m: float = 30.0) -> KeyScan:
     """A scan of 181 rays over 180 deg with 1 cm noise."""
     directions = np.stack((np.cos(pose[2] + ANGLES), np.sin(pose[2] + ANGLES)), axis=-1)[:, None]
@@ -42,6 +53,10 @@ def way(*corners: tuple[float, float], step_m: float = 0.3) -> np.ndarray:
         count = max(1, round(math.dist(start, end) / step_m))
         poses += [(*(np.array(start) + (np.array(end) - start) * k / count), heading) for k in range(count)]
     return np.array(poses)
+
+
+ROUND = ((1.0, 1.0), (9.0, 1.0), (9.0, 7.0), (1.0, 7.0))
+TWICE = way(*ROUND, *ROUND, ROUND[0])
 
 
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -18,19 +18,16 @@ from ngo_estimator.optimizer.scan_loop_candidates import (
     graph_distances,
 )
 from ngo_estimator.optimizer.scan_loops import EVIDENCE, ScanLoopConfig, ScanLoopFinder, ScanLoops
-from tests.unit.ngo_estimator.optimizer.buildings import MOUNTING, between, drifted, outline, scan_at, way
-
-HALLWAY = np.concatenate(
-    (
-        outline((0, 0), (10, 0), (10, 8), (0, 8)),
-        outline((2, 2), (8, 2), (8, 6), (5, 6), (5, 5), (2, 5)),
-        outline((0, 3), (0.5, 3), (0.5, 4.2), (0, 4.2)),
-        outline((9.3, 5), (10, 5), (10, 6), (9.6, 6.2)),
-        outline((4, 0), (4.3, 0.5), (5.5, 0.4), (5.6, 0)),
-    )
+from tests.unit.ngo_estimator.optimizer.buildings import (
+    HALLWAY,
+    MOUNTING,
+    TWICE,
+    between,
+    drifted,
+    outline,
+    scan_at,
+    way,
 )
-ROUND = ((1.0, 1.0), (9.0, 1.0), (9.0, 7.0), (1.0, 7.0))
-TWICE = way(*ROUND, *ROUND, (1.0, 1.0))
 
 
 def scanned(walls: np.ndarray, poses: np.ndarray) -> list[KeyScan]:

@@ -2,9 +2,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from training.data.lidar_drives import ReferencePoses, Relations, TruePoses
-from training.scoring.lidar_errors import absolute_error_m, lidar_errors, within_deviations
+from training.scoring.lidar_errors import absolute_error_m, covariance_errors, lidar_errors
 
 STAMPS = np.array((10, 11, 12, 13)) * 10**9
 SQUARE = np.array(((0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 2.0, math.pi), (0.0, 2.0, -math.pi / 2)))
@@ -75,4 +76,19 @@ def test_the_truth_is_within_three_deviations_of_a_published_pose_or_not() -> No
     published[2, 1] += 0.31  # beyond
     published[3, 2] += 2.0 * math.pi - 0.02  # a turn more, 0.02 rad less: within 3 x 0.01 rad
     covariances = np.tile(np.diag((0.01, 0.01, 1e-4)), (4, 1, 1))
-    assert within_deviations(TruePoses(STAMPS, SQUARE), STAMPS, published, covariances) == 0.75
+    found = covariance_errors(TruePoses(STAMPS, SQUARE), STAMPS, published, covariances)
+    assert found["within_three_deviations"] == [0.75]
+
+
+def test_the_likelihood_is_that_of_a_normal_distribution_and_best_for_the_deviation_that_is_true() -> None:
+    noise = np.random.default_rng(0).standard_normal((4, 3)) * (0.1, 0.1, 0.01)
+    truth = TruePoses(STAMPS, SQUARE)
+    by_factor = {
+        factor: covariance_errors(truth, STAMPS, SQUARE + noise, np.tile(np.diag(variances), (4, 1, 1)))
+        for factor in (0.2, 1.0, 5.0)
+        for variances in [(factor * np.array((0.1, 0.1, 0.01))) ** 2]
+    }
+    found = {factor: float(errors["negative_log_likelihood"][0]) for factor, errors in by_factor.items()}
+    assert found[1.0] < min(found[0.2], found[5.0])
+    density = multivariate_normal(cov=np.diag((0.01 + 1e-6, 0.01 + 1e-6, 1e-4 + 1e-6)))
+    assert found[1.0] == pytest.approx(-density.logpdf(noise).mean())

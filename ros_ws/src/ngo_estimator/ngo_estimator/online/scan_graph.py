@@ -23,8 +23,9 @@ from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_matcher import ScanMatcher
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
-from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder
+from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder, ScanLoops
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.optimizer.ways_through_graph import way_covariances
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
@@ -43,7 +44,8 @@ class ScanGraphConfig:
     An optimisation takes ``iterations`` at most, and begins once ``keys_between`` key scans came since the last one, or
     at once where a new loop is ``surprise`` deviations off the graph and ``surprise_m`` at the walls. The Cauchy kernel
     on steps and loops is ``kernel`` deviations wide. A loop is left out where a way through the graph joins its keys
-    with at most ``redundant`` times its variance, unless it is that far off. ``step_m`` and ``step_deg`` are deviations
+    with at most ``redundant`` times its variance, unless it is that far off. Where the robot may be outside of the
+    widest window, ``agreeing_beyond`` loops must agree with one. ``step_m`` and ``step_deg`` are deviations
     that are added to each step's covariance: registration in the same few key scans does not see them. About
     ``most_scans`` key scans are kept; where there are more, places that many of them show lose some. Their poses stay.
     """
@@ -55,16 +57,17 @@ class ScanGraphConfig:
     surprise: float = 3.0
     surprise_m: float = 0.06
     redundant: float = 15.0
+    agreeing_beyond: int = 8
     kernel: float = 3.0
     step_m: float = 0.005
     step_deg: float = 0.15
     most_scans: int = 4000
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.keys_between < 1 or self.most_scans < 100:
+        if self.iterations < 1 or self.keys_between < 1 or self.most_scans < 100 or self.agreeing_beyond < 0:
             raise ValueError(
-                f"iterations, keys_between, most_scans are {self.iterations}, {self.keys_between}, {self.most_scans}; "
-                "expected at least 1, 1 and 100"
+                f"iterations, keys_between, most_scans, agreeing_beyond are {self.iterations}, {self.keys_between}, "
+                f"{self.most_scans}, {self.agreeing_beyond}; expected at least 1, 1, 100 and 0"
             )
         positive = (self.surprise, self.surprise_m, self.redundant, self.kernel, self.step_m, self.step_deg)
         if not all(0.0 < value < math.inf for value in positive):
@@ -98,6 +101,7 @@ class ScanGraph:
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
         self._before = np.zeros((1, 3))
         self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on, nodes all of them
+        self._doubted = np.zeros(0, np.int64)  # accepted loops for which too few speak as yet
         self._used = GrowingRows((), np.int64)  # loops that the graph needs, among all that were verified
         self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
         self.loop_weights = np.zeros(0)
@@ -196,19 +200,20 @@ class ScanGraph:
         # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
         wait = max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
         if (self.keys - 1) % self.config.loops.every == 0:
-            poses, used = self._nodes.values, self._finder.loops.pairs[self._used.values]
+            poses, used = self._nodes.values, self.used_loops.pairs
             windows = distance_windows(self.config.windows, graph_distances(poses, used, self.keys - 1))
             fresh = self._finder.find(self._scans, poses, windows)
             self._save_memory()
-            if len(fresh):
-                surprises = self._use(fresh)
+            believed = self._believed(np.concatenate((self._doubted, fresh)))
+            if len(believed):
+                surprises = self._use(believed)
                 self._waiting = max(self._waiting, wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
         self._waiting += self._waiting > 0
         return self._waiting > wait
 
     def _use(self, rows: np.ndarray) -> bool:
         """Take those newly accepted loops into the graph that it needs; returns whether one surprises."""
-        loops, known, config = self._finder.loops[rows], self._finder.loops[self._used.values], self.config
+        loops, known, config = self._finder.loops[rows], self.used_loops, self.config
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         off = (measured.residuals(self._nodes.values) ** 2).sum(1)
         at_walls = np.tile(np.diag((1.0, 1.0, WALLS_M)), (len(rows), 1, 1))
@@ -227,6 +232,31 @@ class ScanGraph:
             self._used.append(row)
         return bool(surprising.any())
 
+    def _believed(self, rows: np.ndarray) -> np.ndarray:
+        """Those of the accepted loops that the graph may use; others wait for as long as more may agree with them.
+
+        A search tells a place from others within its window. A robot that may be farther away may be in another place
+        that looks alike, which was not searched: then more loops must agree.
+        """
+        if len(rows) == 0:
+            return rows
+        config, windows = self.config, self.config.windows
+        loops, known = self._finder.loops[rows], self.used_loops
+        chain = np.arange(self.keys - 1)
+        covariance = way_covariances(
+            self._nodes.values,
+            np.concatenate((np.stack((chain, chain + 1), axis=1), known.pairs)),
+            np.concatenate((self._step_covariance.values, known.covariance)),
+            loops.pairs,
+        )
+        metres = windows.deviations * np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+        turn = windows.deviations * np.sqrt(covariance[:, 2, 2])
+        searched = (metres <= windows.most_m) & (turn <= math.radians(windows.most_deg))
+        believed = searched | (loops.agreeing >= config.agreeing_beyond)
+        may_grow = loops.pairs[:, 1] >= self.keys - 1 - config.loops.neighbour_keys
+        self._doubted = rows[~believed & may_grow]
+        return rows[believed]
+
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
         self._scans.compact()
@@ -239,9 +269,14 @@ class ScanGraph:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
         return ScanMatcher(self._scans[:], origin.poses(self._nodes.values.copy()), self._finder)
 
+    @property
+    def used_loops(self) -> ScanLoops:
+        """The loops that the graph needs."""
+        return self._finder.loops[self._used.values]
+
     def measurements(self) -> tuple[RelativePoses, RelativePoses]:
         """The steps from each node to the next, and the loops that the graph needs."""
-        loops = self._finder.loops[self._used.values]
+        loops = self.used_loops
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._chain(self._step_covariance.values), measured
 
@@ -382,6 +417,7 @@ class ScanGraph:
             "since": self._since,
             "end": self._end,
             "waiting": np.array(self._waiting),
+            "doubted": self._doubted,
             "before": self._before,
             "loop_rows": self._loop_rows,
             "loop_weights": self.loop_weights,
@@ -398,6 +434,7 @@ class ScanGraph:
         self._since, self._end = taken(arrays, "since", np.float64, 3, 3), taken(arrays, "end", np.float64, 3, 3)
         self._before = taken(arrays, "before", np.float64, -1, 3)
         self._loop_rows = taken(arrays, "loop_rows", np.int64, -1)
+        self._doubted = taken(arrays, "doubted", np.int64, -1)
         self.loop_weights = taken(arrays, "loop_weights", np.float64, len(self._loop_rows))
         self._check()
         done, waiting = taken_integer(arrays, "iterations", -1), taken_integer(arrays, "waiting")
@@ -416,11 +453,12 @@ class ScanGraph:
             keys > 0 and len(self._scans) == len(frames) == keys and steps == {keys - 1},
             f"there are not {keys} key scans, and a step less",
         )
+        of_loops = (self._loop_rows, self._doubted, self._used.values)
         ordered = frames[0] == 0 and (np.diff(frames) > 0).all() and frames[-1] < len(self.odometry)
         require(
             bool(ordered)
             and 1 <= len(self._before) <= keys
-            and all(bool(((rows >= 0) & (rows < found)).all()) for rows in (self._loop_rows, self._used.values))
+            and all(bool(((rows >= 0) & (rows < found)).all()) for rows in of_loops)
             and bool(np.isin(self._joins.values, frames[1:]).all()),
             "frames, nodes or loops are named that are not there",
         )

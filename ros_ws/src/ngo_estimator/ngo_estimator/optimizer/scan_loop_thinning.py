@@ -37,13 +37,14 @@ def needed_loops(
     count = int(joined.max(initial=0)) + 1
     for k, (earlier, later) in enumerate(pairs):
         limit = redundant * own_variance[k]
-        graph = _graph(joined[kept], variance[kept], count)
+        graph = edge_graph(joined[kept], variance[kept], count)
         known = dijkstra(graph, directed=False, indices=later, limit=limit)[earlier] <= limit
         kept[len(edges) + k] = surprising[k] or not known
     return kept[len(edges) :]
 
 
-def _graph(edges: np.ndarray, variance: np.ndarray, count: int) -> csr_array:
+def edge_graph(edges: np.ndarray, variance: np.ndarray, count: int) -> csr_array:
+    """A graph of ``count`` keys whose edges ``(e, 2)`` are as long as their variances ``(e,)``; doubles count once."""
     # A sparse array sums what it is given twice: of several edges between two keys the surest one counts.
     order = np.lexsort((variance, edges[:, 1], edges[:, 0]))
     edges, variance = edges[order], variance[order]

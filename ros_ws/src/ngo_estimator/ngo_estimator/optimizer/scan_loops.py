@@ -172,6 +172,11 @@ class ScanLoops:
             self.pairs[rows], self.relative[rows], self.covariance[rows], self.evidence[rows], self.accepted[rows]
         )
 
+    @property
+    def agreeing(self) -> np.ndarray:
+        """How many neighbouring loops agree with each ``(e,)``."""
+        return self.evidence[:, _AGREEING]
+
     @staticmethod
     def none() -> "ScanLoops":
         """No loops."""
