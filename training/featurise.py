@@ -13,7 +13,9 @@ import json
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import tyro
 from tqdm import tqdm
 
@@ -21,8 +23,9 @@ from ngo_estimator.checkpoint import load_local, load_place
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
 from training.common import runs
 from training.common.command_line import run_command
-from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE
+from training.data.data_source import MIRRORED_STORE, OTHER_TRAIN_STORE, TRAIN_STORE
 from training.data.drive_plan import Drives, drives_of_table
+from training.data.episodes import mirrored_episode
 from training.data.feature_store import NETWORKS_FILE, check_count, check_networks, fill, groups_of, write_row
 from training.data.features import Networks, features_of
 from training.data.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, WorldName, world_named
@@ -30,6 +33,9 @@ from training.recordings.recording_features import features_of_track
 from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
 from training.recordings.recording_streams import windows
 from training.recordings.recording_tracks import Part
+
+if TYPE_CHECKING:
+    from ngo_sim.episodes import Episode
 
 _MOST_STEPS = 1000  # of a stretch of a recording
 _FOR_ONE_OTHER = 5  # trajectories of the world's driver
@@ -47,6 +53,8 @@ class Arguments:
     trajectories: int = 960
     """Training trajectories, each in a maze that the local network has not seen. Some worlds add a fifth of this
     number, driven by another driver, for the optimizer alone."""
+    mirror: bool = False
+    """Worlds: whether they are kept a second time, as a mirror shows them, for the memory of the local network."""
     validation_trajectories: int = 24
     """Trajectories of the validation split for each table of results."""
     test_trajectories: int = 0
@@ -68,6 +76,8 @@ def planned_drives(arguments: Arguments, world: World) -> dict[str, Drives]:
     """The trajectories of each store."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
     found = {TRAIN_STORE: Drives(seeds, seeds, DRAWN, world.driver)}
+    if arguments.mirror:
+        found[MIRRORED_STORE] = found[TRAIN_STORE]
     if world.optimizer_driver is not None:
         others = list(OPTIMIZER_TRAIN_SEEDS[len(seeds) : len(seeds) + -(-len(seeds) // _FOR_ONE_OTHER)])
         found[OTHER_TRAIN_STORE] = Drives(others, others, DRAWN, world.optimizer_driver)
@@ -102,7 +112,13 @@ def main(arguments: Arguments) -> None:
         check_networks(store, local_description, place_description)
         (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
         part = (arguments.part, arguments.parts)
-        fill(store, world, drives, part, lambda e: features_of(world, e, folder, (local, place)))
+        in_mirror = split == MIRRORED_STORE
+
+        def arrays_of(episode: Episode, in_mirror: bool = in_mirror) -> dict[str, np.ndarray]:
+            seen = mirrored_episode(world, episode) if in_mirror else episode
+            return features_of(world, seen, folder, (local, place))
+
+        fill(store, world, drives, part, arrays_of)
 
 
 def _main_recorded(arguments: Arguments) -> None:

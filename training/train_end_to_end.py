@@ -106,6 +106,7 @@ class EndToEndTraining(lightning.LightningModule):
         earlier, later = batch["images"][:, :-1].flatten(0, 1), batch["images"][:, 1:].flatten(0, 1)
         estimates = self.local(earlier, later, batch["action"].flatten(0, 1))
         relative, log_std, motion = (value.float().unflatten(0, shape) for value in estimates)
+        relative, log_std = self.local.remembered(relative, log_std, motion)
         has_loops = self.optimizer.config.loops
         codes = self.place.encoder(later).float().unflatten(0, shape) if has_loops else relative
         steps = relative, log_std

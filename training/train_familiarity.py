@@ -163,11 +163,18 @@ def see(networks: Networks, config: FamiliarityConfig, drive: SensedDrive) -> Se
     for at in torch.arange(len(images) - 1).split(_CHUNK):
         earlier, later = images[at], images[at + 1]
         some = None if actions is None else actions[at], None if twists is None else twists[at]
-        relative, _, motion = networks.local(earlier, later, *some)
         told = told_vector(config, *some, len(at))
-        parts.append((look(networks.place.encoder, later), motion, told, relative, change(earlier, later)))
-    looks, motions, told_steps, relatives, changes = (torch.cat(column) for column in zip(*parts, strict=True))
-    return Seen(looks, motions, told_steps, relatives, changes, relative_poses(drive.poses_xyyaw))
+        parts.append(
+            (
+                look(networks.place.encoder, later),
+                told,
+                change(earlier, later),
+                *networks.local(earlier, later, *some),
+            )
+        )
+    looks, told_steps, changes, *steps = (torch.cat(column) for column in zip(*parts, strict=True))
+    relative, _ = networks.local.remembered(*steps)
+    return Seen(looks, steps[2], told_steps, relative, changes, relative_poses(drive.poses_xyyaw))
 
 
 def fit(config: FamiliarityConfig, seen: list[Seen], held_out: list[Seen]) -> Familiarity:

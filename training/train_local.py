@@ -11,6 +11,7 @@ a stop.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -227,18 +228,23 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch], steps: int = 1) ->
         mean[i], std[i], bias[i] = float(scale * mean[i]), float(scale * std[i]), float(scale * bias[i] + rest)
         fits[:, i] = scale * estimates[:, i] + rest
         log_std[:, i] += math.log(scale)
-    errors, variances = (fits - truth).split(lengths), log_std.mul(2.0).exp().split(lengths)
-    squares = [
-        _sums(error, steps).square() / _sums(variance, steps) for error, variance in zip(errors, variances, strict=True)
-    ]
-    deviation = torch.cat(squares).mean(0).sqrt().clamp(min=0.01).tolist()
+    deviation = lasting_deviation((fits - truth).split(lengths), log_std.mul(2.0).exp().split(lengths), steps)
     return dataclasses.replace(
         network.config,
         relative_mean=(mean[0], mean[1], mean[2]),
         relative_std=(std[0], std[1], std[2]),
         relative_bias=(bias[0], bias[1], bias[2]),
-        deviation_scale=(deviation[0], deviation[1], deviation[2]),
+        deviation_scale=deviation,
     )
+
+
+def lasting_deviation(errors: Sequence[Tensor], variances: Sequence[Tensor], steps: int) -> tuple[float, float, float]:
+    """The factor of deviations with which errors ``(n, 3)`` of drives, summed over so many ``steps``, are as stated."""
+    squares = [
+        _sums(error, steps).square() / _sums(variance, steps) for error, variance in zip(errors, variances, strict=True)
+    ]
+    x, y, yaw = torch.cat(squares).mean(0).sqrt().clamp(min=0.01).tolist()
+    return x, y, yaw
 
 
 def _sums(values: Tensor, steps: int) -> Tensor:
@@ -311,14 +317,15 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         wanted = domain.action_history if domain.actions else 1
         if config.action_history not in (1, wanted):
             raise RecordingError(f"{folder} is told the latest {config.action_history} actions; expected 1 or {wanted}")
-        # Calibrated they are anew.
-        changes: dict[str, Any] = {"deviation_scale": (1.0, 1.0, 1.0), "relative_bias": (0.0, 0.0, 0.0)}
+        # Calibrated they are anew; a memory was of the steps of these weights.
+        changes: dict[str, Any] = {"deviation_scale": (1.0, 1.0, 1.0), "relative_bias": (0.0, 0.0, 0.0), "memory": None}
         changes["action_history"] = wanted
         if domain.mirrors:
             changes |= {"symmetric": True, "mirrored_actions": domain.mirrored_actions}
         changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s, **changes))
         # What takes earlier actions into account is new where the weights know none.
-        changed.load_state_dict(changed.state_dict() | network.state_dict())
+        kept = {name: value for name, value in network.state_dict().items() if not name.startswith("memory.")}
+        changed.load_state_dict(changed.state_dict() | kept)
         return changed, {"began_with_sha256": description["sha256"]}
     some = steps.typical()
     config = LocalPoseConfig(

@@ -2,11 +2,15 @@
 
     python -m training.train_smoother --world maze3d
     python -m training.train_smoother --data drive_1.mcap drive_2.mcap --name my_robot
+    python -m training.train_smoother --world doom --memory
 
 The weights go beside those of the other networks. `train_optimizer` takes them from there where it smooths
-(`--smoothing True`), so train the smoother first. Run it again to continue after a stop.
+(`--smoothing True`), so train the smoother first. With `--memory` it corrects a step by those before it alone, and
+becomes part of the local network, whose odometry is better from then on: make the feature store anew after it. Both
+learn from the mirrored trajectories of `featurise --mirror` as well. Run it again to continue after a stop.
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +19,9 @@ import lightning
 import torch
 from torch import Tensor
 
-from ngo_estimator.checkpoint import SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
+from ngo_estimator.checkpoint import LOCAL, SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
 from ngo_estimator.geometry import se2
-from ngo_estimator.networks.local_pose_network import LocalPoseConfig
+from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training.common import runs
@@ -25,23 +29,28 @@ from training.common.command_line import run_command
 from training.common.precision import Precision
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
 from training.data.batches import Batch
-from training.data.data_source import TRAIN_STORE
+from training.data.data_source import MIRRORED_STORE, TRAIN_STORE
 from training.data.feature_store import training_stores
 from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
 from training.data.worlds import world_named
 from training.recordings.recording_source import RecordedData, SourceArguments, open_recorded
+from training.train_local import lasting_deviation
 
 ERROR_WINDOWS = (1, 4, 16)
 """Meta-poses that follow each other, over which errors are added up: what lasts makes the odometry drift."""
 
 _STORES = (TRAIN_STORE,)  # another driver's ways cost more on the first one's than they are worth
 _BLOCK = PoseAggregationConfig(1).block
+_LARGEST_OF_MEMORY = 2.0  # a robot that slides along a wall moves sideways faster than it usually does
+_OWN = ("format", "network", "world", "sha256", "config")  # of a description, which each file has of its own
 
 
 @dataclass(frozen=True)
 class Arguments(SourceArguments):
     """Settings of a training of the odometry smoother."""
 
+    memory: bool = False
+    """Whether it sees earlier steps alone, and becomes the memory of the local network."""
     epochs: int = 300
     """Epochs; the learning rate falls to zero over all of them."""
     steps: int = 40
@@ -57,7 +66,7 @@ class Arguments(SourceArguments):
     weights: Path = runs.WEIGHTS
     """Folder with NAME's local network and place encoder, of which the features are."""
     out: Path = runs.WEIGHTS
-    """Folder that gets NAME/odometry_smoother.safetensors."""
+    """Folder that gets NAME/odometry_smoother.safetensors, or the local network with its memory."""
     runs: Path = runs.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
 
@@ -118,24 +127,28 @@ def main(arguments: Arguments) -> dict[str, float]:
     name = arguments.world or arguments.recordings.name
     folder = arguments.weights / name
     local, local_description = load_local(folder, name)
+    if arguments.memory and local.config.memory is not None:
+        raise runs.RunError(f"the local network in {folder} has a memory already; expected one as train_local wrote it")
     recorded: RecordedData | None = None
     if arguments.world is None:
         recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
     domain = world_named(name) if recorded is None else recorded.domain
     place, place_description = load_place(folder, domain.name)
     features = arguments.runs / domain.name / "features"
-    stores = training_stores(features, _STORES, domain, local_description, place_description)
+    mirrored = (features / MIRRORED_STORE).exists()
+    learned_from = (*_STORES, MIRRORED_STORE) if mirrored else _STORES
+    stores = training_stores(features, learned_from, domain, local_description, place_description)
     train, validation = (StoredTrajectories(some, None, place.pair_head, _BLOCK) for some in stores)
     made_with = {"local_pose_network_sha256": local_description["sha256"]}
     run = runs.Run(
-        arguments.runs / domain.name / f"smoother-seed{arguments.seed}",
+        arguments.runs / domain.name / f"{'memory' if arguments.memory else 'smoother'}-seed{arguments.seed}",
         "train_smoother",
         arguments,
         arguments.epochs,
         arguments.seed,
         best=None if recorded is None else "smoothed_m",
         data=None if recorded is None else recorded.sha256,
-        settings={"error_windows": ERROR_WINDOWS, "stores": _STORES, **made_with},
+        settings={"error_windows": ERROR_WINDOWS, "stores": learned_from, "trajectories": len(train), **made_with},
     )
     scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
     smoother, begun = initial_smoother(arguments, local.config)
@@ -145,14 +158,45 @@ def main(arguments: Arguments) -> dict[str, float]:
     metrics = run.validate(training, data)
     if not run.is_first:
         return {}
-    details: dict[str, Any] = {**made_with}
-    if recorded is not None:
-        details["data"] = recorded.about
-    details |= {"training": {**run.finish(metrics), **begun}, "metrics": {"validation": metrics}}
-    path = arguments.out / domain.name / f"{SMOOTHER}.safetensors"
-    save_checkpoint(path, training.smoother.cpu(), SMOOTHER, domain.name, details, half=True)
+    smoother.cpu()
+    about: dict[str, Any] = {"training": {**run.finish(metrics), **begun}, "metrics": {"validation": metrics}}
+    if arguments.memory:
+        lasting = 1 if recorded is not None else world_named(name).deviation_steps
+        remembering = with_memory(local, smoother, data.validation, lasting)
+        details = {k: v for k, v in local_description.items() if k not in _OWN} | {"memory": {**made_with, **about}}
+        save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", remembering, LOCAL, domain.name, details)
+    else:
+        details = {**made_with, **({} if recorded is None else {"data": recorded.about}), **about}
+        path = arguments.out / domain.name / f"{SMOOTHER}.safetensors"
+        save_checkpoint(path, smoother, SMOOTHER, domain.name, details, half=True)
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics
+
+
+@torch.no_grad()
+def with_memory(
+    local: LocalPoseNetwork, smoother: OdometrySmoother, held_out: list[Batch], steps: int
+) -> LocalPoseNetwork:
+    """The local network with a causal smoother as its memory, without a bias on drives that were held out.
+
+    Its deviations are those of errors over so many ``steps``, as ``train_local`` fits them.
+    """
+    errors, variances = [], []
+    for batch in held_out:
+        relative, log_std = smoother(batch["relative"], batch["log_std"], batch["motion"])
+        errors += list(se2.wrapped(relative - se2.g2r(batch["truth"])))
+        variances += list(torch.exp(2.0 * log_std))
+    x, y, yaw = torch.cat(errors).mean(0).tolist()
+    errors = [error - error.new_tensor((x, y, yaw)) for error in errors]
+    memory = dataclasses.replace(
+        smoother.config,
+        relative_bias=(-x, -y, -yaw),
+        deviation_scale=lasting_deviation(errors, variances, steps),
+    )
+    remembering = LocalPoseNetwork(dataclasses.replace(local.config, memory=memory)).eval()
+    of_memory = {f"memory.{name}": value for name, value in smoother.state_dict().items()}
+    remembering.load_state_dict(local.state_dict() | of_memory)
+    return remembering
 
 
 def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[OdometrySmoother, dict[str, str]]:
@@ -161,7 +205,8 @@ def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[Odom
     Raises:
         RunError: the weights are of a smoother for other steps.
     """
-    config = SmootherConfig(local.feature_size, local.relative_std)
+    largest = _LARGEST_OF_MEMORY if arguments.memory else 1.0
+    config = SmootherConfig(local.feature_size, local.relative_std, causal=arguments.memory, largest=largest)
     began = arguments.recordings.from_weights
     if began is None:
         return OdometrySmoother(config), {}

@@ -2,10 +2,10 @@
 
     python -m training.tune_doom
 
-The optimizer is the robust pose graph that an untrained one is, without a network. What is chosen: how many witnesses a
-loop needs, and how far deviations of steps and loops are stretched. A choice with which the error on a map is larger
-than that of its odometry, or on a drive much larger, is out, whatever it gains elsewhere. The optimizer's covariance is
-then fitted to its errors. The command writes ``neural_graph_optimizer.safetensors`` and
+The optimizer is the robust pose graph that an untrained one is, without a network. What is chosen: where candidates may
+lie, how many witnesses a loop needs, and how far deviations of steps and loops are stretched. A choice with which the
+error on a map is larger than that of its odometry, or on a drive much larger, is out, whatever it gains elsewhere. The
+optimizer's covariance is then fitted to its errors. The command writes ``neural_graph_optimizer.safetensors`` and
 ``training/results/doom.gtsam.json``.
 """
 
@@ -45,6 +45,8 @@ BELIEF, HEADING_SCALE = 1.0, -2.0
 """Added to what a loop is believed, in quarters of its logit; stretch of its heading's deviation, as above."""
 CANDIDATES = 8, 2048
 """Loops for each meta-pose, and of all: belief tells so little that true ones are anywhere among them."""
+DRIFTS = ((0.0, 0.0), (0.06, 0.0075), (0.12, 0.0075))
+"""What the odometry drifts in a step (m, rad): how far away candidates may lie; (0, 0): anywhere."""
 WANTED = 0.97
 """Share of the published poses within three deviations."""
 MOST_HARM, MOST_HARM_OF_A_DRIVE = 1.05, 1.1
@@ -86,15 +88,18 @@ def main(arguments: Arguments) -> None:
     odometry = np.array([error(local(one).poses, one) for one in features])
     pair_head = drives.place.pair_head
     best: tuple[float, NeuralGraphOptimizer] | None = None
-    for witnesses, step, loop in itertools.product(WITNESSES, STEP_SCALES, LOOP_SCALES):
-        optimizer = robust_graph(folder, witnesses, step, loop)
+    for drift, witnesses, step, loop in itertools.product(DRIFTS, WITNESSES, STEP_SCALES, LOOP_SCALES):
+        optimizer = robust_graph(folder, witnesses, step, loop, drift)
         corrected = np.array([error(corrected_poses(optimizer, pair_head, one), one) for one in features])
         ratios, harm = corrected / odometry, harmful(corrected, odometry, [of for of, _ in places])
         score = float(np.exp(np.log(ratios).mean()))
-        print(f"witnesses {witnesses} steps {step} loops {loop}: {score:.3f}, worst {ratios.max():.3f}", flush=True)
+        print(
+            f"drift {drift} witnesses {witnesses} steps {step} loops {loop}: {score:.3f}, worst {ratios.max():.3f}",
+            flush=True,
+        )
         if not harm and (best is None or score < best[0]):
             best = score, optimizer
-    chosen = robust_graph(folder, 1000, 1.0, 0.0) if best is None else best[1]
+    chosen = robust_graph(folder, 1000, 1.0, 0.0, DRIFTS[0]) if best is None else best[1]
     core = OnlineTrajectory(chosen.eval(), pair_head)
     scale = covariance_scale(core, features)
     # Where no loop is closed, no less than the odometry itself says.
@@ -133,14 +138,23 @@ def harmful(corrected: np.ndarray, odometry: np.ndarray, maps: list[Map]) -> boo
     return any(corrected[of].mean() > max(MOST_HARM * odometry[of].mean(), HARM_BELOW_M) for of in drives_of)
 
 
-def robust_graph(folder: Path, witnesses: int, step_scale: float, loop_scale: float) -> NeuralGraphOptimizer:
+def robust_graph(
+    folder: Path, witnesses: int, step_scale: float, loop_scale: float, drift: tuple[float, float]
+) -> NeuralGraphOptimizer:
     """An untrained optimizer without a network; arguments as of the grids above."""
     network, world = load_local(folder, "doom")[0], world_named("doom")
     aggregation = PoseAggregationConfig(
         motion_feature_size=network.config.feature_size, relative_std=network.config.relative_std
     )
     per_pose, most = CANDIDATES
-    search = LoopSearch(per_pose=per_pose, most=most, views=world.loop_views, witnesses=witnesses)
+    search = LoopSearch(
+        per_pose=per_pose,
+        most=most,
+        views=world.loop_views,
+        witnesses=witnesses,
+        drift_m=drift[0],
+        drift_rad=drift[1],
+    )
     optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig(aggregation=aggregation, network=False, search=search))
     with torch.no_grad():
         optimizer.log_scale.fill_(float(np.log(step_scale)))
@@ -161,17 +175,18 @@ def write_pose_graph(
     """Choose GTSAM's settings by the same rule, and write them."""
     start = PoseGraphSettings(search=LoopSearch(per_pose=4, most=128, views=1))
     best, least = start, np.inf
-    grid = itertools.product((2.0, 3.0), (0.25, 0.5, 1.0), (1.0, 3.0), (1.0,))
-    for min_logit, step, loop, drift in grid:
+    grid = itertools.product(DRIFTS, (2.0, 3.0), (0.25, 0.5, 1.0), (1.0, 3.0), (1.0,))
+    for (drift_m, drift_rad), min_logit, step, loop, drift in grid:
+        search = dataclasses.replace(start.search, drift_m=drift_m, drift_rad=drift_rad)
         settings = dataclasses.replace(
-            start, min_logit=min_logit, odometry_position_scale=2.0 * step, odometry_heading_scale=step,
+            start, search=search, min_logit=min_logit, odometry_position_scale=2.0 * step, odometry_heading_scale=step,
             loop_position_scale=loop, loop_heading_scale=loop, drift_m=drift,
         )  # fmt: skip
         estimator = gtsam_graph(settings, drives.place.pair_head)
         corrected = np.array([error(estimator(one).poses, one) for one in features])
         ratios = corrected / odometry
         score = float(np.exp(np.log(ratios).mean()))
-        print(f"gtsam {min_logit} {step} {loop} {drift}: {score:.3f}, worst {ratios.max():.3f}", flush=True)
+        print(f"gtsam {drift_m} {min_logit} {step} {loop} {drift}: {score:.3f}, worst {ratios.max():.3f}", flush=True)
         if score < least:
             best, least = settings, score
     result = {

@@ -16,7 +16,7 @@ def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setitem(results_doom._MAPS, "test", (("take_cover.wad", "MAP01"),))
     monkeypatch.setattr(results_doom, "draw_levels", lambda path: None)
     monkeypatch.setattr(tune_doom, "VALIDATION_MAPS", (("simpler_basic.wad", "MAP01"),))
-    for name in ("WITNESSES", "STEP_SCALES", "LOOP_SCALES"):
+    for name in ("DRIFTS", "WITNESSES", "STEP_SCALES", "LOOP_SCALES"):
         monkeypatch.setattr(tune_doom, name, getattr(tune_doom, name)[:1])
     folders = {"weights": tmp_path / "weights", "runs": tmp_path / "runs", "out": tmp_path / "out"}
     folders["out"].mkdir()

@@ -12,6 +12,9 @@ TRAIN_STORE = "train"
 OTHER_TRAIN_STORE = "train_policy"
 """The one that the optimizer learns from as well, in worlds with an ``optimizer_driver``."""
 
+MIRRORED_STORE = "train_mirrored"
+"""The trajectories of ``TRAIN_STORE`` as a mirror shows them, where that was asked for."""
+
 MIRRORED_ACTIONS = (0, 2, 1)
 """Mirror image of each action of ngo_msgs/DiscreteAction: forward stays, left and right change places."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from training.data.data_source import MIRRORED_ACTIONS
 from training.data.worlds import DRAWN, MazeSize, World
 
 if TYPE_CHECKING:
@@ -51,6 +53,16 @@ def episodes_in(
 def images_of(world: World, episode: Episode) -> Tensor:
     """An episode's observations as ``(frames, height, width, channels)``."""
     return torch.from_numpy(episode.observations).reshape(-1, *world.image.shape)
+
+
+def mirrored_episode(world: World, episode: Episode) -> Episode:
+    """An episode as a mirror shows it: left and right exchanged in its pictures, actions and poses."""
+    return dataclasses.replace(
+        episode,
+        observations=images_of(world, episode).flip(-2).numpy(),
+        actions=np.array(MIRRORED_ACTIONS, dtype=episode.actions.dtype)[episode.actions],
+        poses_xyyaw=episode.poses_xyyaw * np.array([1.0, -1.0, -1.0]),
+    )
 
 
 def wall_ranges(maze: Maze, poses_xyyaw: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:

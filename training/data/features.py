@@ -60,12 +60,13 @@ def step_features(
         side = {name: value[chunk] for name, value in told_steps.items()}
         relative, log_std, motion = networks.local(images[:-1], images[1:], side.get("action"), side.get("twist"))
         parts.append((relative, log_std, motion, networks.place.encoder(images[1:])))
-    relative, log_std, motion, codes = (torch.cat(column).numpy() for column in zip(*parts, strict=True))
+    relative, log_std, motion, codes = (torch.cat(column) for column in zip(*parts, strict=True))
+    relative, log_std = networks.local.remembered(relative, log_std, motion)
     return {
-        "relative": relative,
-        "log_std": log_std,
-        "motion": motion.astype(np.float16),
-        "codes": codes.astype(np.float16),
+        "relative": relative.numpy(),
+        "log_std": log_std.numpy(),
+        "motion": motion.numpy().astype(np.float16),
+        "codes": codes.numpy().astype(np.float16),
         "origin_code": networks.place.encoder(frames(slice(0, 1))).numpy().astype(np.float16),
         "truth": seen_from_first(poses_xyyaw)[1:],
     }

@@ -76,10 +76,12 @@ def _trainings(weights: Path) -> list[list[str]]:
     rows = []
     for kind in (LOCAL, PLACE, SMOOTHER, OPTIMIZER):
         path = weights / f"{kind}.json"
-        training = json.loads(path.read_text())["training"] if path.exists() else {}
-        if isinstance(training, dict) and "seconds" in training:
-            speed = number(training["datapoints_per_s"])
-            rows.append([kind, f"`{training['command']}`", number(training["seconds"] / 60.0), speed])
+        described = json.loads(path.read_text()) if path.exists() else {}
+        for name, part in ((kind, described), (f"{kind}, memory", described.get("memory", {}))):
+            training = part.get("training")
+            if isinstance(training, dict) and "seconds" in training:
+                speed = number(training["datapoints_per_s"])
+                rows.append([name, f"`{training['command']}`", number(training["seconds"] / 60.0), speed])
     return rows
 
 

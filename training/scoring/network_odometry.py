@@ -67,6 +67,7 @@ def _network(kind: str, folder: Path, world: str) -> tuple[Callable[[Tensor], Te
     @torch.inference_mode()
     def steps_of(images: Tensor) -> Tensor:
         pairs = zip(images[:-1].split(_TOGETHER), images[1:].split(_TOGETHER), strict=True)
-        return torch.cat([local(earlier, later)[0] for earlier, later in pairs])
+        steps = [local(earlier, later) for earlier, later in pairs]
+        return local.remembered(*(torch.cat(part) for part in zip(*steps, strict=True)))[0]
 
     return steps_of, description["sha256"]

@@ -40,8 +40,9 @@ def estimated_steps(network: LocalPoseNetwork, world: World, episode: Episode) -
     actions = action_histories(episode.actions).split(_TOGETHER)
     pairs = zip(images[:-1].split(_TOGETHER), images[1:].split(_TOGETHER), actions, strict=True)
     told = bool(network.config.actions)
-    steps = [network(earlier, later, action if told else None)[0] for earlier, later, action in pairs]
-    return torch.cat(steps).double().numpy()
+    steps = [network(earlier, later, action if told else None) for earlier, later, action in pairs]
+    relative, _ = network.remembered(*(torch.cat(part) for part in zip(*steps, strict=True)))
+    return relative.double().numpy()
 
 
 def true_steps(episode: Episode) -> np.ndarray:

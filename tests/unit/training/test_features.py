@@ -12,9 +12,11 @@ from ngo_estimator.checkpoint import load_local, load_place, write_untrained
 from ngo_estimator.geometry import se2
 from training import featurise
 from training.data import feature_store
-from training.data.data_source import OTHER_TRAIN_STORE, TRAIN_STORE
+from training.data.batches import mirrored as mirrored_batch
+from training.data.batches import relative_poses
+from training.data.data_source import MIRRORED_STORE, OTHER_TRAIN_STORE, TRAIN_STORE
 from training.data.drive_plan import drives_of_table
-from training.data.episodes import simulate
+from training.data.episodes import images_of, mirrored_episode, simulate
 from training.data.feature_store import check_networks, open_store
 from training.data.features import features_of
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, WORLDS
@@ -92,6 +94,26 @@ def test_another_driver_drives_a_fifth_as_many_more_mazes_for_the_optimizer_alon
     world = WORLDS["maze2d"]
     assert world.optimizer_stores == (TRAIN_STORE,)
     assert OTHER_TRAIN_STORE not in planned_drives(featurise.Arguments("maze2d", **counts), world)
+
+
+def test_trajectories_are_kept_as_a_mirror_shows_them_where_that_is_asked_for() -> None:
+    world, counts = WORLDS["maze2d"], {"validation_trajectories": 0, "test_trajectories": 0}
+    driven = planned_drives(featurise.Arguments("maze2d", mirror=True, **counts), world)
+    assert driven[MIRRORED_STORE] == driven[TRAIN_STORE]
+    assert MIRRORED_STORE not in planned_drives(featurise.Arguments("maze2d", **counts), world)
+    (episode,) = simulate(world, [3], 40)
+    mirrored = mirrored_episode(world, episode)
+    assert {0, 1, 2} <= set(episode.actions.tolist())
+    # What a network of pairs learns from in a mirror is the same.
+    steps, seen = (relative_poses(one.poses_xyyaw) for one in (episode, mirrored))
+    torch.testing.assert_close(seen, steps * torch.tensor([1.0, -1.0, -1.0]))
+    batch = {"images": images_of(world, episode), "action": torch.from_numpy(episode.actions).long()}
+    expected = mirrored_batch(batch)
+    assert torch.equal(images_of(world, mirrored), expected["images"])
+    assert mirrored.actions.tolist() == expected["action"].tolist()
+    again = mirrored_episode(world, mirrored)
+    np.testing.assert_array_equal(again.observations, images_of(world, episode).numpy())
+    np.testing.assert_array_equal(again.poses_xyyaw, episode.poses_xyyaw)
 
 
 def test_features_are_what_the_networks_say_frame_by_frame(tmp_path: Path) -> None:

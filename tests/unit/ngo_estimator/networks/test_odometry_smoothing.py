@@ -1,5 +1,7 @@
 """What smooths the odometry: fresh it changes nothing, and it looks so far and no farther."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -33,6 +35,30 @@ def test_a_step_depends_on_those_within_the_dilations_and_no_others() -> None:
     after, _ = smoother(relative, log_std, motion)
     moved = (after - before).abs().sum(-1)[0].nonzero()[:, 0]
     assert (int(moved[0]), int(moved[-1])) == (30 - 7, 30 + 7)
+
+
+def test_a_causal_one_corrects_by_what_was_before_and_needs_no_more_of_it_than_it_says() -> None:
+    smoother, (relative, log_std, motion, _) = random_smoother(replace(CONFIG, causal=True)), trajectory_inputs(1, 60)
+    before, deviations = smoother(relative, log_std, motion)
+    latest = [values[0, 60 - smoother.config.reach - 1 :] for values in (relative, log_std, motion)]
+    last, last_deviation = smoother(*latest)
+    torch.testing.assert_close(last[-1], before[0, -1])
+    torch.testing.assert_close(last_deviation[-1], deviations[0, -1])
+    motion[0, 30] += 1.0
+    after, _ = smoother(relative, log_std, motion)
+    moved = (after - before).abs().sum(-1)[0].nonzero()[:, 0]
+    assert (int(moved[0]), int(moved[-1])) == (30, 30 + smoother.config.reach)
+
+
+def test_what_was_fitted_to_held_out_drives_is_added_to_each_step() -> None:
+    inputs = trajectory_inputs(1, 30)[:3]
+    plain, fitted = (
+        random_smoother(replace(CONFIG, **changes))
+        for changes in ({}, {"relative_bias": (0.01, 0.0, -0.02), "deviation_scale": (2.0, 1.0, 0.5)})
+    )
+    (steps, deviations), (moved, scaled) = plain(*inputs), fitted(*inputs)
+    torch.testing.assert_close(moved - steps, torch.tensor([0.01, 0.0, -0.02]).expand_as(steps))
+    torch.testing.assert_close((scaled - deviations).exp(), torch.tensor([2.0, 1.0, 0.5]).expand_as(steps))
 
 
 @pytest.mark.parametrize(("form", "blocks"), [("loops", 2), ("smoothed", 6), ("gauss_newton", 0)])
@@ -93,6 +119,7 @@ def test_an_optimizer_keeps_all_but_its_smoother() -> None:
         ({"dilations": ()}, r"dilations are 6, 64, \(\); expected at least 1, and a positive number"),
         ({"dilations": (1, 0)}, r"\(1, 0\)"),
         ({"width": 0}, "6, 0,"),
+        ({"deviation_scale": (1.0, 0.0, 1.0)}, r"deviation_scale is \(1.0, 0.0, 1.0\); expected three positive"),
         ({"relative_std": (0.1, 0.0, 0.1)}, r"relative_std is \(0.1, 0.0, 0.1\); expected three positive numbers"),
     ],
 )

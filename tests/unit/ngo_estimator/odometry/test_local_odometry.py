@@ -11,6 +11,7 @@ from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local,
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
+from ngo_estimator.networks.odometry_smoothing import SmootherConfig
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame, UnusableImage
 from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations, place_config
@@ -244,6 +245,32 @@ def test_the_network_is_told_the_latest_actions_until_a_frame_is_missed_or_the_o
     odometry.update(next(stamps), images[4], 1)
     odometry.update(next(stamps), images[5], 2)
     assert told[-1] == [NO_ACTION, NO_ACTION, 2]
+
+
+def test_steps_are_corrected_by_those_before_them_as_of_a_whole_drive_until_a_frame_is_missed() -> None:
+    memory = SmootherConfig(8, (0.1, 0.02, 0.05), (1, 2), 4, causal=True)
+    torch.manual_seed(0)
+    network = LocalPoseNetwork(local_config("maze2d", actions=0, feature_size=8, memory=memory)).eval()
+    assert network.memory is not None
+    torch.nn.init.normal_(network.memory.head.weight)
+    images = torch.from_numpy(frames(16))
+
+    def drive(first: int) -> torch.Tensor:
+        return torch.cat(network.remembered(*network(images[first:-1], images[first + 1 :])), dim=-1)
+
+    with torch.inference_mode():
+        alone, whole, after_it = torch.cat(network(images[:-1], images[1:])[:2], dim=-1), drive(0), drive(9)
+    odometry = LocalOdometry(network, PlaceNetworks(place_config("maze2d")), "maze2d")
+    for missed, expected in ((0, whole), (1, torch.cat((whole[:8], alone[8:9], after_it)))):
+        odometry.reset()
+        late = [k * PERIOD_NS + (missed * PERIOD_NS if k > 8 else 0) for k in range(16)]
+        steps = [odometry.update(stamp_ns, image, None) for stamp_ns, image in zip(late, images.numpy(), strict=True)]
+        found = [step.relative_xyyaw for step in steps if step is not None]
+        np.testing.assert_allclose(found, expected[:, :3], atol=1e-6)
+        stds = [np.sqrt(np.diagonal(step.covariance)) for step in steps if step is not None and not step.missed_frames]
+        known = expected[[k for k in range(15) if not (missed and k == 8)], 3:]
+        np.testing.assert_allclose(stds, known.exp(), rtol=1e-4)
+    assert float((whole - alone).abs().max()) > 1e-3
 
 
 @pytest.mark.parametrize("twist", [None, np.zeros(2), np.array([0.1, np.nan, 0.0]), 0.3])

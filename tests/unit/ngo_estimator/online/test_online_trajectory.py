@@ -15,6 +15,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 
@@ -120,6 +121,31 @@ def assert_sound(update: Seen) -> None:
 
 
 # ---- online equals offline
+
+
+def test_candidates_from_where_the_odometry_may_have_been_alone_are_the_same_online_and_offline() -> None:
+    optimizers = [
+        small_optimizer(trained=True, search=LoopSearch(2, 64, 2, 0, 3, **drift))
+        for drift in ({}, {"drift_m": 0.3, "drift_rad": 0.4})
+    ]
+    steps = make_steps(160)
+    poses = np.concatenate((np.zeros((1, 3)), np.stack([step.odom_xyyaw for step in steps])))
+
+    def farthest(optimizer: NeuralGraphOptimizer, window_frames: int = 2000) -> tuple[Seen, OnlineTrajectory, float]:
+        core = OnlineTrajectory(optimizer, small_pair_head(), window_frames)
+        update = [take(core, step) for step in steps][-1]
+        ends = (poses[update.loops[:, side], :2] for side in (0, 1))
+        return update, core, float(np.hypot(*np.subtract(*ends).T).max(initial=0.0))
+
+    anywhere, (nearby, core, reach), (_, _, reach_of_keys) = (
+        farthest(optimizers[0]),
+        farthest(optimizers[1]),
+        farthest(optimizers[1], window_frames=80),
+    )
+    most = 1.0 + 0.3 * 160**0.5 + 0.8  # frames of a meta-pose are up to so far from its end
+    assert 0.0 < max(reach, reach_of_keys) < most < anywhere[2]
+    assert 0 < len(nearby.loops) < len(anywhere[0].loops)
+    assert_same_poses(nearby.poses_xyyaw, offline(core, steps))
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def planted(pairs: list[tuple[int, int]], steps: int = 96) -> tuple[Tensor, Tens
     return relative, codes
 
 
-def search(relative: Tensor, codes: Tensor, block: int = 8, **changes: int) -> Loops:
+def search(relative: Tensor, codes: Tensor, block: int = 8, **changes: float) -> Loops:
     limits = LoopSearch(**{"per_pose": 2, "most": 6, "min_separation": 3, "min_apart": 0, "views": 1, **changes})
     return find_loops(Identity(place_config("maze2d")), codes, poses_in_blocks(relative, block), limits)
 
@@ -190,6 +190,29 @@ def test_more_views_measure_better_and_tell_how_far_they_disagree() -> None:
             assert 0.005 < loops.spread.exp().mean().item() < 0.03
     assert errors[9] < errors[5] < errors[1]
     assert errors[9] < 0.6 * errors[1]
+
+
+def test_with_a_drift_the_most_similar_that_the_odometry_allows_are_taken() -> None:
+    relative, codes = planted([])
+    relative[..., :] = torch.tensor([0.1, 0.0, 0.0])  # straight on: after 96 steps it is 9.6 m away
+    for frame, share in ((8, 1.0), (40, 0.9), (64, 0.8)):
+        codes[0, frame] = share * codes[0, 95] + (1.0 - share) * codes[0, frame]
+    blocks = {}
+    # One metre and the drift in so many steps, which are 8.7, 5.5 and 3.1 m.
+    for drift_m in (0.0, 0.7, 0.5, 0.3):
+        loops = search(relative, codes, per_pose=1, most=50, drift_m=drift_m, drift_rad=drift_m)
+        chosen = (loops.end[0] == 11) & loops.valid[0] & (loops.similarity[0] > 0.5)
+        blocks[drift_m] = (loops.frame[0] // 8)[chosen].tolist()
+    assert blocks == {0.0: [1], 0.7: [5], 0.5: [8], 0.3: []}
+    turned = relative.clone()
+    turned[0, 80, 2] = 1.5
+    assert not (search(turned, codes, per_pose=1, most=50, drift_m=0.5, drift_rad=0.1).similarity[0] > 0.5).any()
+
+
+@pytest.mark.parametrize("drift", [(0.1, 0.0), (0.0, 0.1), (-0.1, -0.1)])
+def test_a_drift_is_of_positions_and_headings(drift: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="expected two positive numbers, or 0 and 0"):
+        LoopSearch(drift_m=drift[0], drift_rad=drift[1])
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from torch.nn.functional import one_hot
 
 from ngo_estimator.data.images import ImageFormat, to_network
 from ngo_estimator.networks.flownet import FlowNetConvolutions
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 
 NO_ACTION = -1
 """In place of an action that was not taken, or that nobody knows."""
@@ -26,7 +27,7 @@ class LocalPoseConfig:
     velocity between the frames, which it divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between
     frames in training. With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror
     images, in which action ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard
-    deviations that the heads give.
+    deviations that the heads give. With ``memory``, a causal smoother, steps are corrected by those before them.
     """
 
     image: ImageFormat
@@ -45,6 +46,7 @@ class LocalPoseConfig:
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     action_history: int = 1
     fusion_size: int = 128
+    memory: SmootherConfig | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -70,6 +72,12 @@ class LocalPoseConfig:
         if self.symmetric and sorted(self.mirrored_actions) != list(range(self.actions)):
             raise ValueError(
                 f"mirrored_actions is {self.mirrored_actions}; expected each of the {self.actions} actions once"
+            )
+        memory = self.memory
+        if memory is not None and not (memory.causal and memory.motion_feature_size == self.feature_size):
+            raise ValueError(
+                f"memory is {memory}; expected causal=True and motion_feature_size {self.feature_size}, as the "
+                "network's features are"
             )
 
 
@@ -104,6 +112,9 @@ class LocalPoseNetwork(nn.Module):
     earlier actions: told at once, they explain so much that little is learned from the frames. A symmetric network
     estimates both the frames and their mirror image, in evaluation mode: errors to the left and to the right then
     cancel wherever the two differ.
+
+    Beyond the paper, too: ``remembered`` corrects the steps of a drive by those before them. A robot has momentum, and
+    two frames of a wall without marks tell nothing that the frames before them have not shown.
     """
 
     def __init__(self, config: LocalPoseConfig) -> None:
@@ -127,6 +138,7 @@ class LocalPoseNetwork(nn.Module):
             )
             for parameter in self.fusion[-1].parameters():
                 nn.init.zeros_(parameter)  # it begins with what is seen
+        self.memory = None if config.memory is None else OdometrySmoother(config.memory)
         self.register_buffer("relative_mean", torch.tensor(config.relative_mean), persistent=False)
         self.register_buffer("relative_std", torch.tensor(config.relative_std), persistent=False)
         self.register_buffer("relative_bias", torch.tensor(config.relative_bias), persistent=False)
@@ -168,6 +180,17 @@ class LocalPoseNetwork(nn.Module):
         of_both = (estimates.fused.mean, estimates.fused.log_std, estimates.feature)
         mean, log_std, feature = (values.chunk(2) for values in of_both)
         return 0.5 * (mean[0] + mean[1] * flip) + self.relative_bias, 0.5 * (log_std[0] + log_std[1]), feature[0]
+
+    def remembered(self, relative: Tensor, log_std: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps of drives and the logarithms of their deviations, ``(..., steps, 3)``, corrected by those before them.
+
+        Arguments are what ``forward`` gives for steps that follow each other: all from the first one on, or the latest
+        ``memory.reach + 1``, of which the last one comes out as it would of all. Without a memory they come back.
+        """
+        if self.memory is None:
+            return relative, log_std
+        corrected: tuple[Tensor, Tensor] = self.memory(relative, log_std, features)
+        return corrected
 
     def estimates(
         self, earlier: Tensor, later: Tensor, actions: Tensor | None = None, twist: Tensor | None = None

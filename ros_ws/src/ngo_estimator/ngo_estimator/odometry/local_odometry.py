@@ -1,5 +1,6 @@
 """Local odometry: frames in, relative poses out (no ROS here)."""
 
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,6 +96,8 @@ class LocalOdometry:
         self._origin_code: np.ndarray | None = None
         self._odom = torch.zeros(3, dtype=torch.float64)
         self._actions = [NO_ACTION] * self._network.config.action_history
+        memory = self._network.config.memory
+        self._steps: deque[tuple[torch.Tensor, ...]] = deque(maxlen=1 if memory is None else memory.reach + 1)
         if self._watch is not None:
             self._watch.reset()
 
@@ -151,6 +154,12 @@ class LocalOdometry:
         with torch.inference_mode():
             relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
             code = self._encoder(frame)
+            if missed:
+                self._steps.clear()
+            else:
+                self._steps.append((relative, log_std, feature))
+                drive = (torch.cat(part) for part in zip(*self._steps, strict=True))
+                relative, log_std = (values[-1:] for values in self._network.remembered(*drive))
         variance, unlikeness, repeated = torch.exp(2.0 * log_std[0].double()), 0.0, False
         if self._watch is not None:
             if missed:

@@ -20,7 +20,7 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.place_map import PlaceMap
-from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere, may_show_one_place
 from ngo_estimator.optimizer.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
 from ngo_estimator.optimizer.place_ambiguity import looks_like_everything, places_by_odometry
@@ -125,11 +125,12 @@ class OnlineLoops:
             similarity = (seen @ embedding).reshape(-1, self._block)
             if self._looks_like_everything(similarity.reshape(-1), first * self._block):
                 return KeptLoops.none()
+            similarity = self._possible(similarity, in_window, last)
             for index, step, value in self._most_similar(similarity, in_window, self._search.per_pose):
                 node = int(in_window[index])
                 frames.append(self._in_window(node, node * self._block + step, value, last, offsets))
         if len(keys):
-            similarity = keys.embeddings @ embedding
+            similarity = self._possible(keys.embeddings @ embedding, keys.nodes, last)
             for index, step, value in self._most_similar(similarity, keys.nodes, _KEY_FRAMES_PER_POSE):
                 frames.append(self._of_key_frame(keys.frame(index), step, value, offsets))
         found = self._measured(frames, end, offsets) if frames else KeptLoops.none()
@@ -142,6 +143,15 @@ class OnlineLoops:
         places = places_by_odometry(at, 2.0 * self._pair_head.config.offset_scale_m)
         alike = torch.from_numpy(similarity)
         return bool(looks_like_everything(alike, places, torch.ones_like(alike, dtype=torch.bool)))
+
+    def _possible(self, similarity: np.ndarray, blocks: np.ndarray, last: int) -> np.ndarray:
+        """Similarity ``(n, frames)`` of the frames of blocks to the one after step ``last``, 0 for impossible ones."""
+        if not self._search.drift_m:
+            return similarity
+        odometry, steps = self._odometry.values, blocks[:, None] * self._block + np.arange(self._block)
+        earlier, newest = (torch.from_numpy(odometry[number + 1]) for number in (steps, last))
+        possible = may_show_one_place(se2.between(earlier, newest), torch.from_numpy(last - steps), self._search)
+        return np.where(possible.numpy(), similarity, 0.0)
 
     def _most_similar(self, similarity: np.ndarray, blocks: np.ndarray, count: int) -> list[tuple[int, int, float]]:
         """Index in ``blocks``, frame of the block and value of the best of ``similarity`` ``(n, frames)``."""

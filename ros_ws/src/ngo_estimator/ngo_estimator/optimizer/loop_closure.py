@@ -7,6 +7,7 @@ frame.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,6 +31,8 @@ class LoopSearch:
     is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
     place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
     With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
+    With ``drift_m`` and ``drift_rad``, candidates are the most similar of those frames alone that may show the same
+    place by the odometry, which drifts so much in the first of the steps between (``may_show_one_place``).
     With ``witnesses``, a loop must be as the odometry allows, and others nearby must agree: so many for each of the
     odometry's deviations by which it is off (``loop_agreement``).
     """
@@ -42,6 +45,8 @@ class LoopSearch:
     registrations: int = 0
     overlaps: int = 0
     witnesses: int = 0
+    drift_m: float = 0.0
+    drift_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
@@ -53,6 +58,11 @@ class LoopSearch:
             raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
         if self.witnesses < 0:
             raise ValueError(f"witnesses is {self.witnesses}; expected 0 (none) or more")
+        if min(self.drift_m, self.drift_rad) < 0.0 or (self.drift_m > 0.0) != (self.drift_rad > 0.0):
+            raise ValueError(
+                f"drift_m, drift_rad are {self.drift_m}, {self.drift_rad}; expected two positive numbers, or 0 and 0 "
+                "(candidates from anywhere)"
+            )
         if self.registrations < 0:
             raise ValueError(f"registrations is {self.registrations}; expected 0 (none) or more")
         if self.overlaps < 0 or (self.overlaps and not self.registrations):
@@ -142,8 +152,14 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     embeddings = pair_head.embed(codes)
     at_ends = embeddings[:, block - 1 :: block]
     with torch.no_grad():
-        places = places_by_odometry(frame_odometry(in_blocks)[..., :2], 2.0 * pair_head.config.offset_scale_m)
-        similarity, frame, end = _most_similar(at_ends, embeddings, places, block, search)
+        odometry = frame_odometry(in_blocks)
+        places = places_by_odometry(odometry[..., :2], 2.0 * pair_head.config.offset_scale_m)
+        possible = None
+        if search.drift_m:
+            steps = torch.arange(odometry.shape[1], device=odometry.device)
+            between = se2.between(odometry.unsqueeze(1), odometry[:, block - 1 :: block].unsqueeze(2))
+            possible = may_show_one_place(between, steps[block - 1 :: block, None] - steps, search)
+        similarity, frame, end = _most_similar(at_ends, embeddings, (places, possible), block, search)
         # The pair head is the costly part: it sees only what is most similar, twice as many as can be kept.
         keep = similarity.topk(min(2 * search.most, similarity.shape[1]), dim=-1).indices
         similarity, frame, end = (value.gather(1, keep) for value in (similarity, frame, end))
@@ -171,6 +187,20 @@ def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: Lo
     )
 
 
+def may_show_one_place(between: Tensor, steps: Tensor, search: LoopSearch) -> Tensor:
+    """Whether frames may be of one place ``(...)``, which lies within 1 m and 35 degrees, by the odometry.
+
+    What the odometry is off grows with the root of the number of steps.
+
+    Args:
+        between: poses ``(..., 3)`` of the later frames in the earlier ones by odometry.
+        steps: steps ``(...)`` between the frames.
+    """
+    root = steps.clamp(min=0).to(between.dtype).sqrt()
+    near = between[..., :2].norm(dim=-1) <= _PLACE_M + search.drift_m * root
+    return near & (se2.wrap(between[..., 2]).abs() <= _PLACE_RAD + search.drift_rad * root)
+
+
 def frame_odometry(in_blocks: Tensor) -> Tensor:
     """Global poses ``(batch, steps, 3)`` of all frames by odometry."""
     ends = se2.r2g(in_blocks[..., -1, :])
@@ -179,18 +209,25 @@ def frame_odometry(in_blocks: Tensor) -> Tensor:
 
 
 _NONE = -4.0  # similarity that marks fill
+_PLACE_M, _PLACE_RAD = 1.0, math.radians(35.0)
 
 
 def _most_similar(
-    at_ends: Tensor, embeddings: Tensor, places: Tensor, block: int, search: LoopSearch
+    at_ends: Tensor, embeddings: Tensor, where: tuple[Tensor, Tensor | None], block: int, search: LoopSearch
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Similarity, earlier frame and later meta-pose ``(batch, blocks * per_pose)`` of the candidates."""
+    """Similarity, earlier frame and later meta-pose ``(batch, blocks * per_pose)`` of the candidates.
+
+    ``where`` holds the places of all frames, and which of them are possible ``(batch, blocks, frames)`` (None: all).
+    """
+    places, possible = where
     batch, blocks = at_ends.shape[:2]
     similarity = (at_ends @ embeddings.mT).unflatten(-1, (blocks, block))
-    best, best_step = similarity.max(dim=-1)
     index = torch.arange(blocks, device=at_ends.device)
     older = index[:, None] - index >= search.min_separation
     vague = looks_like_everything(similarity.flatten(2), places, older.repeat_interleave(block, dim=-1))
+    if possible is not None:
+        similarity = similarity.masked_fill(~possible.unflatten(-1, (blocks, block)), _NONE)
+    best, best_step = similarity.max(dim=-1)
     best = best.masked_fill(~older | vague.unsqueeze(-1), _NONE)
     values, chosen = each_from_elsewhere(best, min(search.per_pose, blocks), search.min_apart, _NONE)
     frames = chosen * block + best_step.gather(-1, chosen)
