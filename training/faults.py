@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import FAMILIARITY, load_description, load_local, load_place
+from ngo_estimator.checkpoint import FAMILIARITY, load_local, load_place
+from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from training.common import runs

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER, load_description
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
+from ngo_estimator.data.weights_file import load_description
 from training import (
     featurise,
     throughput,

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import FAMILIARITY, load_description, load_familiarity, load_local, load_place
+from ngo_estimator.checkpoint import FAMILIARITY, load_familiarity, load_local, load_place
+from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode

@@ -20,14 +20,13 @@ from ngo_estimator.checkpoint import (
     LOCAL,
     OPTIMIZER,
     PLACE,
-    CheckpointError,
     PlaceNetworks,
-    load_description,
     load_local,
     load_optimizer,
     load_place,
     save_checkpoint,
 )
+from ngo_estimator.data.weights_file import CheckpointError, load_description
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory

@@ -18,14 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
-from ngo_estimator.checkpoint import (
-    OPTIMIZER,
-    load_local,
-    load_optimizer,
-    load_place,
-    load_smoother,
-    save_checkpoint,
-)
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, load_smoother, save_checkpoint
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig

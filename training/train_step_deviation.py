@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import STEP_DEVIATION, save_checkpoint
-from ngo_estimator.networks.step_deviation import StepDeviation, StepDeviationConfig
+from ngo_estimator.checkpoint import save_checkpoint
+from ngo_estimator.networks.step_deviation import StepDeviation
+from ngo_estimator.networks.step_scaling import STEP_DEVIATION, StepDeviationConfig
 from ngo_estimator.odometry.lidar_odometry import LidarOdometryConfig
 from ngo_estimator.online.scan_graph import ScanGraphConfig
 from training.common import runs

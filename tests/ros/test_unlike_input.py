@@ -7,16 +7,8 @@ import torch
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from sensor_msgs.msg import Image
 
-from ngo_estimator.checkpoint import (
-    FAMILIARITY,
-    LOCAL,
-    PLACE,
-    load_description,
-    load_local,
-    load_place,
-    save_checkpoint,
-    write_untrained,
-)
+from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load_place, save_checkpoint, write_untrained
+from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig, look_size
 from ngo_estimator.nodes.messages import to_time
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from ngo_estimator.checkpoint import load_description, load_local
+from ngo_estimator.checkpoint import load_local
+from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.ros.processes import NodeProcess

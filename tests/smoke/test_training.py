@@ -23,12 +23,12 @@ from ngo_estimator.checkpoint import (
     OPTIMIZER,
     PLACE,
     SMOOTHER,
-    CheckpointError,
     load_local,
     load_optimizer,
     load_place,
     load_smoother,
 )
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.smoke import toy

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import tyro
 
-from ngo_estimator.checkpoint import CheckpointError
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_recordings.errors import RecordingError
 from training.common.runs import RunError
 

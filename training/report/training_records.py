@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER, load_description
+from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
+from ngo_estimator.data.weights_file import load_description
 from training.baselines.deepvo import DEEPVO
 from training.scoring.table_rows import ROWS, Sources, rows_of, trainings_of
 

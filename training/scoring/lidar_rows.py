@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.odometry import lidar_odometry
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
 from ngo_estimator.online import scan_trajectory
@@ -120,8 +120,8 @@ class DriveRuns:
         key = identity_of(dataclasses.replace(pipeline, learned_deviations=True, graph={}))
         if key not in self._fronts:
             settings = changed(read_lidar_file(self._weights, "odometry", LidarOdometryConfig), pipeline.odometry)
-            deviation = load_step_deviation(self._weights) if settings.learned_deviation else None
-            odometry = LidarOdometry(settings, self.drive.mounting, deviation)
+            scaling = StepScaling.load(self._weights) if settings.learned_deviation else None
+            odometry = LidarOdometry(settings, self.drive.mounting, scaling)
             steps: list[LidarStep] = []
             began = time.process_time()
             for record in self.drive.records(pipeline.wheels):

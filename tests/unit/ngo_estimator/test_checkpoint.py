@@ -16,7 +16,6 @@ from ngo_estimator.checkpoint import (
     LOCAL,
     OPTIMIZER,
     PLACE,
-    CheckpointError,
     load_local,
     load_optimizer,
     load_place,
@@ -24,6 +23,7 @@ from ngo_estimator.checkpoint import (
     write_untrained,
 )
 from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.data.weights_file import CheckpointError
 
 LOADERS: dict[str, Callable[..., Any]] = {LOCAL: load_local, PLACE: load_place, OPTIMIZER: load_optimizer}
 

@@ -7,32 +7,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import safetensors
-from safetensors.torch import load, save
+import torch
+from safetensors.torch import save
 from torch import nn
 
-from ngo_common.files import read_file, write_together
-from ngo_estimator.data.configuration import config_from_dict
+from ngo_common.files import write_together
 from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.data.weights_file import FORMAT, CheckpointError, load_description, read_weights
 from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.networks.step_deviation import StepDeviation, StepDeviationConfig
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 
-FORMAT = 1
 LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "local_pose_network",
     "place_encoder",
     "odometry_smoother",
     "neural_graph_optimizer",
 )
-STEP_DEVIATION = "step_deviation"
 FAMILIARITY = "familiarity"
-RETIRED_SETTINGS = {OPTIMIZER: {"compass": False}}
-"""Settings of earlier versions, by the kind of network, with the only value that still means the same."""
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
@@ -40,10 +35,6 @@ WORLD_IMAGES = {
 }
 
 Network = TypeVar("Network", bound=nn.Module)
-
-
-class CheckpointError(ValueError):
-    """A checkpoint is missing, damaged, or not the one that was asked for."""
 
 
 class PlaceNetworks(nn.Module):
@@ -86,26 +77,6 @@ def save_checkpoint(
     write_together({path: weights, path.with_suffix(".json"): json.dumps(description, indent=2) + "\n"})
 
 
-def load_description(path: Path, kind: str, world: str | None = None) -> dict[str, Any]:
-    """The JSON beside ``path``, checked to describe a network of ``kind``, trained for ``world`` if one is given."""
-    beside = path.with_suffix(".json")
-    try:
-        description = json.loads(read_file(beside))
-    except OSError as error:
-        raise CheckpointError(
-            f"{beside}: cannot be read ({error.strerror}); expected the description of a {kind}"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{beside}: is not JSON ({error})") from error
-    if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise CheckpointError(f"{beside}: is not a checkpoint description of format {FORMAT}")
-    if description.get("network") != kind:
-        raise CheckpointError(f"{beside}: describes a {description.get('network')!r}; expected a {kind!r}")
-    if world is not None and description.get("world") != world:
-        raise CheckpointError(f"{beside}: was trained for the world {description.get('world')!r}; expected {world!r}")
-    return description
-
-
 def load_network(
     path: Path, kind: str, build: Callable[[Any], Network], config: type[Any], world: str | None = None
 ) -> tuple[Network, dict[str, Any]]:
@@ -114,40 +85,16 @@ def load_network(
     Raises:
         CheckpointError: naming the file, what is wrong with it and what was expected.
     """
-    description = load_description(path, kind, world)
+    settings, arrays, description = read_weights(path, kind, config, world)
     try:
-        network = build(config_from_dict(config, _without_retired(kind, description.get("config"))))
+        network = build(settings)
     except (ValueError, RuntimeError, TypeError) as error:  # the latter two: sizes that no memory holds
         raise CheckpointError(f"{path.with_suffix('.json')}: {' '.join(str(error).split())}") from error
     try:
-        content = read_file(path)
-        tensors = load(content)
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
-    except safetensors.SafetensorError as error:
-        raise CheckpointError(f"{path}: is damaged or no safetensors file ({error})") from error
-    if hashlib.sha256(content).hexdigest() != description.get("sha256"):
-        raise CheckpointError(
-            f"{path}: is not the file that {path.with_suffix('.json').name} describes (sha256 differs)"
-        )
-    try:
-        network.load_state_dict(tensors)
+        network.load_state_dict({name: torch.tensor(array) for name, array in arrays.items()})
     except RuntimeError as error:
         raise CheckpointError(f"{path}: does not fit its configuration ({' '.join(str(error).split())})") from error
-    if broken := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
-        raise CheckpointError(f"{path}: has weights that are not finite in {', '.join(broken)}")
     return network.eval().requires_grad_(False), description
-
-
-def _without_retired(kind: str, values: Any) -> Any:
-    """The values of a configuration without settings that this version no longer has."""
-    if not isinstance(values, dict):
-        return values
-    retired = RETIRED_SETTINGS.get(kind, {})
-    for name, meant in retired.items():
-        if (value := values.get(name, meant)) is not meant:
-            raise ValueError(f"{name} is {value!r}, which this version no longer has; expected {meant!r}, or none")
-    return {name: value for name, value in values.items() if name not in retired}
 
 
 def load_local(weights: Path, world: str | None = None) -> tuple[LocalPoseNetwork, dict[str, Any]]:
@@ -193,12 +140,6 @@ def load_familiarity(weights: Path, world: str | None = None) -> Familiarity | N
         if description.get(f"{kind}_sha256") != load_description(weights / f"{kind}.safetensors", kind)["sha256"]:
             raise CheckpointError(f"{path}: was fitted to another {kind} than the one beside it; fit it again")
     return familiarity
-
-
-def load_step_deviation(weights: Path, world: str | None = None) -> StepDeviation:
-    """The network in the folder ``weights`` that scales deviations of a lidar's steps."""
-    path = weights / f"{STEP_DEVIATION}.safetensors"
-    return load_network(path, STEP_DEVIATION, StepDeviation, StepDeviationConfig, world)[0]
 
 
 def write_untrained(weights: Path, world: str, image: ImageFormat | None = None) -> None:

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import STEP_DEVIATION, CheckpointError, load_step_deviation, save_checkpoint
-from ngo_estimator.networks.step_deviation import STEP_EVIDENCE, UNSURE, StepDeviation, StepDeviationConfig
-from ngo_estimator.odometry.step_evidence import StepScaling
+from ngo_estimator.checkpoint import save_checkpoint
+from ngo_estimator.data.weights_file import CheckpointError
+from ngo_estimator.networks.step_deviation import StepDeviation
+from ngo_estimator.networks.step_scaling import (
+    STEP_DEVIATION,
+    STEP_EVIDENCE,
+    UNSURE,
+    StepDeviationConfig,
+    StepScaling,
+)
 
 
 def evidence(steps: int) -> np.ndarray:
@@ -26,16 +33,20 @@ def trained() -> StepDeviation:
     return network.requires_grad_(False)
 
 
+def in_numpy(network: StepDeviation) -> StepScaling:
+    return StepScaling(network.config, {name: value.detach().numpy() for name, value in network.state_dict().items()})
+
+
 def test_untrained_factors_are_one() -> None:
     network = StepDeviation(StepDeviationConfig())
     assert (network(torch.from_numpy(evidence(20)).float()) == 0.0).all()
-    assert (StepScaling(network).factors(evidence(1)[0]) == 1.0).all()
+    assert (in_numpy(network).factors(evidence(1)[0]) == 1.0).all()
 
 
 def test_one_step_in_numpy_equals_many_in_torch() -> None:
     network, steps = trained(), evidence(50)
     expected = network.double()(torch.from_numpy(steps)).exp().numpy()[:, [0, 0, 1]]
-    scaling = StepScaling(network)
+    scaling = in_numpy(network)
     np.testing.assert_allclose(np.stack([scaling.factors(step) for step in steps]), expected, rtol=1e-6)
     assert np.ptp(expected[:, 0]) > 0.5
 
@@ -43,27 +54,34 @@ def test_one_step_in_numpy_equals_many_in_torch() -> None:
 def test_factors_stay_within_their_limit() -> None:
     network = trained()
     network.head.bias += 100.0
-    factors = StepScaling(network).factors(evidence(1)[0])
+    factors = in_numpy(network).factors(evidence(1)[0])
     np.testing.assert_allclose(factors, network.config.largest, rtol=1e-6)
 
 
 def test_an_unsure_step_keeps_its_deviations() -> None:
     network, step = trained(), evidence(1)[0]
     step[UNSURE] = 1.0
-    assert (StepScaling(network).factors(step) == 1.0).all()
+    assert (in_numpy(network).factors(step) == 1.0).all()
     assert (network(torch.from_numpy(step).float()) == 0.0).all()
 
 
 def test_weights_survive_the_disk_and_damage_is_noticed(tmp_path: Path) -> None:
-    network, path = trained(), tmp_path / f"{STEP_DEVIATION}.safetensors"
+    network, path, step = trained(), tmp_path / f"{STEP_DEVIATION}.safetensors", evidence(1)[0]
     save_checkpoint(path, network, STEP_DEVIATION, "scan", {})
-    loaded = load_step_deviation(tmp_path, "scan")
-    assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in network.state_dict().items())
+    assert (StepScaling.load(tmp_path, "scan").factors(step) == in_numpy(network).factors(step)).all()
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(bytes(content))
     with pytest.raises(CheckpointError, match="sha256"):
-        load_step_deviation(tmp_path, "scan")
+        StepScaling.load(tmp_path, "scan")
+
+
+def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
+    network = trained()
+    network.head = torch.nn.Linear(16, 3)
+    save_checkpoint(tmp_path / f"{STEP_DEVIATION}.safetensors", network, STEP_DEVIATION, "scan", {})
+    with pytest.raises(CheckpointError, match="does not fit its configuration"):
+        StepScaling.load(tmp_path)
 
 
 @pytest.mark.parametrize("settings", [{"hidden": 0}, {"largest": 1.0}, {"largest": float("inf")}])

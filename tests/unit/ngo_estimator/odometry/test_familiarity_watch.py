@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import FAMILIARITY, CheckpointError, load_familiarity, load_local, load_place
+from ngo_estimator.checkpoint import FAMILIARITY, load_familiarity, load_local, load_place
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive

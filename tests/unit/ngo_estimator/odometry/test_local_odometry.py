@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_local, write_untrained
+from ngo_estimator.checkpoint import PlaceNetworks, load_local, write_untrained
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import SmootherConfig

@@ -9,8 +9,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ngo_estimator.checkpoint import CheckpointError, write_untrained
+from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RejectedStep, RelativeStep
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate

@@ -92,8 +92,9 @@ def scan_source(weights: Path, world: str | None = None, max_range_m: float = 0.
     if is_lidar(weights):
         return KeyScans(max_range_m)
     # Imported here because torch takes seconds, and a lidar needs none.
-    from ngo_estimator.checkpoint import PLACE, load_description
+    from ngo_estimator.checkpoint import PLACE
     from ngo_estimator.data.configuration import config_from_dict
+    from ngo_estimator.data.weights_file import load_description
     from ngo_estimator.networks.place_encoder import PlaceConfig
 
     description = load_description(weights / f"{PLACE}.safetensors", PLACE, world)

@@ -8,16 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.checkpoint import load_step_deviation
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, between, compose, turned_covariance
 from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep, key_scan
-from ngo_estimator.networks.step_deviation import StepDeviation
+from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
-from ngo_estimator.odometry.step_evidence import StepScaling
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry, WheelOdometryConfig
 from ngo_recordings.scan_stream import LidarScan
 
@@ -89,15 +87,15 @@ class LidarOdometry:
         self,
         config: LidarOdometryConfig | None = None,
         mounting: Mounting | None = None,
-        deviation: StepDeviation | None = None,
+        scaling: StepScaling | None = None,
     ) -> None:
         self.config = config or LidarOdometryConfig()
-        if self.config.learned_deviation != (deviation is not None):
+        if self.config.learned_deviation != (scaling is not None):
             raise ValueError(
-                f"learned_deviation is {self.config.learned_deviation}, and the network is {deviation}; expected both "
+                f"learned_deviation is {self.config.learned_deviation}, and the network is {scaling}; expected both "
                 "or neither"
             )
-        self._scaling = None if deviation is None else StepScaling(deviation)
+        self._scaling = scaling
         self.mounting = mounting or Mounting(np.zeros(3))
         """Where the sensor sits on the robot; may be set until the first scan comes."""
         self.restarts = 0
@@ -112,7 +110,7 @@ class LidarOdometry:
             LidarFileError, CheckpointError: of one clear line.
         """
         config = read_lidar_file(weights, "odometry", LidarOdometryConfig, world)
-        return cls(config, deviation=load_step_deviation(weights, world) if config.learned_deviation else None)
+        return cls(config, scaling=StepScaling.load(weights, world) if config.learned_deviation else None)
 
     def reset(self) -> None:
         """Forget everything: the next scan is the new origin of ``odom``."""

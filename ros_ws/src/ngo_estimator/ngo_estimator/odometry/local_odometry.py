@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ngo_estimator.checkpoint import CheckpointError, PlaceNetworks, load_familiarity, load_local, load_place
+from ngo_estimator.checkpoint import PlaceNetworks, load_familiarity, load_local, load_place
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.familiarity import Familiarity
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork

@@ -13,10 +13,10 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, search
 from ngo_estimator.geometry.planar_motion import Array, between, turned_covariance, wrap
 from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
-from ngo_estimator.networks.step_deviation import STEP_EVIDENCE
+from ngo_estimator.networks.step_scaling import STEP_EVIDENCE, StepScaling
 from ngo_estimator.odometry.local_submap import LocalSubmap
 from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
-from ngo_estimator.odometry.step_evidence import StepScaling, step_evidence
+from ngo_estimator.odometry.step_evidence import step_evidence
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 

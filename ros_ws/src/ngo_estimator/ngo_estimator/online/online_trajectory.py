@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from safetensors.torch import save
 
-from ngo_estimator.checkpoint import CheckpointError, load_optimizer, load_place
+from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
+from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.localisation import Localiser
