@@ -1,12 +1,14 @@
 """What nodes compile before the first frame comes."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ngo_estimator.geometry import branch_and_bound, scan_matching, scan_points, scan_registration_kernels
-from ngo_estimator.offline.warm_up import warm_up, warm_up_networks
+from ngo_estimator.offline.warm_up_trajectory import warm_up_networks, warm_up_scans
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer import block_cholesky, compiled_closing, shared_views_kernel
 from tests.unit.ngo_estimator.online.test_online_trajectory import make_steps
@@ -16,9 +18,21 @@ WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 
 
 def test_registration_and_the_search_for_loops_are_compiled() -> None:
-    warm_up()
+    warm_up_scans()
     for function in (scan_points._thinned, scan_points._normals, scan_matching._icp, branch_and_bound._best_first):
         assert function.signatures, function
+
+
+def test_the_odometry_of_a_lidar_does_without_torch() -> None:
+    program = f"""
+import sys
+from pathlib import Path
+from ngo_estimator.nodes.lidar_input import LidarOdometry, warm_up_odometry
+LidarOdometry.load(Path({str(WEIGHTS / "scan")!r}), "scan")
+warm_up_odometry()
+assert "torch" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @pytest.mark.parametrize("world", ["maze2d", "maze3d"])

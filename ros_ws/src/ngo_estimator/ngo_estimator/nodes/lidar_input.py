@@ -20,7 +20,7 @@ from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import compiling, load_core
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
-from ngo_estimator.offline.warm_up import warm_up
+from ngo_estimator.offline.warm_up import warm_up_odometry
 from ngo_recordings.association import ros_pose
 from ngo_recordings.mounting import mounting_in
 from ngo_recordings.poses import TransformTree
@@ -44,7 +44,7 @@ class LidarInput:
         self._node, self._settings, self._publish = node, settings, publish
         self._core = load_core(LidarOdometry.load, settings)
         with compiling(node.get_logger()):
-            warm_up()
+            warm_up_odometry()
         self._base_frame = settings.framed(settings.base_frame)
         self._odom_frame = settings.framed(settings.odom_frame)
         self._static = TransformTree(0)

@@ -62,14 +62,14 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
     All that it runs is compiled by then, which ``logger`` tells where it takes long.
     """
     # Imported here because torch takes seconds: a bad parameter is said at once.
-    from ngo_estimator.offline.warm_up import warm_up, warm_up_networks
+    from ngo_estimator.offline.warm_up_trajectory import warm_up_networks, warm_up_scans
     from ngo_estimator.online.online_trajectory import OnlineTrajectory
     from ngo_estimator.online.scan_trajectory import ScanTrajectory
 
     def load(folder: Path, world: str) -> "CorrectedTrajectory":
         if is_lidar(folder):
             with compiling(logger):
-                warm_up()
+                warm_up_scans()
             return ScanTrajectory.load(folder, world, settings.iterations_per_step)
         online = OnlineTrajectory.load(
             folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
