@@ -121,7 +121,7 @@ def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
     steps, _ = drive(LAP + 160)
     at_once = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16)
     spread = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=per_step)
-    later = -(-spread._graph.work // max(2, per_step)) - 1  # with one it would not be done in time
+    later = -(-spread._graph.work // per_step) - 1
     for count, step in enumerate(steps, start=1):
         expected, update = at_once.update(step), spread.update(step)
         assert update.optimized == (count >= 8 and count % 8 == later)

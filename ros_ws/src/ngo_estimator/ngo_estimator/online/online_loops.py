@@ -209,11 +209,12 @@ class OnlineLoops:
             return KeptLoops.none()
         end, last = block + 1, (block + 1) * self._block - 1
         before = self._kept.overlap & (self._kept.end == end) & (self._kept.start >= first)
-        self._kept = self._kept.where(~before)
+        if before.any():
+            self._kept = self._kept.where(~before)
         in_window = np.arange(max(1, first), end - self._search.min_separation + 1)
-        # The origin has no code of its own.
-        frames = [] if keys is None else [keys.frame(k) for k in range(len(keys)) if keys.nodes[k]]
-        earlier = np.concatenate((np.array([key.node for key in frames], np.int64), in_window))
+        # The origin, the first key frame, has no code of its own.
+        frames = [] if keys is None else [keys.frame(k) for k in range(1, len(keys))]
+        earlier = in_window if keys is None else np.concatenate((keys.nodes[1:], in_window))
         if len(earlier) == 0:
             return KeptLoops.none()
         codes = np.concatenate(
