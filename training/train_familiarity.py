@@ -165,7 +165,7 @@ def see(networks: Networks, config: FamiliarityConfig, drive: SensedDrive) -> Se
         some = None if actions is None else actions[at], None if twists is None else twists[at]
         relative, _, motion = networks.local(earlier, later, *some)
         told = told_vector(config, *some, len(at))
-        parts.append((look(networks.place.encoder, later), motion, told, relative, change(earlier, later)))
+        parts.append((look(networks.place.encoder.early(later)), motion, told, relative, change(earlier, later)))
     looks, motions, told_steps, relatives, changes = (torch.cat(column) for column in zip(*parts, strict=True))
     return Seen(looks, motions, told_steps, relatives, changes, relative_poses(drive.poses_xyyaw))
 

@@ -33,8 +33,9 @@ class LocalOdometry:
     def __init__(
         self, network: LocalPoseNetwork, place: PlaceNetworks, world: str, familiarity: Familiarity | None = None
     ) -> None:
-        self._network = network.eval()
-        self._encoder = place.encoder.eval()
+        # As the images lie, so that no convolution has to turn its weights round each time.
+        self._network = network.eval().to(memory_format=torch.channels_last)
+        self._encoder = place.encoder.eval().to(memory_format=torch.channels_last)
         self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self._encoder)
         self.world = world
         self.restarts = 0
@@ -150,13 +151,14 @@ class LocalOdometry:
             twists = torch.tensor(np.asarray(twist)[None], dtype=torch.float32)
         with torch.inference_mode():
             relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
-            code = self._encoder(frame)
+            early = self._encoder.early(frame)
+            code = self._encoder.code_of(frame, early)
         variance, unlikeness, repeated = torch.exp(2.0 * log_std[0].double()), 0.0, False
         if self._watch is not None:
             if missed:
                 self._watch.forget_actions()
             step = relative, variance.unsqueeze(0), feature
-            judged = self._watch.judge((self._last_image, frame), (action, twist), step)
+            judged = self._watch.judge((self._last_image, frame), early, (action, twist), step)
             unlikeness, repeated = judged.unlikeness, judged.repeated
             relative, variance = torch.from_numpy(judged.relative).unsqueeze(0), torch.from_numpy(judged.variance)
         # A pair further apart than in training: the network's own belief holds no longer, so a typical step for every
