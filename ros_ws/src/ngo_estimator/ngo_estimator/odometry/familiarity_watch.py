@@ -89,9 +89,7 @@ class FamiliarityWatch:
         relative, variance, feature = step
         changed = change(*images)
         with torch.inference_mode():
-            distances = self._familiarity.distances(
-                look(early), feature.float(), known, relative.float(), changed
-            )[0]
+            distances = self._familiarity.distances(look(early), feature.float(), known, relative.float(), changed)[0]
             other = self._familiarity.told_motion(known)[0].double().numpy()
         return self._judged(distances.double().numpy(), float(changed), other, relative[0], variance[0])
 
