@@ -33,9 +33,10 @@ class LocalOdometry:
     def __init__(
         self, network: LocalPoseNetwork, place: PlaceNetworks, world: str, familiarity: Familiarity | None = None
     ) -> None:
-        # As the images lie, so that no convolution has to turn its weights round each time.
-        self._network = network.eval().to(memory_format=torch.channels_last)
-        self._encoder = place.encoder.eval().to(memory_format=torch.channels_last)
+        self._network, self._encoder = network.eval(), place.encoder.eval()
+        for module in (self._network, self._encoder):
+            # As the images lie, so that no convolution has to turn its weights round each time.
+            module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self._encoder)
         self.world = world
         self.restarts = 0

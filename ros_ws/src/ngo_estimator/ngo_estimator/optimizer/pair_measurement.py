@@ -166,7 +166,9 @@ def _fused(measured: Tensor, log_scale: Tensor) -> PairMeasurement:
     # The compiler's library takes 100 MB: only those pay for it that fuse.
     from ngo_estimator.optimizer.view_fusion_kernel import fuse
 
-    shape = measured.shape[1:-1]
-    given = (rows.detach().double().reshape(len(rows), -1, rows.shape[-1]).numpy() for rows in (measured, log_scale))
-    fused = fuse(*given, _REWEIGHTINGS, SMALLEST_SPREAD)
+    views, *shape, _ = measured.shape
+    poses, scales = (
+        rows.detach().double().reshape(views, -1, rows.shape[-1]).numpy() for rows in (measured, log_scale)
+    )
+    fused = fuse(poses, scales, _REWEIGHTINGS, SMALLEST_SPREAD)
     return PairMeasurement(*(torch.from_numpy(rows).to(measured.dtype).reshape(*shape, -1) for rows in fused))
