@@ -89,8 +89,9 @@ class _Corrections:
     def for_blocks(self, first: int, last: int) -> list[Correction]:
         """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
         stiffness, adjustment = self.stiffness[:, first - self.first :], self.adjustment[:, first - self.first :]
-        new = ((0, 0), (0, last - first - stiffness.shape[1]), (0, 0))
-        rows = np.pad(adjustment, new), np.pad(stiffness, new, mode="edge")
+        iterations, seen, _ = stiffness.shape
+        new = np.zeros((iterations, last - first - seen, 3), np.float32)
+        rows = np.hstack((adjustment, new)), np.hstack((stiffness, new + stiffness[:, -1:]))
         pairs = zip(*(torch.from_numpy(array).unsqueeze(1) for array in rows), strict=True)
         return [Correction(*pair) for pair in pairs]
 

@@ -20,7 +20,7 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.place_map import PlaceMap
-from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
 from ngo_estimator.optimizer.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
 from ngo_estimator.optimizer.place_ambiguity import looks_like_everything, places_by_odometry
@@ -146,12 +146,12 @@ class OnlineLoops:
     def _most_similar(self, similarity: np.ndarray, blocks: np.ndarray, count: int) -> list[tuple[int, int, float]]:
         """Index in ``blocks``, frame of the block and value of the best of ``similarity`` ``(n, frames)``."""
         similarity = np.where(similarity == 0.0, -np.inf, similarity)  # frames that close no loops
-        best = torch.from_numpy(similarity.max(axis=1))
-        apart = self._search.min_apart
-        values, at = each_from_elsewhere(best, min(count, len(best)), apart, -torch.inf, torch.from_numpy(blocks))
-        step = similarity.argmax(axis=1)
-        found = zip(at.tolist(), values.tolist(), strict=True)
-        return [(index, int(step[index]), value) for index, value in found if value > -np.inf]
+        best, found = similarity.max(axis=1), []
+        # As ``each_from_elsewhere``, whose calls of torch cost more than their arithmetic for a single row.
+        while len(found) < min(count, len(best)) and (value := float(best[index := int(best.argmax())])) > -np.inf:
+            found.append((index, int(similarity[index].argmax()), value))
+            best[np.abs(blocks - blocks[index]) <= self._search.min_apart] = -np.inf
+        return found
 
     def _in_window(self, node: int, frame: int, similarity: float, last: int, offsets: _Offsets) -> _EarlierFrame:
         """A frame of the window, seen from ``node``; ``last`` is the newest frame."""
