@@ -94,11 +94,15 @@ class OnlineLoops:
     def append(self, place_code: np.ndarray) -> None:
         """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
         self._codes.append(place_code)
-        if not place_code.any():  # like nothing, not even like other such codes
-            self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
-            return
-        with torch.inference_mode():
-            self._embeddings.append(self._pair_head.embed(torch.from_numpy(self._codes.slice(len(self._codes) - 1))[0]))
+        # ``find`` embeds all frames of a block at once.
+        self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
+
+    def _embed(self, first: int) -> None:
+        """Embed the codes after the steps from number ``first`` on."""
+        codes = self._codes.slice(first)
+        embeddings = self._pair_head.embed(torch.from_numpy(codes)).numpy()
+        embeddings[~codes.any(axis=1)] = 0.0  # like nothing, not even like other such codes
+        self._embeddings.replace(first, embeddings)
 
     def codes(self, first: int) -> np.ndarray:
         """Place codes ``(n, code_length)`` of the frames after the steps from number ``first`` on, without a copy."""
@@ -114,6 +118,7 @@ class OnlineLoops:
             first: number of the first block in the window.
         """
         end, last = block + 1, block * self._block + self._block - 1
+        self._embed(block * self._block)
         embedding = self._embeddings.slice(last)[0]
         if not embedding.any():
             return KeptLoops.none()
