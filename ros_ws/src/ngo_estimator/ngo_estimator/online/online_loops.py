@@ -151,7 +151,8 @@ class OnlineLoops:
     def _most_similar(self, similarity: np.ndarray, blocks: np.ndarray, count: int) -> list[tuple[int, int, float]]:
         """Index in ``blocks``, frame of the block and value of the best of ``similarity`` ``(n, frames)``."""
         similarity = np.where(similarity == 0.0, -np.inf, similarity)  # frames that close no loops
-        best, found = similarity.max(axis=1), []
+        best = similarity.max(axis=1)
+        found: list[tuple[int, int, float]] = []
         # As ``each_from_elsewhere``, whose calls of torch cost more than their arithmetic for a single row.
         while len(found) < min(count, len(best)) and (value := float(best[index := int(best.argmax())])) > -np.inf:
             found.append((index, int(similarity[index].argmax()), value))
