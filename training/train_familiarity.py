@@ -166,7 +166,7 @@ def see(networks: Networks, config: FamiliarityConfig, drive: SensedDrive) -> Se
         told = told_vector(config, *some, len(at))
         parts.append(
             (
-                look(networks.place.encoder, later),
+                look(networks.place.encoder.early(later)),
                 told,
                 change(earlier, later),
                 *networks.local(earlier, later, *some),

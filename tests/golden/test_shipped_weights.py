@@ -115,7 +115,7 @@ def test_an_update_from_the_last_solution_on_gives_what_one_from_the_odometry_gi
     ) -> Iterator[OptimizedMetaPoses]:
         if solution is None:
             return iterate(given, loops, corrections)
-        (resumed,) = iterate(given, loops, corrections, solution)
+        *_, resumed = iterate(given, loops, corrections, solution)
         *_, anew = iterate(given, loops, corrections)
         poses, expected = (se2.r2g(result.meta_relative[-1][0].double()) for result in (resumed, anew))
         moved_m.append(float((poses - expected)[:, :2].norm(dim=1).max()))

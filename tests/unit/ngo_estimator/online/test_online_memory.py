@@ -121,7 +121,7 @@ def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
     steps, _ = drive(LAP + 160)
     at_once = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16)
     spread = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=per_step)
-    later = -(-spread._graph.work // max(2, per_step)) - 1  # with one it would not be done in time
+    later = -(-spread._graph.work // per_step) - 1
     for count, step in enumerate(steps, start=1):
         expected, update = at_once.update(step), spread.update(step)
         assert update.optimized == (count >= 8 and count % 8 == later)
@@ -132,6 +132,19 @@ def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
             a, b = spread.trajectory(), at_once.trajectory()
             assert a is not None and b is not None
             np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
+
+
+def test_each_step_does_one_part_of_an_update_where_that_is_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    spread = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=1)
+    graph, parts = spread._graph, [0]
+    do, iterate = graph._do, graph._iterate
+    monkeypatch.setattr(graph, "_do", lambda part: (do(part), parts.append(parts.pop() + 1)))
+    monkeypatch.setattr(graph, "_iterate", lambda: (iterate(), parts.append(parts.pop() + 1)))
+    assert graph.work == 8  # steps in a block
+    for count, step in enumerate(drive(LAP)[0], start=1):
+        spread.update(step)
+        assert parts == [int(count >= 8)], count
+        parts[0] = 0
 
 
 def test_more_iterations_than_steps_in_a_block_are_done_before_the_next_block() -> None:

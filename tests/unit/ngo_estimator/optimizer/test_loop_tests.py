@@ -1,5 +1,6 @@
 """Loops are tested against the odometry between their poses, and frames against looking like every place."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.online import online_loops
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.optimizer import compiled_closing
+from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.meta_poses import MetaSteps
 from ngo_estimator.optimizer.odometry_test import FARTHEST, without_contradictions
 from ngo_estimator.optimizer.place_ambiguity import FEWEST_PLACES, looks_like_everything, places_by_odometry
@@ -44,14 +47,17 @@ def test_no_number_of_loops_wins_over_confident_odometry(
     assert believed == 0 and abs(x - STEPS * STEP_M) < 3.0 * max(deviation, 0.02)
 
 
-def test_loops_are_measured_in_deviations_of_the_odometry_between_their_poses() -> None:
+@pytest.mark.parametrize("test", [without_contradictions, compiled_closing.without_contradictions])
+def test_loops_are_measured_in_deviations_of_the_odometry_between_their_poses(
+    test: Callable[[Loops, MetaSteps], Loops],
+) -> None:
     steps = MetaSteps(torch.tensor([[[1.0, 0.0, 0.0]] * 16]), torch.full((1, 16, 3), 0.01), None, 16)
     deviation = 0.01 * 16**0.5
     within, beyond = 16.0 - 0.9 * FARTHEST * deviation, 16.0 - 1.1 * FARTHEST * deviation
     loops = make_loops([0] * 4, [15] * 4, torch.tensor([[x, 0.0, 0.0] for x in (16.0, within, beyond, 0.0)])[None])
-    assert without_contradictions(loops, steps).valid.tolist() == [[True, True, False, False]]
+    assert test(loops, steps).valid.tolist() == [[True, True, False, False]]
     unsure = MetaSteps(steps.relative, 100.0 * steps.std, None, 16)
-    assert without_contradictions(loops, unsure).valid.all()
+    assert test(loops, unsure).valid.all()
 
 
 def test_a_frame_like_many_places_tells_none_and_a_robot_that_stood_long_is_no_such_frame() -> None:

@@ -15,7 +15,7 @@ from ngo_estimator.networks.pose_aggregation import poses_in_blocks
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.overlaps import OVERLAP_LOGIT, find_overlaps, shared_views
-from ngo_estimator.optimizer.pair_measurement import PairViews, measure_overlaps
+from ngo_estimator.optimizer.pair_measurement import PairViews, fuse_views, measure_overlaps
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera, seen_by_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, with_origin
 
@@ -186,3 +186,14 @@ def test_in_a_pause_none_are_looked_for() -> None:
     errors = [online(overlaps, 640, 160, first=159) for overlaps in (0, 40)]
     assert errors[0] == errors[1]
     assert online(40, 640, 160) < 0.7 * errors[0]
+
+
+def test_views_are_fused_to_the_same_where_nobody_asks_for_a_gradient() -> None:
+    generator = torch.Generator().manual_seed(20000)
+    measured = torch.randn(5, 2, 3, 3, generator=generator)
+    measured[..., 2] += math.pi
+    log_scale = torch.randn(5, 2, 3, 2, generator=generator)
+    expected = fuse_views(measured.clone().requires_grad_(), log_scale)
+    for fused, same in zip(fuse_views(measured, log_scale), expected, strict=True):
+        assert fused.shape == same.shape and fused.dtype == same.dtype
+        torch.testing.assert_close(fused, same.detach(), atol=1e-5, rtol=1e-5)

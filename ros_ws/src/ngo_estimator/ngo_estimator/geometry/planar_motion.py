@@ -44,6 +44,15 @@ def all_between(a: Array, b: Array) -> Array:
 
 
 @njit(cache=True)
+def chained(relative: Array) -> Array:
+    """Poses ``(n + 1, 3)``, the origin in front, of relative ones ``(n, 3)``, each seen from the one before."""
+    poses = np.zeros((len(relative) + 1, 3))
+    for k in range(len(relative)):
+        poses[k + 1] = compose(poses[k], relative[k])
+    return poses
+
+
+@njit(cache=True)
 def rotated(yaw: float, xy: Array) -> Array:
     """Vectors ``(n, 2)`` turned by ``yaw``."""
     cos, sin = math.cos(yaw), math.sin(yaw)

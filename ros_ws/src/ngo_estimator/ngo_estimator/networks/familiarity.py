@@ -135,12 +135,11 @@ class Familiarity(nn.Module):
         return torch.stack((look, motion, apart, changed), dim=-1)
 
 
-def look(encoder: PlaceEncoder, images: Tensor) -> Tensor:
-    """Statistics ``(n, look_size)`` of the early features of images ``(n, height, width, channels)``.
+def look(early: Tensor) -> Tensor:
+    """Statistics ``(n, look_size)`` of a place encoder's early features ``(n, channels, ...)`` of images.
 
     Mean and deviation of each channel in columns of the picture, on a logarithmic scale.
     """
-    early = encoder.early(images)
     early = early if early.dim() == 4 else early.unsqueeze(2)  # a row has no height
     parts = [
         stat for part in early.tensor_split(_COLUMNS, dim=-1) for stat in (part.mean((-1, -2)), part.std((-1, -2)))

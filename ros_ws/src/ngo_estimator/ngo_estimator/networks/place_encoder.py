@@ -122,7 +122,11 @@ class PlaceEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Observations ``(batch, height, width, channels)`` to codes ``(batch, code_length)``."""
-        code, seen = self.see(images)
+        return self.code_of(images, self.early(images))
+
+    def code_of(self, images: Tensor, early: Tensor) -> Tensor:
+        """The codes of observations of which the ``early`` features are known."""
+        code, seen = self._see(early)
         if self.config.registration is None:
             return code
         if seen is not None:
@@ -132,7 +136,9 @@ class PlaceEncoder(nn.Module):
 
     def see(self, images: Tensor) -> tuple[Tensor, SeenRanges | None]:
         """What is learned of observations: the first ``code_size`` numbers of their codes, and ranges of pictures."""
-        early = self.early(images)
+        return self._see(self.early(images))
+
+    def _see(self, early: Tensor) -> tuple[Tensor, SeenRanges | None]:
         code = self.code(self.convolutions.late(early)).float()
         return code, self.ranges(early) if self.config.sees_ranges else None
 

@@ -12,8 +12,8 @@ from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.mapping.map_files import write_map
 from ngo_estimator.mapping.scan_map import ScanMap
 from ngo_estimator.mapping.scan_source import ScanSource
-from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.path_message import PathWriter
+from ngo_estimator.nodes.step_messages import TYPES, StepMessages
 from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
 from ngo_estimator.online.trajectory_update import Trajectory
 from ngo_estimator.trajectory.errors import aligned, associate
@@ -22,7 +22,6 @@ from ngo_estimator.trajectory.plot import save_plot
 from ngo_estimator.trajectory.report import Report, ReportSettings, trajectory_report
 from ngo_recordings.writer import RecordingWriter
 
-ODOMETRY, POSE, TF = "/odom", "/ngo/pose", "/tf"
 PATHS = {"odometry": "/odom/path", "corrected": "/ngo/path", "truth": "/ground_truth/path"}
 PART = "part"
 """Folders of the second trajectory of a recording and those after it have this name, and a number."""
@@ -39,11 +38,6 @@ _FILES = (
     "metrics.json",
     "run.json",
 )
-_TYPES = {
-    ODOMETRY: "nav_msgs/msg/Odometry",
-    POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
-    TF: "tf2_msgs/msg/TFMessage",
-}
 _PATH_TYPE = "nav_msgs/msg/Path"
 
 
@@ -68,14 +62,15 @@ class RecordedOutput:
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self._frames = {"base": base_frame, "odom": odom_frame, "map": map_frame}
+        self._frames = {"odom": odom_frame, "map": map_frame}
+        self._messages = StepMessages(base_frame, odom_frame, map_frame, self._serialise)
         self._covariance = np.zeros((3, 3))
         self._source, self._map = source, ScanMap()
         self.left_out = ""
         """Why scans are not in the map, where any were left out."""
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = RecordingWriter(folder / "trajectories.mcap", flush_s=None, library="ngo_estimator")
-        for topic, type_name in _TYPES.items():
+        for topic, type_name in TYPES.items():
             self._writer.add_topic(topic, type_name)
 
     def __enter__(self) -> "RecordedOutput":
@@ -88,16 +83,10 @@ class RecordedOutput:
 
     def add(self, step: RecordedStep) -> None:
         """Write the messages that the nodes publish about a step."""
-        local, update, frames = step.local, step.update, self._frames
+        local = step.local
         self._covariance = propagate(self._covariance, local.odom_xyyaw, local.relative_xyyaw, local.covariance)
-        stamp_ns, odom, map_frame = local.stamp_ns, frames["odom"], frames["map"]
-        odometry = messages.odometry_message(local, self._covariance, odom, frames["base"])
-        pose = messages.pose_message(stamp_ns, map_frame, update.pose_xyyaw, update.covariance)
-        transforms = messages.transform_message(stamp_ns, map_frame, odom, update.map_from_odom_xyyaw)
-        below = messages.transform_message(stamp_ns, odom, frames["base"], local.tf_odom_xyyaw)
-        transforms.transforms = [*transforms.transforms, *below.transforms]
-        for topic, message in ((ODOMETRY, odometry), (POSE, pose), (TF, transforms)):
-            self._writer.write(topic, self._serialise(message, _TYPES[topic]), stamp_ns)
+        for topic, message in self._messages.of(local, self._covariance, step.update).items():
+            self._writer.write(topic, message, local.stamp_ns)
         if self._source is not None:
             self._map.take(local, self._source.scans(local))
 

@@ -68,12 +68,17 @@ class FamiliarityWatch:
         self._actions = [NO_ACTION] * HISTORY
 
     def judge(
-        self, images: tuple[Tensor, Tensor], told: tuple[int | None, np.ndarray | None], step: tuple[Tensor, ...]
+        self,
+        images: tuple[Tensor, Tensor],
+        early: Tensor,
+        told: tuple[int | None, np.ndarray | None],
+        step: tuple[Tensor, ...],
     ) -> Judged:
         """Judge a step.
 
         Args:
             images: the earlier and the later observation ``(1, height, width, channels)``.
+            early: the place encoder's early features of the later one.
             told: action and mean velocity ``(3,)`` between them, where the networks take them.
             step: the network's motion ``(1, 3)``, variance ``(1, 3)`` and motion feature ``(1, motion_size)``.
         """
@@ -84,9 +89,7 @@ class FamiliarityWatch:
         relative, variance, feature = step
         changed = change(*images)
         with torch.inference_mode():
-            distances = self._familiarity.distances(
-                look(self._encoder, images[1]), feature.float(), known, relative.float(), changed
-            )[0]
+            distances = self._familiarity.distances(look(early), feature.float(), known, relative.float(), changed)[0]
             other = self._familiarity.told_motion(known)[0].double().numpy()
         return self._judged(distances.double().numpy(), float(changed), other, relative[0], variance[0])
 
@@ -106,7 +109,7 @@ class FamiliarityWatch:
             known = told_vector(self._config, None if actions is None else histories[at], None, len(at))
             changed = change(images[at], images[at + 1])
             with torch.inference_mode():
-                looks = look(self._encoder, images[at + 1])
+                looks = look(self._encoder.early(images[at + 1]))
                 distances = self._familiarity.distances(
                     looks, features[at].float(), known, relative[at].float(), changed
                 )

@@ -35,8 +35,10 @@ class LocalOdometry:
     def __init__(
         self, network: LocalPoseNetwork, place: PlaceNetworks, world: str, familiarity: Familiarity | None = None
     ) -> None:
-        self._network = network.eval()
-        self._encoder = place.encoder.eval()
+        self._network, self._encoder = network.eval(), place.encoder.eval()
+        for module in (self._network, self._encoder):
+            # As the images lie, so that no convolution has to turn its weights round each time.
+            module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self._encoder)
         self.world = world
         self.restarts = 0
@@ -154,7 +156,8 @@ class LocalOdometry:
             twists = torch.tensor(np.asarray(twist)[None], dtype=torch.float32)
         with torch.inference_mode():
             relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
-            code = self._encoder(frame)
+            early = self._encoder.early(frame)
+            code = self._encoder.code_of(frame, early)
             if missed:
                 self._steps.clear()
             else:
@@ -166,7 +169,7 @@ class LocalOdometry:
             if missed:
                 self._watch.forget_actions()
             step = relative, variance.unsqueeze(0), feature
-            judged = self._watch.judge((self._last_image, frame), (action, twist), step)
+            judged = self._watch.judge((self._last_image, frame), early, (action, twist), step)
             unlikeness, repeated = judged.unlikeness, judged.repeated
             relative, variance = torch.from_numpy(judged.relative).unsqueeze(0), torch.from_numpy(judged.variance)
         # A pair further apart than in training: the network's own belief holds no longer, so a typical step for every

@@ -14,7 +14,7 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.geometry.planar_motion import all_between, between, chained, compose
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
 from ngo_estimator.online.blind_stretches import shrunk_corrections, summed_variances
@@ -40,8 +40,8 @@ _AGAIN = 8
 _TOLD_LATE = 16
 """Frames before the first unfamiliar one that were taken for familiar and may not have been: a mean over them tells."""
 
-_LONG = 2
-"""Iterations that take as long as a search for loops."""
+_RESUMED = 2
+"""Iterations of an optimisation that goes on from the last solution."""
 
 _BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features", "familiar", "fixed")
 """Names of the newest rows: the first three and ``familiar`` of each step, the others of each block; without a network
@@ -89,8 +89,9 @@ class _Corrections:
     def for_blocks(self, first: int, last: int) -> list[Correction]:
         """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
         stiffness, adjustment = self.stiffness[:, first - self.first :], self.adjustment[:, first - self.first :]
-        new = ((0, 0), (0, last - first - stiffness.shape[1]), (0, 0))
-        rows = np.pad(adjustment, new), np.pad(stiffness, new, mode="edge")
+        iterations, seen, _ = stiffness.shape
+        new = np.zeros((iterations, last - first - seen, 3), np.float32)
+        rows = np.hstack((adjustment, new)), np.hstack((stiffness, new + stiffness[:, -1:]))
         pairs = zip(*(torch.from_numpy(array).unsqueeze(1) for array in rows), strict=True)
         return [Correction(*pair) for pair in pairs]
 
@@ -249,7 +250,7 @@ class MetaGraph:
         self._work = self._all_work()
 
     def _all_work(self) -> list[Callable[[int], None]]:
-        """What is to be done for a new block before it is optimised, each as long as ``_LONG`` iterations."""
+        """What is to be done for a new block before it is optimised."""
         looks_for_overlaps = self._optimizer.config.loops and self._optimizer.config.search.overlaps > 0
         overlaps = [self._find_again], [self._find_shared]
         again, shared = overlaps if looks_for_overlaps else ([], [])
@@ -257,8 +258,8 @@ class MetaGraph:
 
     @property
     def work(self) -> int:
-        """How much an update is, in iterations: taking in a block, preparing its optimisation, and that."""
-        return _LONG * len(self._all_work()) + 1 + self._optimizer.config.iterations
+        """The parts of an update: taking in a block, preparing its optimisation, and each iteration of that."""
+        return len(self._all_work()) + 1 + self._optimizer.config.iterations
 
     def _do(self, part: Callable[[int], None]) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""
@@ -399,8 +400,8 @@ class MetaGraph:
     def _slide(self) -> None:
         """Move the window by a block: its first node becomes a key frame."""
         node = self._first
-        ends = torch.from_numpy(self._nodes.values[[node, node + 1]])
-        relative, variance = se2.between(ends[0], ends[1]).numpy(), self._optimized_std.slice(node, node + 1)[0] ** 2
+        relative = between(*self._nodes.values[[node, node + 1]])
+        variance = self._optimized_std.slice(node, node + 1)[0] ** 2
         if self._loops is not None:
             self._keys.add(self._loops.key_frame(node, relative, variance))
         else:
@@ -499,32 +500,41 @@ class MetaGraph:
 
     def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
-        nodes = torch.from_numpy(self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))])
-        return se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
+        nodes = self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))]
+        return torch.from_numpy(all_between(nodes[:-1], nodes[1:])).unsqueeze(0)
 
     def _remembered(self) -> list[Correction] | None:
         """What the network gave lately; None where it is time to run it, or where there is none."""
         known = self._corrections
-        if known is None:
-            return None
-        seen = known.stiffness.shape[1]
-        new = self.blocks - known.first - seen
-        # A short trajectory changes a lot with each block.
-        return None if new >= min(self._network_every, 1 + seen // 8) else known.for_blocks(self._first, self.blocks)
+        return None if known is None or self._network_is_due else known.for_blocks(self._first, self.blocks)
 
-    def _iterate(self) -> int:
-        """Prepare an optimisation, or run its next iteration; how many iterations that counts for."""
+    @property
+    def _network_is_due(self) -> bool:
+        """Whether what the network gave is too old; a short trajectory changes a lot with each block."""
+        if self._corrections is None:
+            return True
+        seen = self._corrections.stiffness.shape[1]
+        return self.blocks - self._corrections.first - seen >= min(self._network_every, 1 + seen // 8)
+
+    def _iterate(self) -> None:
+        """Prepare an optimisation, or run its next iteration."""
         if self._running is None:
             self._prepare()
-            return 1
+            return
         self._running.result = next(self._running.iterations)
         self._running.taken += 1
-        # With the network it takes twice as long, and has a step of its own where the block has enough of them.
-        return _LONG if self._running.runs_network and self._running.result.left <= self._steps_left else 1
+
+    @property
+    def _parts_left(self) -> int:
+        """Parts of the update to come."""
+        if self._running is not None and self._running.result is not None:
+            return self._running.result.left
+        iterations = self._optimizer.config.iterations if self._network_is_due else _RESUMED
+        return len(self._work) + (self._running is None) + iterations
 
     @torch.inference_mode()
-    def advance(self, iterations: int) -> bool:
-        """Run so many iterations of what has begun, or what takes as long and comes before them.
+    def advance(self, parts: int) -> bool:
+        """Do so many parts of the update, or more where it would not be done before the next block is complete.
 
         Returns:
             Whether it is done, and every node at its new pose.
@@ -532,14 +542,12 @@ class MetaGraph:
         if not self._begun:
             raise RuntimeError("no optimisation has begun")
         began = time.perf_counter()
-        while iterations > 0:
+        steps_left = self._block - (len(self.odometry) - 1) % self._block
+        for _ in range(min(max(parts, -(-self._parts_left // steps_left)), self._parts_left)):
             if self._work:
                 self._do(self._work.pop(0))
-                iterations -= _LONG
-                continue
-            if self._running is not None and self._running.done:
-                break
-            iterations -= self._iterate()
+            else:
+                self._iterate()
         self._begun_s += time.perf_counter() - began
         running = self._running
         if running is None or running.result is None or not running.done:
@@ -554,11 +562,6 @@ class MetaGraph:
         self._pose, self._covariance = self._newest(end)
         self.optimized = True
         return True
-
-    @property
-    def _steps_left(self) -> int:
-        """Steps to come before the one that completes the next block, less one that is kept free."""
-        return max(0, self._block - 2 - (len(self.odometry) - 1) % self._block)
 
     @property
     def unfinished(self) -> bool:
@@ -583,12 +586,11 @@ class MetaGraph:
             self.loop_std = information.clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
             self.loop_weights = result.loop_weights[0].double().numpy()
             self._loops.weigh(running.numbers, self.loop_weights, information.numpy())
-        poses = se2.r2g(result.meta_relative[-1][0].double())
-        poses[:, 2] = se2.wrap(poses[:, 2])
+        poses = chained(result.meta_relative[-1][0].double().numpy())[1:]
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
         self._before = self._nodes.values[self._active]
-        moved = self._shrink(poses.numpy())
-        self._nodes.values[self._active[1:]] = poses.numpy()
+        moved = self._shrink(poses)
+        self._nodes.values[self._active[1:]] = poses
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._end, self._information = end, result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks

@@ -20,7 +20,7 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.place_map import PlaceMap
-from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, each_from_elsewhere, may_show_one_place
+from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, may_show_one_place
 from ngo_estimator.optimizer.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
 from ngo_estimator.optimizer.place_ambiguity import looks_like_everything, places_by_odometry
@@ -94,11 +94,15 @@ class OnlineLoops:
     def append(self, place_code: np.ndarray) -> None:
         """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
         self._codes.append(place_code)
-        if not place_code.any():  # like nothing, not even like other such codes
-            self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
-            return
-        with torch.inference_mode():
-            self._embeddings.append(self._pair_head.embed(torch.from_numpy(self._codes.slice(len(self._codes) - 1))[0]))
+        # ``find`` embeds all frames of a block at once.
+        self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
+
+    def _embed(self, first: int) -> None:
+        """Embed the codes after the steps from number ``first`` on."""
+        codes = self._codes.slice(first)
+        embeddings = self._pair_head.embed(torch.from_numpy(codes)).numpy()
+        embeddings[~codes.any(axis=1)] = 0.0  # like nothing, not even like other such codes
+        self._embeddings.replace(first, embeddings)
 
     def codes(self, first: int) -> np.ndarray:
         """Place codes ``(n, code_length)`` of the frames after the steps from number ``first`` on, without a copy."""
@@ -114,6 +118,7 @@ class OnlineLoops:
             first: number of the first block in the window.
         """
         end, last = block + 1, block * self._block + self._block - 1
+        self._embed(block * self._block)
         embedding = self._embeddings.slice(last)[0]
         if not embedding.any():
             return KeptLoops.none()
@@ -156,12 +161,13 @@ class OnlineLoops:
     def _most_similar(self, similarity: np.ndarray, blocks: np.ndarray, count: int) -> list[tuple[int, int, float]]:
         """Index in ``blocks``, frame of the block and value of the best of ``similarity`` ``(n, frames)``."""
         similarity = np.where(similarity == 0.0, -np.inf, similarity)  # frames that close no loops
-        best = torch.from_numpy(similarity.max(axis=1))
-        apart = self._search.min_apart
-        values, at = each_from_elsewhere(best, min(count, len(best)), apart, -torch.inf, torch.from_numpy(blocks))
-        step = similarity.argmax(axis=1)
-        found = zip(at.tolist(), values.tolist(), strict=True)
-        return [(index, int(step[index]), value) for index, value in found if value > -np.inf]
+        best = similarity.max(axis=1)
+        found: list[tuple[int, int, float]] = []
+        # As ``each_from_elsewhere``, whose calls of torch cost more than their arithmetic for a single row.
+        while len(found) < min(count, len(best)) and (value := float(best[index := int(best.argmax())])) > -np.inf:
+            found.append((index, int(similarity[index].argmax()), value))
+            best[np.abs(blocks - blocks[index]) <= self._search.min_apart] = -np.inf
+        return found
 
     def _in_window(self, node: int, frame: int, similarity: float, last: int, offsets: _Offsets) -> _EarlierFrame:
         """A frame of the window, seen from ``node``; ``last`` is the newest frame."""
@@ -219,11 +225,12 @@ class OnlineLoops:
             return KeptLoops.none()
         end, last = block + 1, (block + 1) * self._block - 1
         before = self._kept.overlap & (self._kept.end == end) & (self._kept.start >= first)
-        self._kept = self._kept.where(~before)
+        if before.any():
+            self._kept = self._kept.where(~before)
         in_window = np.arange(max(1, first), end - self._search.min_separation + 1)
-        # The origin has no code of its own.
-        frames = [] if keys is None else [keys.frame(k) for k in range(len(keys)) if keys.nodes[k]]
-        earlier = np.concatenate((np.array([key.node for key in frames], np.int64), in_window))
+        # The origin, the first key frame, has no code of its own.
+        frames = [] if keys is None else [keys.frame(k) for k in range(1, len(keys))]
+        earlier = in_window if keys is None else np.concatenate((keys.nodes[1:], in_window))
         if len(earlier) == 0:
             return KeptLoops.none()
         codes = np.concatenate(

@@ -77,10 +77,7 @@ class OnlineTrajectory(CorrectedTrajectory):
         self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
         self._network_every = _NETWORK_EVERY if iterations_per_step else 1
-        work = self._new_graph().work
-        # An update must be done when the next one begins, a block later. Each iteration counts for two at most.
-        least = -(-work // max(1, block - 1))
-        super().__init__(max(iterations_per_step, least) if iterations_per_step else 2 * work)
+        super().__init__(iterations_per_step or self._new_graph().work)
 
     @classmethod
     def load(

@@ -14,16 +14,28 @@ import torch
 from numba import njit
 from torch import Tensor, nn
 
-from ngo_estimator.geometry.planar_motion import wrap
+from ngo_estimator.geometry.planar_motion import chained, wrap
 from ngo_estimator.optimizer.block_cholesky import Array
 from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER, LoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure, add_factor
+from ngo_estimator.optimizer.odometry_test import FARTHEST, LEAST_STD, LEAST_VARIANCE
 
 _GATE_INPUTS = 11
 _KERNEL_WIDTH = RobustLoopGate.WIDTH
+
+
+def without_contradictions(loops: Loops, steps: MetaSteps) -> Loops:
+    """As ``odometry_test.without_contradictions``."""
+    relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
+    nodes, measured = loops.nodes[0].numpy(), loops.measured[0].double().numpy()
+    residuals, variance = np.empty((2, len(nodes), 3))
+    unlimited = np.full((len(nodes), 3), np.inf)
+    _residuals(chained(relative), np.maximum(std, LEAST_STD), nodes, measured, unlimited, residuals, variance)
+    agree = (np.square(residuals) / np.maximum(variance, LEAST_VARIANCE)).sum(1) <= FARTHEST**2
+    return replace(loops, valid=loops.valid & torch.from_numpy(agree))
 
 
 class CompiledClosing(LoopClosing):
@@ -43,7 +55,6 @@ class CompiledClosing(LoopClosing):
         self._noise_2 = np.stack((gate.noise.double().numpy(), gate.components.double().numpy()))
         self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
-        self._poses = np.zeros((len(self._std) + 1, 3))
         self._take(loops)
 
     def _take(self, loops: Loops) -> None:
@@ -73,7 +84,7 @@ class CompiledClosing(LoopClosing):
         count = len(self._nodes)
         self._residuals, self._weights, self._information = np.empty((count, 3)), np.empty(count), np.empty((count, 3))
         expected = np.empty((count, 3))
-        _chained(adjusted + deviation, self._poses)
+        self._poses = chained(adjusted + deviation)
         _residuals(self._poses, step_std, self._nodes, self._measured, self._most_drift, self._residuals, expected)
         annealing = RobustLoopGate.ANNEALING**iteration
         inputs = np.empty((count, _GATE_INPUTS), np.float32)
@@ -128,19 +139,6 @@ class CompiledClosing(LoopClosing):
 def _of(layer: nn.Linear) -> tuple[Array, Array]:
     """Weights, inputs first, and biases of a layer."""
     return layer.weight.detach().float().numpy().T.copy(), layer.bias.detach().float().numpy()
-
-
-@njit(cache=True)
-def _chained(relative: Array, poses: Array) -> None:
-    """Poses ``(n + 1, 3)`` of relative ones ``(n, 3)``, the origin in front; yaw is not wrapped."""
-    x, y, yaw = 0.0, 0.0, 0.0
-    poses[0] = 0.0
-    for k in range(len(relative)):
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        x += cos * relative[k, 0] - sin * relative[k, 1]
-        y += sin * relative[k, 0] + cos * relative[k, 1]
-        yaw += relative[k, 2]
-        poses[k + 1, 0], poses[k + 1, 1], poses[k + 1, 2] = x, y, yaw
 
 
 @njit(cache=True, error_model="numpy")

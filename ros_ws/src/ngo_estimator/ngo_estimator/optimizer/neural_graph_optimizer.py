@@ -220,8 +220,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
                 running it.
-            solution: of an optimisation that took these corrections, to go on from: there is a single result then,
-                after two iterations. Its belief in loops stays; only new loops are judged.
+            solution: of an optimisation that took these corrections, to go on from: there are two iterations then.
+                Its belief in loops stays; only new loops are judged.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -231,7 +231,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
         closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops)
         if corrections is not None and solution is not None:
-            yield self._resumed(steps, closing, corrections, solution)
+            yield from self._resumed(steps, closing, corrections, solution)
             return
         phases = self._phases(steps, loops, corrections)
         state, results = GraphState.initial(steps), []
@@ -255,8 +255,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
         closing: LoopClosing | NoLoopClosing,
         corrections: Sequence[Correction],
         solution: Solution,
-    ) -> OptimizedMetaPoses:
-        """The result that begins at an earlier solution.
+    ) -> Iterator[OptimizedMetaPoses]:
+        """The results that begin at an earlier solution.
 
         New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last
         one. Others keep what an annealing of all loops gave them.
@@ -267,10 +267,12 @@ class NeuralGraphOptimizer(AttentionNetwork):
             adjusted[:, steps.key_frames :] += adjustment
         state, stiffness = _without_fixed(before, replace(before, adjusted=adjusted), corrections[-1].stiffness, steps)
         state = replace(state, deviation=se2.wrapped(solution.relative - state.adjusted.double()))
-        for iteration in (0, self.config.iterations - 1):
+        results = []
+        for left, iteration in ((1, 0), (0, self.config.iterations - 1)):
             closing.look(state, iteration, solution)
             state = closing.close(state, stiffness)
-        return OptimizedMetaPoses([state.relative.to(steps.relative.dtype)], state.step_std, closing.closed)
+            results.append(state.relative.to(steps.relative.dtype))
+            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, left=left)
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
@@ -292,16 +294,16 @@ class NeuralGraphOptimizer(AttentionNetwork):
 
     def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
-        believed = without_contradictions(loops, steps)
+        closing, test = LoopClosing, without_contradictions
+        if not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu":
+            # The compiler's library takes 100 MB: only those pay for it that optimise.
+            from ngo_estimator.optimizer import compiled_closing
+
+            closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
+        believed = test(loops, steps)
         if self.config.search.witnesses:
             believed = agreeing(believed, steps, self.config.search.witnesses)
-        arguments = (self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
-        if torch.is_grad_enabled() or steps.relative.shape[0] != 1 or steps.relative.device.type != "cpu":
-            return LoopClosing(*arguments)
-        # The compiler's library takes 100 MB: only those pay for it that optimise.
-        from ngo_estimator.optimizer.compiled_closing import CompiledClosing
-
-        return CompiledClosing(*arguments)
+        return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
 
 
 def _without_fixed(

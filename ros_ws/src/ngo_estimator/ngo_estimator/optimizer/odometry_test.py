@@ -22,8 +22,11 @@ Errors of steps are not independent: true loops of validation mazes are up to 25
 has 40) and 16 in 3D, wrong ones 60 to 130 in the median (docs/explanation/findings.md).
 """
 
-_LEAST_STD = 0.01
+LEAST_STD = 0.01
 """Deviation of a meta-step, m and rad, at least: a registered step says a tenth of that, and is at times that wrong."""
+
+LEAST_VARIANCE = 1e-12
+"""Of the odometry between two poses, m^2 and rad^2, so that none divides by zero."""
 
 
 def without_contradictions(loops: Loops, steps: MetaSteps) -> Loops:
@@ -34,7 +37,7 @@ def without_contradictions(loops: Loops, steps: MetaSteps) -> Loops:
     with torch.no_grad():
         poses = with_origin(se2.r2g(steps.relative.double()))
         variance = odometry_variances(
-            loops.start, loops.end + 1, poses, steps.std.double().clamp(min=_LEAST_STD).square()
+            loops.start, loops.end + 1, poses, steps.std.double().clamp(min=LEAST_STD).square()
         )
-        squared = (loop_residuals(loops, poses).square() / variance.clamp(min=1e-12)).sum(-1)
+        squared = (loop_residuals(loops, poses).square() / variance.clamp(min=LEAST_VARIANCE)).sum(-1)
         return dataclasses.replace(loops, valid=loops.valid & (squared <= FARTHEST**2))

@@ -145,6 +145,9 @@ def fuse_views(measured: Tensor, log_scale: Tensor) -> PairMeasurement:
     Args:
         measured: ``(views, ..., 3)``; log_scale: logarithm of their scales ``(views, ..., 2)``.
     """
+    asked = torch.is_grad_enabled() and (measured.requires_grad or log_scale.requires_grad)
+    if not asked and measured.device.type == "cpu":
+        return _fused(measured, log_scale)
     precision = torch.exp(-2.0 * log_scale)
     error = se2.wrapped(measured - measured[0])
     weight, mean = precision, torch.zeros_like(measured[0])
@@ -156,3 +159,16 @@ def fuse_views(measured: Tensor, log_scale: Tensor) -> PairMeasurement:
         weight = precision / (1.0 + 0.25 * precision * squares)
     spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=SMALLEST_SPREAD).log()
     return PairMeasurement(se2.wrapped(measured[0] + mean), -0.5 * weight.sum(0).log(), spread)
+
+
+def _fused(measured: Tensor, log_scale: Tensor) -> PairMeasurement:
+    """``fuse_views`` compiled: for some pairs its calls of torch cost more than their arithmetic."""
+    # The compiler's library takes 100 MB: only those pay for it that fuse.
+    from ngo_estimator.optimizer.view_fusion_kernel import fuse
+
+    views, *shape, _ = measured.shape
+    poses, scales = (
+        rows.detach().double().reshape(views, -1, rows.shape[-1]).numpy() for rows in (measured, log_scale)
+    )
+    fused = fuse(poses, scales, _REWEIGHTINGS, SMALLEST_SPREAD)
+    return PairMeasurement(*(torch.from_numpy(rows).to(measured.dtype).reshape(*shape, -1) for rows in fused))
