@@ -268,10 +268,18 @@ def _paired(table: Table) -> dict[str, Any]:
     return {
         row: {
             "with": _paired_with(row),
-            **{key: compare(*np.array(found).T).as_json() for key, found in keys.items() if len(found) > 1},
+            **{key: _compared(key, np.array(found)) for key, found in keys.items() if len(found) > 1},
         }
         for row, keys in pairs.items()
     }
+
+
+def _compared(key: str, pairs: np.ndarray) -> dict[str, Any]:
+    """A row's numbers against another's, pairs ``(drives, 2)``; likelihoods, which may be negative, have no ratio."""
+    values, others = pairs.T
+    if key == "negative_log_likelihood":
+        return {"difference": mean_interval(values - others).as_json()}
+    return compare(values, others).as_json()
 
 
 def _paired_with(row: str) -> str:
