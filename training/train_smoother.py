@@ -163,7 +163,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     if arguments.memory:
         lasting = 1 if recorded is not None else world_named(name).deviation_steps
         remembering = with_memory(local, smoother, data.validation, lasting)
-        details = {k: v for k, v in local_description.items() if k not in _OWN} | {"memory": {**made_with, **about}}
+        of_memory = {**made_with, **about, "deviation_steps": lasting}
+        details = {k: v for k, v in local_description.items() if k not in _OWN} | {"memory": of_memory}
         save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", remembering, LOCAL, domain.name, details)
     else:
         details = {**made_with, **({} if recorded is None else {"data": recorded.about}), **about}
