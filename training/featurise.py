@@ -53,7 +53,7 @@ class Arguments:
     trajectories: int = 960
     """Training trajectories, each in a maze that the local network has not seen. Some worlds add a fifth of this
     number, driven by another driver, for the optimizer alone."""
-    mirror: bool = False
+    mirror_drives: bool = False
     """Worlds: whether they are kept a second time, as a mirror shows them, for the memory of the local network."""
     validation_trajectories: int = 24
     """Trajectories of the validation split for each table of results."""
@@ -76,7 +76,7 @@ def planned_drives(arguments: Arguments, world: World) -> dict[str, Drives]:
     """The trajectories of each store."""
     seeds = list(OPTIMIZER_TRAIN_SEEDS[: arguments.trajectories])
     found = {TRAIN_STORE: Drives(seeds, seeds, DRAWN, world.driver)}
-    if arguments.mirror:
+    if arguments.mirror_drives:
         found[MIRRORED_STORE] = found[TRAIN_STORE]
     if world.optimizer_driver is not None:
         others = list(OPTIMIZER_TRAIN_SEEDS[len(seeds) : len(seeds) + -(-len(seeds) // _FOR_ONE_OTHER)])

@@ -7,7 +7,7 @@
 The weights go beside those of the other networks. `train_optimizer` takes them from there where it smooths
 (`--smoothing True`), so train the smoother first. With `--memory` it corrects a step by those before it alone, and
 becomes part of the local network, whose odometry is better from then on: make the feature store anew after it. Both
-learn from the mirrored trajectories of `featurise --mirror` as well. Run it again to continue after a stop.
+learn from the mirrored trajectories of `featurise --mirror-drives` as well. Run it again to continue after a stop.
 """
 
 import dataclasses

@@ -98,7 +98,7 @@ def test_another_driver_drives_a_fifth_as_many_more_mazes_for_the_optimizer_alon
 
 def test_trajectories_are_kept_as_a_mirror_shows_them_where_that_is_asked_for() -> None:
     world, counts = WORLDS["maze2d"], {"validation_trajectories": 0, "test_trajectories": 0}
-    driven = planned_drives(featurise.Arguments("maze2d", mirror=True, **counts), world)
+    driven = planned_drives(featurise.Arguments("maze2d", mirror_drives=True, **counts), world)
     assert driven[MIRRORED_STORE] == driven[TRAIN_STORE]
     assert MIRRORED_STORE not in planned_drives(featurise.Arguments("maze2d", **counts), world)
     (episode,) = simulate(world, [3], 40)
