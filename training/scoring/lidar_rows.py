@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.geometry.planar_motion import chained
 from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.odometry import lidar_odometry
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
@@ -194,7 +195,7 @@ def graph_peer(runs: DriveRuns, solve: Solver, config: GraphPeerConfig) -> Estim
     graph = run.online.graph
     steps, loops = graph.measurements()
     began = time.process_time()
-    nodes = solve(steps, loops, _chained(steps.relative), config)
+    nodes = solve(steps, loops, chained(steps.relative), config)
     seconds = time.process_time() - began
     poses = graph.frame_poses(nodes=nodes)
     facts = {"solver_s": seconds, "loops": len(loops.nodes)}
@@ -207,21 +208,12 @@ def fed_with_wrong_loops(
     """A solver on the steps and the loops of our own run and wrong loops, one estimate for each seed of these."""
     run = runs.run(Pipeline())
     steps, loops = run.online.graph.measurements()
-    start, estimates = _chained(steps.relative), []
+    start, estimates = chained(steps.relative), []
     for seed in wrong.seeds:
         fed = with_wrong_loops(loops, len(start), wrong.percent, np.random.default_rng(seed))
         poses = run.online.graph.frame_poses(nodes=solve(steps, fed, start, config))
         estimates.append(Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw))
     return estimates
-
-
-def _chained(relative: np.ndarray) -> np.ndarray:
-    """Poses ``(n + 1, 3)`` along relative ones ``(n, 3)``, from the origin."""
-    yaw = np.concatenate(([0.0], np.cumsum(relative[:, 2])))
-    cosine, sine = np.cos(yaw[:-1]), np.sin(yaw[:-1])
-    x = cosine * relative[:, 0] - sine * relative[:, 1]
-    y = sine * relative[:, 0] + cosine * relative[:, 1]
-    return np.stack((*(np.concatenate(([0.0], np.cumsum(part))) for part in (x, y)), yaw), axis=-1)
 
 
 def wheels_alone(runs: DriveRuns) -> Estimate:

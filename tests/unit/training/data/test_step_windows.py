@@ -7,7 +7,7 @@ import torch
 
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import compose
-from ngo_estimator.networks.step_deviation import STEP_EVIDENCE
+from ngo_estimator.networks.step_scaling import STEP_EVIDENCE
 from training.data.lidar_steps import KeySteps
 from training.data.step_windows import figures, negative_log_likelihood, squared_deviations, windows_of
 from training.train_step_deviation import Arguments, data_of, fitted
