@@ -213,7 +213,8 @@ class LidarOdometry:
         if len(key.points) < _LEAST_POINTS:
             raise UnusableImage(f"the scan has {len(key.points)} usable returns; expected at least {_LEAST_POINTS}")
         last = self._last
-        estimate = self._core.update(key, self._wheels)
+        middle_s, turn_rad_s = (0.0, 0.0) if sweep is None else (float(sweep.offsets_s.mean()), float(sweep.twist[2]))
+        estimate = self._core.update(key, self._wheels, (round(middle_s * 1e9), middle_s * turn_rad_s))
         self._last = key
         if last is None:
             self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns

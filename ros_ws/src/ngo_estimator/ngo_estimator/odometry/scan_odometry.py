@@ -121,22 +121,29 @@ class ScanOdometry:
         self._key = np.zeros(3)
         self._passed = np.zeros(3)  # of the last key scan, or of a later scan that would be one in an unknown place
         self._stamp_ns: int | None = None
+        self._middle = (0, 0.0)  # of the last scan's sweep
 
-    def update(self, scan: KeyScan, wheels: WheelOdometry | None = None) -> ScanEstimate:
+    def update(
+        self, scan: KeyScan, wheels: WheelOdometry | None = None, middle: tuple[int, float] = (0, 0.0)
+    ) -> ScanEstimate:
         """Estimate where a scan was taken.
 
         Args:
             scan: newer than the last one.
             wheels: the wheels' poses so far, where the robot has wheels. The turns that the scans measure are given to
                 it, from which it learns its lag.
+            middle: of the sweep: its time after the stamp (ns), and the turn until then (rad) that was removed. What
+                removed it is none of what the scans measure.
 
         Raises:
             ValueError: the scan is not newer than the last one.
         """
         if self._stamp_ns is None:
+            self._middle = middle
             return self._begin(scan, wheels)
         if scan.stamp_ns <= self._stamp_ns:
             raise ValueError(f"the scan's stamp is {scan.stamp_ns}; expected one after {self._stamp_ns}")
+        last_ns = self._stamp_ns
         prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, doubt, searched = self._register(scan, prediction)
         unsure = self._is_unsure(found, prediction)
@@ -145,7 +152,13 @@ class ScanOdometry:
             pose, covariance = found.pose, self._covariance_of(found, prediction, searched)
         if doubt is not None and not unsure:
             covariance, unsure = covariance + doubt, True
-        return self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
+        estimate = self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
+        if wheels is not None and not unsure and found.share >= self.config.good_share:
+            (before_ns, before), (after_ns, after) = self._middle, middle
+            turn = float(estimate.step[2]) + after - before
+            wheels.observe_turn(last_ns + before_ns, scan.stamp_ns + after_ns, turn)
+        self._middle = middle
+        return estimate
 
     def _begin(self, scan: KeyScan, wheels: WheelOdometry | None) -> ScanEstimate:
         self._submap.add(scan, self._pose)
@@ -244,8 +257,6 @@ class ScanOdometry:
         if prediction.step_covariance is not None:
             # Both poses share the errors of the submap, and of the prior where the walls say nothing.
             both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
-        if wheels is not None and not unsure and found.share >= self.config.good_share:
-            wheels.observe_turn(self._stamp_ns, scan.stamp_ns, float(step[2]))
         distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
         passed = between(self._passed, pose)
         passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
