@@ -264,3 +264,34 @@ def test_any_wheels_leave_finite_steps(hostile: list[tuple[int, int, tuple[float
     assert len(steps) == 30
     for step in steps:
         check_step(step, 0, None)
+
+
+def test_noise_of_the_wheels_that_a_sweep_was_moved_by_is_no_lag() -> None:
+    """Noisy wheels move the points of each sweep: what they moved is none of the turn that scans tell the lag by."""
+    generator, period_s, rays = np.random.default_rng(5), 0.1, 181
+    stamps_s = np.arange(400) * period_s
+    odometry, noise, told = LidarOdometry(), 0.0, []
+    for stamp_s in np.arange(0.0, 0.1 * len(stamps_s) + 0.5, 0.05):
+        noise += 0.02 * generator.standard_normal()
+        odometry.add_wheels(round(1e9 * stamp_s), np.array((0.0, 0.0, 0.6 * math.sin(0.9 * stamp_s) + noise)))
+    wheels = odometry._wheels
+    assert wheels is not None
+    wheels.observe_turn = lambda start_ns, end_ns, turn: told.append((start_ns, end_ns, turn))  # type: ignore[method-assign]
+    angles = np.linspace(-math.pi / 2.0, math.pi / 2.0, rays)
+    for stamp_s in stamps_s:
+        # Each ray at its own time.
+        times = stamp_s + 0.9 * period_s * np.arange(rays) / rays
+        turned = angles + 0.6 * np.sin(0.9 * times)
+        ranges = np.minimum(
+            4.0 / np.maximum(np.abs(np.cos(turned)), 1e-6), 3.0 / np.maximum(np.abs(np.sin(turned)), 1e-6)
+        )
+        odometry.add_scan(
+            LidarScan(
+                round(1e9 * stamp_s), float(angles[0]), math.pi / (rays - 1), ranges, 0.0, 30.0,
+                0.9 * period_s / rays, "laser",
+            )
+        )  # fmt: skip
+        list(odometry.ready(at_end=True))
+    off = [turn - 0.6 * (math.sin(0.9e-9 * end) - math.sin(0.9e-9 * start)) for start, end, turn in told[20:]]
+    assert len(off) > 300
+    assert np.std(off) < 0.006
