@@ -23,6 +23,7 @@ from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.online.step_log import StepLog
+from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
@@ -491,12 +492,25 @@ class MetaGraph:
         loops, numbers, solution = None, np.zeros(0, np.int64), None
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
+            loops = self._verified(loops, np.concatenate((keys, np.arange(first, self.blocks + 1))))
             # Across blind stretches the poses are not those of the solution.
             if corrections is not None and not self._blind.values[first:].any():
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         runs_network = self._optimizer.config.network and corrections is None
         self._running = _Running(iterations, keys, first, numbers, runs_network)
+
+    def _verified(self, loops: Loops, active: np.ndarray) -> Loops:
+        """The loops between the ``active`` nodes; none across a blind stretch where place codes alone tell them.
+
+        Nothing limits the motion within it, so that each place that looks alike would do.
+        """
+        search = self._optimizer.config.search
+        if search.registrations or search.witnesses or not self._blind.values.any():
+            return loops
+        blind = (summed_variances(self._blind.values, active) > 0.0).any(axis=1)
+        before = torch.from_numpy(np.concatenate(([0], blind.cumsum())))
+        return replace(loops, valid=loops.valid & (before[loops.end + 1] == before[loops.start]))
 
     def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
