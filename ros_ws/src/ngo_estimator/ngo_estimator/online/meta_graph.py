@@ -63,6 +63,7 @@ class _Running:
     first: int
     numbers: np.ndarray
     runs_network: bool
+    anneals: bool
     taken: int = 0
     result: OptimizedMetaPoses | None = None
 
@@ -99,7 +100,8 @@ class _Corrections:
 class MetaGraph:
     """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
 
-    The network runs for each ``network_every``-th block; between, what it gave is taken again.
+    The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
+    ``anneal_every``-th block all loops are judged from the odometry on; between, only new ones.
     """
 
     def __init__(
@@ -109,6 +111,7 @@ class MetaGraph:
         window: int,
         key_frames: int,
         network_every: int = 1,
+        anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
@@ -156,7 +159,8 @@ class MetaGraph:
         self._work: list[Callable[[int], None]] = []  # what is left of taking in the newest block
         self._begun = False
         self._running: _Running | None = None
-        self._network_every = network_every
+        self._network_every, self._anneal_every = network_every, anneal_every
+        self._annealed = 0  # blocks when all loops were judged last
         self._corrections: _Corrections | None = None
         self._begun_s = 0.0
         self.optimized, self.fault = False, ""
@@ -492,11 +496,11 @@ class MetaGraph:
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
             # Across blind stretches the poses are not those of the solution.
-            if corrections is not None and not self._blind.values[first:].any():
+            if not self._annealing_is_due and not self._blind.values[first:].any():
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         runs_network = self._optimizer.config.network and corrections is None
-        self._running = _Running(iterations, keys, first, numbers, runs_network)
+        self._running = _Running(iterations, keys, first, numbers, runs_network, solution is None)
 
     def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
@@ -516,6 +520,12 @@ class MetaGraph:
         seen = self._corrections.stiffness.shape[1]
         return self.blocks - self._corrections.first - seen >= min(self._network_every, 1 + seen // 8)
 
+    @property
+    def _annealing_is_due(self) -> bool:
+        """Whether all loops are to be judged anew, from the odometry on."""
+        seen = self._annealed - self._first
+        return self._network_is_due or self.blocks - self._annealed >= min(self._anneal_every, 1 + seen // 8)
+
     def _iterate(self) -> None:
         """Prepare an optimisation, or run its next iteration."""
         if self._running is None:
@@ -529,7 +539,7 @@ class MetaGraph:
         """Parts of the update to come."""
         if self._running is not None and self._running.result is not None:
             return self._running.result.left
-        iterations = self._optimizer.config.iterations if self._network_is_due else _RESUMED
+        iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
         return len(self._work) + (self._running is None) + iterations
 
     @torch.inference_mode()
@@ -594,6 +604,8 @@ class MetaGraph:
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._end, self._information = end, result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
+        if running.anneals:
+            self._annealed = self.blocks
         if running.runs_network and self._network_every > 1:
             self._corrections = _Corrections.of(first, result.corrections)
         return moved
@@ -695,6 +707,7 @@ class MetaGraph:
             "first": np.array(self._first),
             "blind": self._blind.values,
             "recalled": np.array(self._recalled),
+            "annealed": np.array(self._annealed),
             "kept": self._kept,
             "gone": self._gone,
             "active": self._active,
@@ -727,7 +740,7 @@ class MetaGraph:
         self.odometry.restore(arrays, "odometry")
         self._nodes.restore(arrays, "nodes")
         self._blind.restore(arrays, "blind")
-        self._recalled = taken_integer(arrays, "recalled")
+        self._recalled, self._annealed = (taken_integer(arrays, name) for name in ("recalled", "annealed"))
         for name, rows in self._buffers().items():
             rows.restore(part(arrays, name))
         self._pose, self._covariance = (

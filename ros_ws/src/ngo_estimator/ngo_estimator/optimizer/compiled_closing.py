@@ -20,22 +20,28 @@ from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER, LoopC
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
-from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure, add_factor
+from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure
 from ngo_estimator.optimizer.odometry_test import FARTHEST, LEAST_STD, LEAST_VARIANCE
 
 _GATE_INPUTS = 11
 _KERNEL_WIDTH = RobustLoopGate.WIDTH
+_ALL = slice(None)
 
 
-def without_contradictions(loops: Loops, steps: MetaSteps) -> Loops:
-    """As ``odometry_test.without_contradictions``."""
+_LEAST_WEIGHT = 1e-4
+"""Of a loop that an earlier solution knew: one of less weight has no share in the equations."""
+
+
+def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | slice = _ALL) -> Loops:
+    """As ``odometry_test.without_contradictions``; only the loops of these indices are tested."""
     relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
-    nodes, measured = loops.nodes[0].numpy(), loops.measured[0].double().numpy()
+    nodes, measured = loops.nodes[0].numpy()[which], loops.measured[0].double().numpy()[which]
     residuals, variance = np.empty((2, len(nodes), 3))
     unlimited = np.full((len(nodes), 3), np.inf)
     _residuals(chained(relative), np.maximum(std, LEAST_STD), nodes, measured, unlimited, residuals, variance)
-    agree = (np.square(residuals) / np.maximum(variance, LEAST_VARIANCE)).sum(1) <= FARTHEST**2
-    return replace(loops, valid=loops.valid & torch.from_numpy(agree))
+    valid = loops.valid.clone()
+    valid[0].numpy()[which] &= (np.square(residuals) / np.maximum(variance, LEAST_VARIANCE)).sum(1) <= FARTHEST**2
+    return replace(loops, valid=valid)
 
 
 class CompiledClosing(LoopClosing):
@@ -49,8 +55,9 @@ class CompiledClosing(LoopClosing):
         find_overlaps: Callable[[Tensor], Loops | None],
         odometry_noise: Tensor,
         correction_std: Tensor,
+        solution: Solution | None = None,
     ) -> None:
-        super().__init__(gate, steps, loops, find_overlaps, odometry_noise, correction_std)
+        super().__init__(gate, steps, loops, find_overlaps, odometry_noise, correction_std, solution)
         self._layers, self._head = [_of(layer) for layer in gate.layers if isinstance(layer, nn.Linear)], _of(gate.head)
         self._noise_2 = np.stack((gate.noise.double().numpy(), gate.components.double().numpy()))
         self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
@@ -59,13 +66,25 @@ class CompiledClosing(LoopClosing):
 
     def _take(self, loops: Loops) -> None:
         self._loops = loops
-        nodes, blocks = loops.nodes[0].numpy(), len(self._std)
-        index = np.arange(blocks)
-        self._structure = GraphStructure(np.concatenate((np.stack((index, index + 1), axis=1), nodes)), blocks + 1)
+        self._used: Array | slice = _ALL
+        """Which loops are in the equations, and which of these are judged: without a solution, all of them."""
+        self._judged: Array | slice = _ALL
+        if self._solution is not None:
+            known = self._solution.known
+            self._used = np.flatnonzero(~known | (self._solution.weights >= _LEAST_WEIGHT))
+            self._judged = np.flatnonzero(~known[self._used])
+        nodes, blocks = loops.nodes[0].numpy()[self._used], len(self._std)
+        self._structure = GraphStructure(nodes, blocks + 1, chain=True)
         self._nodes = nodes
-        self._measured = loops.measured[0].double().numpy()
+        self._measured = loops.measured[0].double().numpy()[self._used]
+        if self._solution is not None:
+            self._weights, self._information = self._solution.weights[self._used], self._solution.information[self._used]
+        else:
+            self._weights, self._information = np.empty(len(nodes)), np.empty((len(nodes), 3))
         limits = loops.most_drift
-        self._most_drift = np.full((len(nodes), 3), np.inf) if limits is None else limits[0].double().numpy()
+        self._most_drift = (
+            np.full((len(nodes), 3), np.inf) if limits is None else limits[0].double().numpy()[self._used]
+        )
         constants = (
             loops.description[0],
             loops.log_length[0].unsqueeze(-1),
@@ -73,32 +92,33 @@ class CompiledClosing(LoopClosing):
             loops.logit[0].unsqueeze(-1),
             loops.valid[0].unsqueeze(-1),
         )
-        self._constants = torch.cat([part.double() for part in constants], dim=-1).numpy()
+        self._constants = torch.cat([part.double() for part in constants], dim=-1).numpy()[self._used][self._judged]
 
-    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
+    def look(self, state: GraphState, iteration: int) -> None:
         """As ``LoopClosing.look``."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._take(self._loops.and_also(overlaps))
         arrays = (state.adjusted, state.deviation, state.step_std)
         adjusted, deviation, step_std = (array[0].double().numpy() for array in arrays)
-        count = len(self._nodes)
-        self._residuals, self._weights, self._information = np.empty((count, 3)), np.empty(count), np.empty((count, 3))
-        expected = np.empty((count, 3))
+        self._residuals, expected = np.empty((2, len(self._nodes), 3))
         self._poses = chained(adjusted + deviation)
         _residuals(self._poses, step_std, self._nodes, self._measured, self._most_drift, self._residuals, expected)
         annealing = RobustLoopGate.ANNEALING**iteration
-        inputs = np.empty((count, _GATE_INPUTS), np.float32)
-        squared = np.empty(count)
-        _gate_inputs(self._constants, self._residuals, expected, annealing, self._noise_2, inputs, squared)
+        count = len(self._constants)
+        inputs, squared = np.empty((count, _GATE_INPUTS), np.float32), np.empty(count)
+        residuals, expected = self._residuals[self._judged], expected[self._judged]
+        _gate_inputs(self._constants, residuals, expected, annealing, self._noise_2, inputs, squared)
         hidden = inputs
         for weight, bias in self._layers:
             hidden = np.maximum(hidden @ weight + bias, 0.0)
         belief = hidden @ self._head[0] + self._head[1]
-        _gates(self._constants, belief, squared, self._noise_2, self._weights, self._information)
-        if solution is not None:
-            known = solution.known
-            self._weights[known], self._information[known] = solution.weights[known], solution.information[known]
-        channels = np.empty((self._steps.blocks, CHANNELS), np.float32)
+        weights, information = np.empty(count), np.empty((count, 3))
+        _gates(self._constants, belief, squared, self._noise_2, weights, information)
+        self._weights[self._judged], self._information[self._judged] = weights, information
+
+    def channels(self, state: GraphState) -> Tensor:
+        """As ``LoopClosing.channels``."""
+        deviation, channels = state.deviation[0].double().numpy(), np.empty((self._steps.blocks, CHANNELS), np.float32)
         _channels(self._poses, deviation, self._nodes, self._residuals, self._weights, self._unit, channels)
         return torch.from_numpy(channels).unsqueeze(0)
 
@@ -110,30 +130,30 @@ class CompiledClosing(LoopClosing):
         step_std[keys:] *= (factor[0] if factor.ndim == 3 else factor) * self._noise
         structure = self._structure
         diagonal, lower, right = structure.empty()
-        _add_chain(self._poses, deviation, step_std, structure.ranks, structure.place, diagonal, lower, right)
+        steps = len(self._std)
+        chain, loops = ((of[:steps], of[steps:]) for of in (structure.ranks, structure.place))
+        _add_chain(self._poses, deviation, step_std, chain[0], loops[0], diagonal, lower, right)
         _add_loops(
-            self._poses,
-            self._nodes,
-            self._residuals,
-            self._information,
-            structure.ranks[len(self._std) :],
-            structure.place[len(self._std) :],
-            diagonal,
-            lower,
-            right,
-        )
+            self._poses, self._nodes, self._residuals, self._information, chain[1], loops[1], diagonal, lower, right
+        )  # fmt: skip
         equations = FactorisedInformation(structure.blocks, diagonal, lower)
         _deviate(self._poses, equations.step(right), deviation)
         kind = state.deviation.dtype
-        weights, information = (
-            torch.from_numpy(values).unsqueeze(0).to(kind) for values in (self._weights, self._information)
-        )
+        weights, information = (torch.from_numpy(values).unsqueeze(0).to(kind) for values in self._of_all_loops())
         self._closed = ClosedLoops(self._loops, weights, information, equations)
         return replace(
             state,
             deviation=torch.from_numpy(deviation).unsqueeze(0),
             step_std=torch.from_numpy(step_std).unsqueeze(0),
         )
+
+    def _of_all_loops(self) -> tuple[Array, Array]:
+        """Weights ``(n,)`` and information ``(n, 3)`` of all loops, those without a share in the equations included."""
+        if self._solution is None:
+            return self._weights.copy(), self._information.copy()
+        weights, information = self._solution.weights.copy(), self._solution.information.copy()
+        weights[self._used], information[self._used] = self._weights, self._information
+        return weights, information
 
 
 def _of(layer: nn.Linear) -> tuple[Array, Array]:
@@ -252,23 +272,45 @@ def _add_chain(
     right: Array,
 ) -> None:
     """Add the factors of ``chain_factors``."""
-    jacobian, hessian, gradient = np.zeros((3, 6)), np.empty((6, 6)), np.empty(6)
     for k in range(len(deviation)):
         cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
         x, y = poses[k + 1, 0] - poses[k, 0], poses[k + 1, 1] - poses[k, 1]
-        jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = -cos, -sin, cos * y - sin * x
-        jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = sin, -cos, -cos * x - sin * y
-        jacobian[0, 3], jacobian[0, 4], jacobian[1, 3], jacobian[1, 4] = cos, sin, -sin, cos
-        jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
-        hessian[:], gradient[:] = 0.0, 0.0
-        for r in range(3):
-            information = 1.0 / step_std[k, r] ** 2
-            for i in range(6):
-                weighted = information * jacobian[r, i]
-                gradient[i] -= weighted * deviation[k, r]
-                for j in range(6):
-                    hessian[i, j] += weighted * jacobian[r, j]
-        add_factor(hessian, gradient, ranks[k], place[k], diagonal, lower, right)
+        first, second, turn = 1.0 / step_std[k, 0] ** 2, 1.0 / step_std[k, 1] ** 2, 1.0 / step_std[k, 2] ** 2
+        # Along the axes of the map, of the later pose: information, pull, and what the earlier heading does.
+        xx, xy = cos * cos * first + sin * sin * second, cos * sin * (first - second)
+        yy = sin * sin * first + cos * cos * second
+        across, along = cos * y - sin * x, -cos * x - sin * y
+        pulls = (-first * deviation[k, 0], -second * deviation[k, 1], -turn * deviation[k, 2])
+        pull = (cos * pulls[0] - sin * pulls[1], sin * pulls[0] + cos * pulls[1], pulls[2])
+        lever = (cos * first * across - sin * second * along, sin * first * across + cos * second * along)
+        at, to, between = ranks[k, 0], ranks[k, 1], place[k]
+        for node, sign in ((at, -1.0), (to, 1.0)):
+            if node < 0:
+                continue
+            for c in range(3):
+                right[node, c, 0] += sign * pull[c]
+            diagonal[node, 0, 0] += xx
+            diagonal[node, 0, 1] += xy
+            diagonal[node, 1, 0] += xy
+            diagonal[node, 1, 1] += yy
+            diagonal[node, 2, 2] += turn
+        if at >= 0:
+            right[at, 2, 0] += across * pulls[0] + along * pulls[1]
+            diagonal[at, 2, 2] += first * across**2 + second * along**2
+            for c in range(2):
+                diagonal[at, 2, c] -= lever[c]
+                diagonal[at, c, 2] -= lever[c]
+        if between >= 0:
+            lower[between, 0, 0] -= xx
+            lower[between, 0, 1] -= xy
+            lower[between, 1, 0] -= xy
+            lower[between, 1, 1] -= yy
+            lower[between, 2, 2] -= turn
+            for c in range(2):
+                if at > to:
+                    lower[between, 2, c] += lever[c]
+                else:
+                    lower[between, c, 2] += lever[c]
 
 
 @njit(cache=True, error_model="numpy")

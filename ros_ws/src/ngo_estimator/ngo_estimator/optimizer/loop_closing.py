@@ -44,7 +44,10 @@ class NoLoopClosing:
 
     closed = None
 
-    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
+    def look(self, state: GraphState, iteration: int) -> None:
+        """Nothing."""
+
+    def channels(self, state: GraphState) -> Tensor:
         """No channels."""
         return state.features[..., :0]
 
@@ -62,6 +65,7 @@ class LoopClosing:
         find_overlaps: gives further loops under corrected poses ``(batch, poses + 1, 3)``, or None.
         odometry_noise: ``(3,)`` factors between the deviations of ``steps`` and those of the odometry's real errors.
         correction_std: ``(3,)`` unit of residuals and deviations for the convolutions.
+        solution: an earlier one, whose belief in the loops that it knew stays.
     """
 
     def __init__(
@@ -72,9 +76,10 @@ class LoopClosing:
         find_overlaps: Callable[[Tensor], Loops | None],
         odometry_noise: Tensor,
         correction_std: Tensor,
+        solution: Solution | None = None,
     ) -> None:
         self._gate, self._steps, self._loops, self._find_overlaps = gate, steps, loops, find_overlaps
-        self._odometry_noise, self._correction_std = odometry_noise, correction_std
+        self._odometry_noise, self._correction_std, self._solution = odometry_noise, correction_std, solution
         self._gated: _GatedLoops
         self._closed: ClosedLoops | None = None
 
@@ -85,14 +90,8 @@ class LoopClosing:
             raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
         return self._closed
 
-    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
-        """Judge the loops under the current poses; the third iteration adds overlaps to them.
-
-        With an earlier ``solution``, its belief in the loops that it knew stays.
-
-        Returns:
-            The loops for the convolutions ``(batch, blocks, CHANNELS)``.
-        """
+    def look(self, state: GraphState, iteration: int) -> None:
+        """Judge the loops under the current poses; the third iteration adds overlaps to them."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._loops = self._loops.and_also(overlaps)
         loops, poses = self._loops, state.poses
@@ -101,12 +100,11 @@ class LoopClosing:
         if loops.most_drift is not None:
             expected = torch.minimum(expected, loops.most_drift)
         weights, information = self._gate(loops, residuals, expected, iteration)
-        if solution is not None:
+        if (solution := self._solution) is not None:
             known, before = (torch.from_numpy(part) for part in (solution.known, solution.information))
             weights = torch.where(known, torch.from_numpy(solution.weights), weights)
             information = torch.where(known.unsqueeze(-1), before, information)
         self._gated = _GatedLoops(poses, loops, residuals, weights, information)
-        return self._channels(state, residuals, weights)
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """Take a Gauss-Newton step from the poses of the last ``look``, so that the gated loops close.
@@ -131,10 +129,13 @@ class LoopClosing:
         self._closed = ClosedLoops(gated.loops, gated.weights, gated.information, None)
         return replace(state, deviation=deviation, step_std=step_std)
 
-    def _channels(self, state: GraphState, residuals: Tensor, weights: Tensor) -> Tensor:
-        """The residuals spread over their loops, in the frame of each pose, and the deviation and support there."""
-        keys, poses = self._steps.key_frames, state.poses
-        spread, support = spread_over_span(self._loops, residuals, weights, state.adjusted.shape[1])
+    def channels(self, state: GraphState) -> Tensor:
+        """The loops of the last ``look`` for the convolutions ``(batch, blocks, CHANNELS)``.
+
+        Their residuals are spread over the loops, in the frame of each pose; the deviation and support there follow.
+        """
+        gated, keys, poses = self._gated, self._steps.key_frames, state.poses
+        spread, support = spread_over_span(gated.loops, gated.residuals, gated.weights, state.adjusted.shape[1])
         spread, support = spread[:, keys:], support[:, keys:]
         local = torch.cat((se2.rotate(-poses[:, keys:-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
         bent = torch.cat((local, state.deviation[:, keys:]), dim=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -35,6 +35,8 @@ from ngo_estimator.optimizer.meta_poses import (
 from ngo_estimator.optimizer.odometry_test import without_contradictions
 from ngo_estimator.optimizer.overlaps import find_overlaps
 from ngo_estimator.optimizer.registered_odometry import registered_steps
+
+_Channels = Callable[[GraphState], Tensor]
 
 _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 """Before anything is learned: errors of a relative meta-pose in units of the deviations that its steps add up to."""
@@ -229,18 +231,25 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
-        closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops)
+        resumes = corrections is not None and solution is not None
+        closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops, solution if resumes else None)
         if corrections is not None and solution is not None:
-            yield from self._resumed(steps, closing, corrections, solution)
-            return
-        phases = self._phases(steps, loops, corrections)
+            return self._resumed(steps, closing, corrections, solution)
+        return self._annealed(steps, closing, self._phases(steps, loops, corrections))
+
+    def _annealed(
+        self,
+        steps: MetaSteps,
+        closing: LoopClosing | NoLoopClosing,
+        phases: AttentionPhases | _NoNetwork | _Remembered,
+    ) -> Iterator[OptimizedMetaPoses]:
+        """The results that begin at the odometry: all loops are judged, allowing for less of its drift each time."""
         state, results = GraphState.initial(steps), []
         made: list[Correction] = []
         for iteration in range(self.config.iterations):
-            seen = closing.look(state, iteration)
-            attended = phases.attend(state)
+            closing.look(state, iteration)
             before = state.adjusted
-            optimised, stiffness = phases.optimise(state, attended, seen)
+            optimised, stiffness = phases.optimise(state, closing.channels)
             state, stiffness = _without_fixed(state, optimised, stiffness, steps)
             if self.config.network:
                 made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
@@ -269,7 +278,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
         state = replace(state, deviation=se2.wrapped(solution.relative - state.adjusted.double()))
         results = []
         for left, iteration in ((1, 0), (0, self.config.iterations - 1)):
-            closing.look(state, iteration, solution)
+            closing.look(state, iteration)
             state = closing.close(state, stiffness)
             results.append(state.relative.to(steps.relative.dtype))
             yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, left=left)
@@ -292,18 +301,23 @@ class NeuralGraphOptimizer(AttentionNetwork):
         found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
         return without_contradictions(found, steps)
 
-    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
+    def _loop_closing(self, steps: MetaSteps, loops: Loops, solution: Solution | None) -> LoopClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
         closing, test = LoopClosing, without_contradictions
+        witnesses = self.config.search.witnesses
         if not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu":
             # The compiler's library takes 100 MB: only those pay for it that optimise.
             from ngo_estimator.optimizer import compiled_closing
 
             closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
+            if solution is not None and not witnesses:
+                test = partial(test, which=~solution.known)
         believed = test(loops, steps)
-        if self.config.search.witnesses:
-            believed = agreeing(believed, steps, self.config.search.witnesses)
-        return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+        if witnesses:
+            believed = agreeing(believed, steps, witnesses)
+        return closing(
+            self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std, solution
+        )
 
 
 def _without_fixed(
@@ -324,11 +338,7 @@ class _NoNetwork:
     def __init__(self, optimizer: NeuralGraphOptimizer) -> None:
         self._stiffness = optimizer.log_scale
 
-    def attend(self, state: GraphState) -> Tensor:
-        """No attention vectors."""
-        return state.features
-
-    def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
+    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
         """The state as it is, and the stiffness ``(3,)``."""
         return state, self._stiffness
 
@@ -339,11 +349,7 @@ class _Remembered:
     def __init__(self, corrections: Sequence[Correction]) -> None:
         self._corrections = iter(corrections)
 
-    def attend(self, state: GraphState) -> Tensor:
-        """No attention vectors."""
-        return state.features
-
-    def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
+    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
         """The state with the adjustments of the next iteration, and its stiffness."""
         adjustment, stiffness = next(self._corrections)
         adjusted = state.adjusted.clone()
