@@ -87,3 +87,32 @@ def turned_covariance(yaw: float, covariance: Array) -> Array:
     cos, sin = math.cos(yaw), math.sin(yaw)
     turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
     return turn @ covariance @ turn.T
+
+
+@njit(cache=True)
+def carried(
+    pose: Array, covariance: Array, odometry: Array, relative: Array, variance: Array
+) -> tuple[Array, Array]:
+    """A pose and its covariance after further steps, as ``planar_covariance.propagate`` has it for each.
+
+    Args:
+        pose: ``(3,)`` where the steps begin, covariance: ``(3, 3)`` of it.
+        odometry: poses ``(n + 1, 3)`` by odometry where they begin and after each.
+        relative: the steps ``(n, 3)``, with independent errors of this ``variance`` ``(n, 3)``.
+    """
+    last = pose
+    for k in range(len(relative)):
+        last = compose(pose, between(odometry[0], odometry[k + 1]))
+        yaw = last[2] - relative[k, 2]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        lever = np.eye(3)
+        lever[0, 2] = -(sin * relative[k, 0] + cos * relative[k, 1])
+        lever[1, 2] = cos * relative[k, 0] - sin * relative[k, 1]
+        result = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                for m in range(3):
+                    for n in range(3):
+                        result[i, j] += lever[i, m] * covariance[m, n] * lever[j, n]
+        covariance = result + turned_covariance(yaw, np.diag(variance[k]))
+    return last, covariance

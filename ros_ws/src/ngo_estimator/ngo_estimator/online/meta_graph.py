@@ -14,7 +14,7 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import all_between, between, chained, compose
+from ngo_estimator.geometry.planar_motion import all_between, between, carried, chained, compose
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
 from ngo_estimator.online.blind_stretches import shrunk_corrections, summed_variances
@@ -676,12 +676,10 @@ class MetaGraph:
             covariance: that of the last node in the map ``(3, 3)``.
         """
         whole = self.blocks * self._block
-        odometry, node = self.odometry.values[whole:], self._nodes.values[-1]
-        poses = [compose(node, between(odometry[0], row)) for row in odometry]
-        steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
-        for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
-            covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))
-        return poses[-1], covariance
+        relative, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
+        return carried(
+            self._nodes.values[-1], covariance, self.odometry.values[whole:], relative, np.exp(2.0 * log_std)
+        )
 
     def _buffers(self) -> dict[str, SlidingRows]:
         rows = (

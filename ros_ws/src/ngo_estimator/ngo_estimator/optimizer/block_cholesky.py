@@ -97,8 +97,17 @@ def _bits(word: Any) -> Any:
 
 
 @njit(cache=True)
+def _lowest(word: Any) -> Any:
+    """The lowest bit of those that are set."""
+    return word & (~word + _ONE)
+
+
+@njit(cache=True)
 def _eliminated(pairs: Array, count: int) -> tuple[Array, Array, Array]:
-    """Rank of each row, starts of the factor's columns, and the ranks of their rows."""
+    """Rank of each row, starts of the factor's columns, and the ranks of their rows.
+
+    The first row of least degree is eliminated next.
+    """
     words = (count + 63) // 64
     neighbours = np.zeros((count, words), np.uint64)
     for k in range(len(pairs)):
@@ -106,26 +115,29 @@ def _eliminated(pairs: Array, count: int) -> tuple[Array, Array, Array]:
         if a != b:
             neighbours[a, b // 64] |= _ONE << np.uint64(b % 64)
             neighbours[b, a // 64] |= _ONE << np.uint64(a % 64)
-    degree = np.zeros(count, np.int64)
+    degree, of_degree = np.zeros(count, np.int64), np.zeros((count, words), np.uint64)
     for a in range(count):
         for w in range(words):
             degree[a] += _bits(neighbours[a, w])
+        of_degree[degree[a], a // 64] |= _ONE << np.uint64(a % 64)
     rank = np.empty(count, np.int64)
     starts = np.zeros(count + 1, np.int64)
     rows = np.empty(max(16, 8 * count), np.int64)
     filled = 0
     least = 0
     for step in range(count):
-        # A row's degree falls by one at most with each elimination, so the least one hardly has to be looked for.
-        pivot, smallest = -1, count
-        for a in range(count):
-            if degree[a] < smallest:
-                pivot, smallest = a, degree[a]
-                if smallest <= least:
+        pivot = -1
+        while pivot < 0:
+            for w in range(words):
+                if of_degree[least, w] != np.uint64(0):
+                    pivot = 64 * w + _bits(_lowest(of_degree[least, w]) - _ONE)
                     break
-        least = max(smallest - 1, 0)
+            least += 1
+        # An elimination lowers the least degree by one at most.
+        least = max(least - 2, 0)
         rank[pivot] = step
-        degree[pivot] = count + 1
+        own = ~(_ONE << np.uint64(pivot % 64))
+        of_degree[degree[pivot], pivot // 64] &= own
         if filled + count > len(rows):
             more = np.empty(2 * len(rows) + count, np.int64)
             more[:filled] = rows[:filled]
@@ -134,31 +146,33 @@ def _eliminated(pairs: Array, count: int) -> tuple[Array, Array, Array]:
         for w in range(words):
             word = neighbours[pivot, w]
             while word != np.uint64(0):
-                lowest = word & (~word + _ONE)
+                lowest = _lowest(word)
                 rows[filled] = 64 * w + _bits(lowest - _ONE)
                 filled += 1
                 word ^= lowest
         starts[step + 1] = filled
-        own = ~(_ONE << np.uint64(pivot % 64))
         for k in range(first, filled):
             a = rows[k]
+            here = _ONE << np.uint64(a % 64)
+            for w in range(words):
+                neighbours[a, w] |= neighbours[pivot, w]
             neighbours[a, pivot // 64] &= own
+            neighbours[a, a // 64] &= ~here
             total = 0
             for w in range(words):
-                joined = neighbours[a, w] | neighbours[pivot, w]
-                if w == pivot // 64:
-                    joined &= own
-                if w == a // 64:
-                    joined &= ~(_ONE << np.uint64(a % 64))
-                neighbours[a, w] = joined
-                total += _bits(joined)
-            degree[a] = total
+                total += _bits(neighbours[a, w])
+            if total != degree[a]:
+                of_degree[degree[a], a // 64] &= ~here
+                of_degree[total, a // 64] |= here
+                degree[a] = total
     rows = rows[:filled].copy()
     for step in range(count):
-        column = rows[starts[step] : starts[step + 1]]
-        for k in range(len(column)):
-            column[k] = rank[column[k]]
-        column.sort()
+        for k in range(starts[step], starts[step + 1]):  # a column is short: insertion sorts it fastest
+            value, at = rank[rows[k]], k
+            while at > starts[step] and rows[at - 1] > value:
+                rows[at] = rows[at - 1]
+                at -= 1
+            rows[at] = value
     return rank, starts, rows
 
 

@@ -23,24 +23,18 @@ from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaStep
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure
 from ngo_estimator.optimizer.odometry_test import FARTHEST, LEAST_STD, LEAST_VARIANCE
 
-_GATE_INPUTS = 11
 _KERNEL_WIDTH = RobustLoopGate.WIDTH
-_ALL = slice(None)
-
 
 _LEAST_WEIGHT = 1e-4
 """Of a loop that an earlier solution knew: one of less weight has no share in the equations."""
 
 
-def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | slice = _ALL) -> Loops:
-    """As ``odometry_test.without_contradictions``; only the loops of these indices are tested."""
+def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | None = None) -> Loops:
+    """As ``odometry_test.without_contradictions``; only the loops of these indices, by default all, are tested."""
     relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
-    nodes, measured = loops.nodes[0].numpy()[which], loops.measured[0].double().numpy()[which]
-    residuals, variance = np.empty((2, len(nodes), 3))
-    unlimited = np.full((len(nodes), 3), np.inf)
-    _residuals(chained(relative), np.maximum(std, LEAST_STD), nodes, measured, unlimited, residuals, variance)
     valid = loops.valid.clone()
-    valid[0].numpy()[which] &= (np.square(residuals) / np.maximum(variance, LEAST_VARIANCE)).sum(1) <= FARTHEST**2
+    which = np.arange(valid.shape[1]) if which is None else which
+    _test(relative, std, loops.nodes[0].numpy(), loops.measured[0].double().numpy(), which, valid[0].numpy())
     return replace(loops, valid=valid)
 
 
@@ -58,63 +52,48 @@ class CompiledClosing(LoopClosing):
         solution: Solution | None = None,
     ) -> None:
         super().__init__(gate, steps, loops, find_overlaps, odometry_noise, correction_std, solution)
-        self._layers, self._head = [_of(layer) for layer in gate.layers if isinstance(layer, nn.Linear)], _of(gate.head)
-        self._noise_2 = np.stack((gate.noise.double().numpy(), gate.components.double().numpy()))
+        linear = [layer for layer in (*gate.layers, gate.head) if isinstance(layer, nn.Linear)]
+        self._layers = [array for layer in linear for array in _of(layer)]
+        self._gate_noise, self._components = gate.noise.double().numpy(), gate.components.double().numpy()
         self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
+        self._stiffness: Tensor | None = None
+        """That of the last iteration, and the deviations ``(n, 3)`` with which the odometry is believed then."""
+        self._step_std: Array | None = None
         self._take(loops)
 
     def _take(self, loops: Loops) -> None:
         self._loops = loops
-        self._used: Array | slice = _ALL
-        """Which loops are in the equations, and which of these are judged: without a solution, all of them."""
-        self._judged: Array | slice = _ALL
-        if self._solution is not None:
-            known = self._solution.known
-            self._used = np.flatnonzero(~known | (self._solution.weights >= _LEAST_WEIGHT))
-            self._judged = np.flatnonzero(~known[self._used])
-        nodes, blocks = loops.nodes[0].numpy()[self._used], len(self._std)
-        self._structure = GraphStructure(nodes, blocks + 1, chain=True)
-        self._nodes = nodes
-        self._measured = loops.measured[0].double().numpy()[self._used]
-        if self._solution is not None:
-            self._weights, self._information = self._solution.weights[self._used], self._solution.information[self._used]
+        nodes, measured = loops.nodes[0].numpy(), loops.measured[0].double().numpy()
+        count = len(nodes)
+        limits = np.full((count, 3), np.inf) if loops.most_drift is None else loops.most_drift[0].double().numpy()
+        constants = _constants(
+            loops.similarity[0].numpy(), loops.logit[0].numpy(), loops.log_scale[0].numpy(), loops.spread[0].numpy(),
+            loops.log_length[0].numpy(), self._gate_noise,
+        )  # fmt: skip
+        valid, solution = loops.valid[0].numpy(), self._solution
+        used = valid if solution is None else np.where(solution.known, solution.weights >= _LEAST_WEIGHT, valid)
+        self._used = used = np.flatnonzero(used)
+        """Which loops are in the equations: others would fill them, and change nothing."""
+        if solution is None:
+            self._weights, self._information = np.empty(len(used)), np.empty((len(used), 3))
+            self._judged = np.arange(len(used))
         else:
-            self._weights, self._information = np.empty(len(nodes)), np.empty((len(nodes), 3))
-        limits = loops.most_drift
-        self._most_drift = (
-            np.full((len(nodes), 3), np.inf) if limits is None else limits[0].double().numpy()[self._used]
-        )
-        constants = (
-            loops.description[0],
-            loops.log_length[0].unsqueeze(-1),
-            loops.log_scale[0],
-            loops.logit[0].unsqueeze(-1),
-            loops.valid[0].unsqueeze(-1),
-        )
-        self._constants = torch.cat([part.double() for part in constants], dim=-1).numpy()[self._used][self._judged]
+            self._weights, self._information = solution.weights[used], solution.information[used]
+            self._judged = np.flatnonzero(~solution.known[used])
+        self._nodes = nodes = nodes[used]
+        self._measured, self._most_drift, self._constants = measured[used], limits[used], constants[used]
+        self._structure = GraphStructure(nodes, len(self._std) + 1, chain=True)
 
     def look(self, state: GraphState, iteration: int) -> None:
         """As ``LoopClosing.look``."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._take(self._loops.and_also(overlaps))
-        arrays = (state.adjusted, state.deviation, state.step_std)
-        adjusted, deviation, step_std = (array[0].double().numpy() for array in arrays)
-        self._residuals, expected = np.empty((2, len(self._nodes), 3))
-        self._poses = chained(adjusted + deviation)
-        _residuals(self._poses, step_std, self._nodes, self._measured, self._most_drift, self._residuals, expected)
-        annealing = RobustLoopGate.ANNEALING**iteration
-        count = len(self._constants)
-        inputs, squared = np.empty((count, _GATE_INPUTS), np.float32), np.empty(count)
-        residuals, expected = self._residuals[self._judged], expected[self._judged]
-        _gate_inputs(self._constants, residuals, expected, annealing, self._noise_2, inputs, squared)
-        hidden = inputs
-        for weight, bias in self._layers:
-            hidden = np.maximum(hidden @ weight + bias, 0.0)
-        belief = hidden @ self._head[0] + self._head[1]
-        weights, information = np.empty(count), np.empty((count, 3))
-        _gates(self._constants, belief, squared, self._noise_2, weights, information)
-        self._weights[self._judged], self._information[self._judged] = weights, information
+        relative, step_std = state.relative[0].double().numpy(), state.step_std[0].double().numpy()
+        self._poses, self._residuals = _judge(
+            relative, step_std, self._nodes, self._measured, self._most_drift, self._constants, self._judged,
+            RobustLoopGate.ANNEALING**iteration, self._components, *self._layers, self._weights, self._information,
+        )  # fmt: skip
 
     def channels(self, state: GraphState) -> Tensor:
         """As ``LoopClosing.channels``."""
@@ -124,48 +103,57 @@ class CompiledClosing(LoopClosing):
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """As ``LoopClosing.close``."""
-        keys = self._steps.key_frames
-        step_std, deviation = self._std.copy(), state.deviation[0].double().numpy().copy()
-        factor = np.exp(3.0 * np.tanh(stiffness.double().numpy() / 3.0))
-        step_std[keys:] *= (factor[0] if factor.ndim == 3 else factor) * self._noise
-        structure = self._structure
-        diagonal, lower, right = structure.empty()
-        steps = len(self._std)
-        chain, loops = ((of[:steps], of[steps:]) for of in (structure.ranks, structure.place))
-        _add_chain(self._poses, deviation, step_std, chain[0], loops[0], diagonal, lower, right)
-        _add_loops(
-            self._poses, self._nodes, self._residuals, self._information, chain[1], loops[1], diagonal, lower, right
+        deviation, structure = state.deviation[0].double().numpy(), self._structure
+        step_std = self._step_std
+        if step_std is None or stiffness is not self._stiffness:
+            self._stiffness, step_std = stiffness, self._std.copy()
+            factor = np.exp(3.0 * np.tanh(stiffness.double().numpy() / 3.0))
+            step_std[self._steps.key_frames :] *= (factor[0] if factor.ndim == 3 else factor) * self._noise
+            self._step_std = step_std
+        diagonal, lower, right = _linearised(
+            self._poses, deviation, step_std, self._nodes, self._residuals, self._information, structure.ranks,
+            structure.place, structure.blocks.blocks,
         )  # fmt: skip
         equations = FactorisedInformation(structure.blocks, diagonal, lower)
-        _deviate(self._poses, equations.step(right), deviation)
+        deviation = _deviated(self._poses, equations.step(right), deviation)
         kind = state.deviation.dtype
         weights, information = (torch.from_numpy(values).unsqueeze(0).to(kind) for values in self._of_all_loops())
         self._closed = ClosedLoops(self._loops, weights, information, equations)
-        return replace(
-            state,
-            deviation=torch.from_numpy(deviation).unsqueeze(0),
-            step_std=torch.from_numpy(step_std).unsqueeze(0),
-        )
+        changed = (torch.from_numpy(values).unsqueeze(0) for values in (deviation, step_std))
+        return GraphState(state.adjusted, *changed, state.features)
 
     def _of_all_loops(self) -> tuple[Array, Array]:
         """Weights ``(n,)`` and information ``(n, 3)`` of all loops, those without a share in the equations included."""
-        if self._solution is None:
-            return self._weights.copy(), self._information.copy()
-        weights, information = self._solution.weights.copy(), self._solution.information.copy()
+        weights, information = np.zeros(self._loops.start.shape[1]), np.zeros((self._loops.start.shape[1], 3))
+        if (solution := self._solution) is not None:
+            weights, information = np.maximum(solution.weights, 0.0), np.maximum(solution.information, 0.0)
         weights[self._used], information[self._used] = self._weights, self._information
         return weights, information
 
 
 def _of(layer: nn.Linear) -> tuple[Array, Array]:
     """Weights, inputs first, and biases of a layer."""
-    return layer.weight.detach().float().numpy().T.copy(), layer.bias.detach().float().numpy()
+    return np.ascontiguousarray(layer.weight.detach().float().numpy().T), layer.bias.detach().float().numpy()
 
 
 @njit(cache=True, error_model="numpy")
-def _residuals(
-    poses: Array, step_std: Array, nodes: Array, measured: Array, most_drift: Array, residuals: Array, expected: Array
-) -> None:
-    """As ``loop_residuals`` and ``odometry_variances``, limited by ``most_drift``."""
+def _test(relative: Array, std: Array, nodes: Array, measured: Array, which: Array, valid: Array) -> None:
+    """Take their validity from loops, of those of the indices ``which``, that contradict the odometry."""
+    poses = chained(relative)
+    prefix = _drifts(poses, np.maximum(std, LEAST_STD))
+    residual, expected = np.empty(3), np.empty(3)
+    for k in which:
+        _residual(poses, nodes[k], measured[k], residual)
+        _expected(poses, prefix, nodes[k], expected)
+        squared = 0.0
+        for c in range(3):
+            squared += residual[c] ** 2 / max(expected[c], LEAST_VARIANCE)
+        valid[k] &= squared <= FARTHEST**2
+
+
+@njit(cache=True, error_model="numpy")
+def _drifts(poses: Array, step_std: Array) -> Array:
+    """Sums over the steps before each pose ``(n + 1, 7)``, from which ``odometry_variances`` follow."""
     prefix = np.zeros((len(poses), 7))
     for k in range(len(step_std)):
         along_x = math.cos(poses[k, 2]) ** 2
@@ -179,55 +167,115 @@ def _residuals(
         prefix[k + 1, 4] = prefix[k, 4] + turn * y
         prefix[k + 1, 5] = prefix[k, 5] + turn * x * x
         prefix[k + 1, 6] = prefix[k, 6] + turn * y * y
-    for k in range(len(nodes)):
-        a, b = nodes[k]
-        cos, sin = math.cos(poses[a, 2]), math.sin(poses[a, 2])
-        x, y = poses[b, 0], poses[b, 1]
-        residuals[k, 0] = poses[a, 0] + cos * measured[k, 0] - sin * measured[k, 1] - x
-        residuals[k, 1] = poses[a, 1] + sin * measured[k, 0] + cos * measured[k, 1] - y
-        residuals[k, 2] = wrap(poses[a, 2] + measured[k, 2] - poses[b, 2])
-        turn = prefix[b, 2] - prefix[a, 2]
-        across_x = x * (x * turn - 2.0 * (prefix[b, 3] - prefix[a, 3])) + prefix[b, 5] - prefix[a, 5]
-        across_y = y * (y * turn - 2.0 * (prefix[b, 4] - prefix[a, 4])) + prefix[b, 6] - prefix[a, 6]
-        expected[k, 0] = min(max(prefix[b, 0] - prefix[a, 0] + across_y, 0.0), most_drift[k, 0])
-        expected[k, 1] = min(max(prefix[b, 1] - prefix[a, 1] + across_x, 0.0), most_drift[k, 1])
-        expected[k, 2] = min(max(turn, 0.0), most_drift[k, 2])
+    return prefix
 
 
 @njit(cache=True, error_model="numpy")
-def _gate_inputs(
-    constants: Array, residuals: Array, expected: Array, annealing: float, noise: Array, inputs: Array, squared: Array
-) -> None:
-    """What ``RobustLoopGate`` sees ``(n, 11)``, and squared residuals ``(n,)`` in deviations.
+def _expected(poses: Array, prefix: Array, nodes: Array, expected: Array) -> None:
+    """What ``odometry_variances`` expect of a loop ``(3,)``, of the sums of ``_drifts``."""
+    a, b = nodes
+    x, y = poses[b, 0], poses[b, 1]
+    turn = prefix[b, 2] - prefix[a, 2]
+    across_x = x * (x * turn - 2.0 * (prefix[b, 3] - prefix[a, 3])) + prefix[b, 5] - prefix[a, 5]
+    across_y = y * (y * turn - 2.0 * (prefix[b, 4] - prefix[a, 4])) + prefix[b, 6] - prefix[a, 6]
+    expected[0] = max(prefix[b, 0] - prefix[a, 0] + across_y, 0.0)
+    expected[1] = max(prefix[b, 1] - prefix[a, 1] + across_x, 0.0)
+    expected[2] = max(turn, 0.0)
 
-    ``constants`` ``(n, 11)``: description, logarithms of length and scales, logit, valid; ``noise`` ``(2, 2)``: that of
-    the gate, and its components.
+
+@njit(cache=True, error_model="numpy")
+def _residual(poses: Array, nodes: Array, measured: Array, residual: Array) -> None:
+    """As ``loop_residuals``, of one loop ``(3,)``."""
+    a, b = nodes
+    cos, sin = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+    residual[0] = poses[a, 0] + cos * measured[0] - sin * measured[1] - poses[b, 0]
+    residual[1] = poses[a, 1] + sin * measured[0] + cos * measured[1] - poses[b, 1]
+    residual[2] = wrap(poses[a, 2] + measured[2] - poses[b, 2])
+
+
+@njit(cache=True, error_model="numpy")
+def _constants(
+    similarity: Array, logit: Array, log_scale: Array, spread: Array, log_length: Array, noise: Array
+) -> Array:
+    """What is the same under all poses ``(n, 10)``: ``Loops.description``, that of the length, variances, and logit."""
+    constants = np.empty((len(logit), 10))
+    for k in range(len(logit)):
+        row = constants[k]
+        row[0], row[1], row[6], row[9] = similarity[k], logit[k] / 5.0, log_length[k] / 3.0, logit[k]
+        for c in range(2):
+            row[2 + c], row[4 + c] = log_scale[k, c], spread[k, c] - log_scale[k, c]
+            row[7 + c] = math.exp(2.0 * log_scale[k, c]) * noise[c]
+    return constants
+
+
+@njit(cache=True, error_model="numpy")
+def _judge(
+    relative: Array,
+    step_std: Array,
+    nodes: Array,
+    measured: Array,
+    most_drift: Array,
+    constants: Array,
+    judged: Array,
+    annealing: float,
+    components: Array,
+    weight_1: Array,
+    bias_1: Array,
+    weight_2: Array,
+    bias_2: Array,
+    weight_3: Array,
+    bias_3: Array,
+    gates: Array,
+    information: Array,
+) -> tuple[Array, Array]:
+    """Poses ``(n + 1, 3)`` and residuals of all loops; gates and information of the ``judged``, as ``RobustLoopGate``.
+
+    ``components`` ``(2,)`` are those of the gate; weights and biases are those of its layers.
     """
-    for k in range(len(constants)):
+    poses = chained(relative)
+    residuals, expected = np.empty((len(nodes), 3)), np.empty(3)
+    for k in range(len(nodes)):
+        _residual(poses, nodes[k], measured[k], residuals[k])
+    if len(judged) == 0:
+        return poses, residuals
+    prefix = _drifts(poses, step_std)
+    hidden_1, hidden_2, belief = np.empty_like(bias_1), np.empty_like(bias_2), np.empty_like(bias_3)
+    inputs = np.empty(weight_1.shape[0], np.float32)
+    for k in judged:
+        _expected(poses, prefix, nodes[k], expected)
+        for c in range(3):
+            expected[c] = min(expected[c], most_drift[k, c])
         errors = (residuals[k, 0] ** 2 + residuals[k, 1] ** 2, residuals[k, 2] ** 2)
-        drifts = (annealing * (expected[k, 0] + expected[k, 1]), annealing * expected[k, 2])
-        for c in range(6):
-            inputs[k, c] = constants[k, c]
-        inputs[k, 6] = constants[k, 6] / 3.0
-        total = 0.0
+        drifts = (annealing * (expected[0] + expected[1]), annealing * expected[2])
+        for c in range(7):
+            inputs[c] = constants[k, c]
+        squared = 0.0
         for c in range(2):
-            both = math.exp(2.0 * constants[k, 7 + c]) * noise[0, c] * noise[1, c]
-            inputs[k, 7 + c] = math.log1p(errors[c] / both) / 3.0
-            total += errors[c] / (both + drifts[c])
-        squared[k], inputs[k, 9], inputs[k, 10] = total, math.log1p(total), annealing
-
-
-@njit(cache=True, error_model="numpy")
-def _gates(constants: Array, belief: Array, squared: Array, noise: Array, gates: Array, information: Array) -> None:
-    """Gates ``(n,)`` and information ``(n, 3)`` of what the layers of ``RobustLoopGate`` say ``(n, 3)``."""
-    for k in range(len(constants)):
-        kernel = (1.0 + squared[k] / _KERNEL_WIDTH) ** 2
-        gate = constants[k, 10] / ((1.0 + math.exp(-(constants[k, 9] + 2.0) - 4.0 * belief[k, 0])) * kernel)
-        gates[k] = gate
+            both = constants[k, 7 + c] * components[c]
+            inputs[7 + c] = math.log1p(errors[c] / both) / 3.0
+            squared += errors[c] / (both + drifts[c])
+        inputs[9], inputs[10] = math.log1p(squared), annealing
+        _layer(inputs, weight_1, bias_1, hidden_1, False)
+        _layer(hidden_1, weight_2, bias_2, hidden_2, True)
+        _layer(hidden_2, weight_3, bias_3, belief, True)
+        kernel = (1.0 + squared / _KERNEL_WIDTH) ** 2
+        gates[k] = 1.0 / ((1.0 + math.exp(-(constants[k, 9] + 2.0) - 4.0 * belief[0])) * kernel)
         for c in range(2):
-            variance = math.exp(2.0 * constants[k, 7 + c]) * noise[0, c]
-            information[k, 1 + c] = gate * math.exp(4.0 * math.tanh(belief[k, 1 + c] / 2.0)) / variance
+            information[k, 1 + c] = gates[k] * math.exp(4.0 * math.tanh(belief[1 + c] / 2.0)) / constants[k, 7 + c]
         information[k, 0] = information[k, 1]
+    return poses, residuals
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _layer(inputs: Array, weight: Array, bias: Array, result: Array, rectified: bool) -> None:
+    """A linear layer of its inputs, or of those that are positive."""
+    result[:] = bias
+    for i in range(len(inputs)):
+        value = inputs[i]
+        if rectified and value <= 0.0:
+            continue
+        for j in range(len(result)):
+            result[j] += value * weight[i, j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -354,9 +402,30 @@ def _add_loops(
                     lower[between, c, 2] += moment
 
 
+@njit(cache=True, error_model="numpy")
+def _linearised(
+    poses: Array,
+    deviation: Array,
+    step_std: Array,
+    nodes: Array,
+    residuals: Array,
+    information: Array,
+    ranks: Array,
+    place: Array,
+    blocks: int,
+) -> tuple[Array, Array, Array]:
+    """The normal equations, as ``GraphStructure.empty`` has their blocks; ranks and places of the steps come first."""
+    steps = len(deviation)
+    diagonal, lower, right = np.zeros((steps, 3, 3)), np.zeros((blocks, 3, 3)), np.zeros((steps, 3, 1))
+    _add_chain(poses, deviation, step_std, ranks, place, diagonal, lower, right)
+    _add_loops(poses, nodes, residuals, information, ranks[steps:], place[steps:], diagonal, lower, right)
+    return diagonal, lower, right
+
+
 @njit(cache=True)
-def _deviate(poses: Array, change: Array, deviation: Array) -> None:
-    """Add to deviations ``(n, 3)`` what a change of the poses ``(n + 1, 3)`` changes in the steps between them."""
+def _deviated(poses: Array, change: Array, before: Array) -> Array:
+    """Deviations ``(n, 3)`` with what a change of the poses ``(n + 1, 3)`` changes in the steps between them."""
+    deviation = before.copy()
     for k in range(len(deviation)):
         cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
         x, y = poses[k + 1, 0] - poses[k, 0], poses[k + 1, 1] - poses[k, 1]
@@ -366,3 +435,4 @@ def _deviate(poses: Array, change: Array, deviation: Array) -> None:
         deviation[k, 0] += new_cos * new_x + new_sin * new_y - cos * x - sin * y
         deviation[k, 1] += new_cos * new_y - new_sin * new_x - cos * y + sin * x
         deviation[k, 2] += wrap(change[k + 1, 2] - change[k, 2])
+    return deviation

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -311,7 +312,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
 
             closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
             if solution is not None and not witnesses:
-                test = partial(test, which=~solution.known)
+                test = partial(test, which=np.flatnonzero(~solution.known))
         believed = test(loops, steps)
         if witnesses:
             believed = agreeing(believed, steps, witnesses)
