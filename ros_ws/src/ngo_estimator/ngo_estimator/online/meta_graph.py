@@ -40,8 +40,8 @@ _AGAIN = 8
 _TOLD_LATE = 16
 """Frames before the first unfamiliar one that were taken for familiar and may not have been: a mean over them tells."""
 
-_RESUMED = 2
-"""Iterations of an optimisation that goes on from the last solution."""
+_RESUMED = 1
+"""Results of an optimisation that goes on from the last solution."""
 
 _BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features", "familiar", "fixed")
 """Names of the newest rows: the first three and ``familiar`` of each step, the others of each block; without a network

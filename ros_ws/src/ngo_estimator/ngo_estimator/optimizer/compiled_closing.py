@@ -6,7 +6,7 @@ Tensors of some hundred rows cost more in calls than in arithmetic. Here an iter
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from ngo_estimator.optimizer.block_cholesky import Array
 from ngo_estimator.optimizer.loop_closing import CHANNELS, OVERLAPS_AFTER, LoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
-from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
+from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation, GraphStructure
 from ngo_estimator.optimizer.odometry_test import FARTHEST, LEAST_STD, LEAST_VARIANCE
 
@@ -38,6 +38,59 @@ def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | None =
     return replace(loops, valid=valid)
 
 
+class _Equations:
+    """The loops that have a share in the normal equations of one trajectory, and these.
+
+    Args:
+        gate: how much each loop is trusted.
+        std: deviations ``(n, 3)`` of the steps between the poses.
+        solution: an earlier one, whose belief in the loops that it knew stays; only others are judged.
+    """
+
+    def __init__(self, gate: RobustLoopGate, std: Array, loops: Loops, solution: Solution | None = None) -> None:
+        linear = [layer for layer in (*gate.layers, gate.head) if isinstance(layer, nn.Linear)]
+        self._layers = [array for layer in linear for array in _of(layer)]
+        self._components = gate.components.double().numpy()
+        nodes, measured = loops.nodes[0].numpy(), loops.measured[0].double().numpy()
+        limits = np.full((len(nodes), 3), np.inf) if loops.most_drift is None else loops.most_drift[0].double().numpy()
+        constants = _constants(
+            loops.similarity[0].numpy(), loops.logit[0].numpy(), loops.log_scale[0].numpy(), loops.spread[0].numpy(),
+            loops.log_length[0].numpy(), gate.noise.double().numpy(),
+        )  # fmt: skip
+        self.all_weights, self.all_information = np.zeros(len(nodes)), np.zeros((len(nodes), 3))
+        """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
+        used, judged = loops.valid[0].numpy(), np.ones(len(nodes), np.bool_)
+        if solution is not None:
+            known, judged = solution.known, ~solution.known
+            used = np.where(known, solution.weights >= _LEAST_WEIGHT, used)
+            self.all_weights[known], self.all_information[known] = solution.weights[known], solution.information[known]
+        self._used = used = np.flatnonzero(used)
+        self._judged = np.flatnonzero(judged[used])
+        self.weights, self._information = self.all_weights[used], self.all_information[used]
+        self.nodes = nodes = nodes[used]
+        """Of the loops that have a share ``(m, 2)``; likewise ``weights`` ``(m,)``, and residuals behind ``judge``."""
+        self._measured, self._most_drift, self._constants = measured[used], limits[used], constants[used]
+        self._structure = GraphStructure(nodes, len(std) + 1, chain=True)
+
+    def judge(self, relative: Array, step_std: Array, iteration: int) -> None:
+        """Judge the loops under poses of which these are the relative ones ``(n, 3)``, with their deviations."""
+        self.poses, self.residuals = _judge(
+            relative, step_std, self.nodes, self._measured, self._most_drift, self._constants, self._judged,
+            RobustLoopGate.ANNEALING**iteration, self._components, *self._layers, self.weights, self._information,
+        )  # fmt: skip
+        self.all_weights[self._used], self.all_information[self._used] = self.weights, self._information
+
+    def solve(self, deviation: Array, step_std: Array) -> tuple[Array, FactorisedInformation]:
+        """What the steps deviate ``(n, 3)`` after a Gauss-Newton step from the poses of the last ``judge``."""
+        structure = self._structure
+        diagonal, lower, right = _linearised(
+            self.poses, deviation, step_std, self.nodes, self.residuals, self._information, structure.ranks,
+            structure.place, structure.blocks.blocks,
+        )  # fmt: skip
+        equations = FactorisedInformation(structure.blocks, diagonal, lower)
+        return _deviated(self.poses, equations.step(right), deviation), equations
+
+
 class CompiledClosing(LoopClosing):
     """As ``LoopClosing``, for a single trajectory on the CPU, without gradients; arguments as there."""
 
@@ -49,86 +102,88 @@ class CompiledClosing(LoopClosing):
         find_overlaps: Callable[[Tensor], Loops | None],
         odometry_noise: Tensor,
         correction_std: Tensor,
-        solution: Solution | None = None,
     ) -> None:
-        super().__init__(gate, steps, loops, find_overlaps, odometry_noise, correction_std, solution)
-        linear = [layer for layer in (*gate.layers, gate.head) if isinstance(layer, nn.Linear)]
-        self._layers = [array for layer in linear for array in _of(layer)]
-        self._gate_noise, self._components = gate.noise.double().numpy(), gate.components.double().numpy()
-        self._noise, self._unit = odometry_noise.double().numpy(), correction_std.double().numpy()
+        super().__init__(gate, steps, loops, find_overlaps, odometry_noise, correction_std)
+        self._unit = correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
-        self._stiffness: Tensor | None = None
-        """That of the last iteration, and the deviations ``(n, 3)`` with which the odometry is believed then."""
-        self._step_std: Array | None = None
-        self._take(loops)
-
-    def _take(self, loops: Loops) -> None:
-        self._loops = loops
-        nodes, measured = loops.nodes[0].numpy(), loops.measured[0].double().numpy()
-        count = len(nodes)
-        limits = np.full((count, 3), np.inf) if loops.most_drift is None else loops.most_drift[0].double().numpy()
-        constants = _constants(
-            loops.similarity[0].numpy(), loops.logit[0].numpy(), loops.log_scale[0].numpy(), loops.spread[0].numpy(),
-            loops.log_length[0].numpy(), self._gate_noise,
-        )  # fmt: skip
-        valid, solution = loops.valid[0].numpy(), self._solution
-        used = valid if solution is None else np.where(solution.known, solution.weights >= _LEAST_WEIGHT, valid)
-        self._used = used = np.flatnonzero(used)
-        """Which loops are in the equations: others would fill them, and change nothing."""
-        if solution is None:
-            self._weights, self._information = np.empty(len(used)), np.empty((len(used), 3))
-            self._judged = np.arange(len(used))
-        else:
-            self._weights, self._information = solution.weights[used], solution.information[used]
-            self._judged = np.flatnonzero(~solution.known[used])
-        self._nodes = nodes = nodes[used]
-        self._measured, self._most_drift, self._constants = measured[used], limits[used], constants[used]
-        self._structure = GraphStructure(nodes, len(self._std) + 1, chain=True)
+        self._equations = _Equations(gate, self._std, loops)
 
     def look(self, state: GraphState, iteration: int) -> None:
         """As ``LoopClosing.look``."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
-            self._take(self._loops.and_also(overlaps))
-        relative, step_std = state.relative[0].double().numpy(), state.step_std[0].double().numpy()
-        self._poses, self._residuals = _judge(
-            relative, step_std, self._nodes, self._measured, self._most_drift, self._constants, self._judged,
-            RobustLoopGate.ANNEALING**iteration, self._components, *self._layers, self._weights, self._information,
-        )  # fmt: skip
+            self._loops = self._loops.and_also(overlaps)
+            self._equations = _Equations(self._gate, self._std, self._loops)
+        relative, step_std = (
+            array[0].double().numpy() for array in (state.adjusted.double() + state.deviation, state.step_std)
+        )
+        self._equations.judge(relative, step_std, iteration)
 
     def channels(self, state: GraphState) -> Tensor:
         """As ``LoopClosing.channels``."""
         deviation, channels = state.deviation[0].double().numpy(), np.empty((self._steps.blocks, CHANNELS), np.float32)
-        _channels(self._poses, deviation, self._nodes, self._residuals, self._weights, self._unit, channels)
+        of = self._equations
+        _channels(of.poses, deviation, of.nodes, of.residuals, of.weights, self._unit, channels)
         return torch.from_numpy(channels).unsqueeze(0)
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """As ``LoopClosing.close``."""
-        deviation, structure = state.deviation[0].double().numpy(), self._structure
-        step_std = self._step_std
-        if step_std is None or stiffness is not self._stiffness:
-            self._stiffness, step_std = stiffness, self._std.copy()
-            factor = np.exp(3.0 * np.tanh(stiffness.double().numpy() / 3.0))
-            step_std[self._steps.key_frames :] *= (factor[0] if factor.ndim == 3 else factor) * self._noise
-            self._step_std = step_std
-        diagonal, lower, right = _linearised(
-            self._poses, deviation, step_std, self._nodes, self._residuals, self._information, structure.ranks,
-            structure.place, structure.blocks.blocks,
-        )  # fmt: skip
-        equations = FactorisedInformation(structure.blocks, diagonal, lower)
-        deviation = _deviated(self._poses, equations.step(right), deviation)
-        kind = state.deviation.dtype
-        weights, information = (torch.from_numpy(values).unsqueeze(0).to(kind) for values in self._of_all_loops())
-        self._closed = ClosedLoops(self._loops, weights, information, equations)
+        step_std = _softened(self._steps, stiffness, self._odometry_noise)
+        deviation, equations = self._equations.solve(state.deviation[0].double().numpy(), step_std)
+        self._closed = _closed(self._loops, self._equations, equations, state.deviation.dtype)
         changed = (torch.from_numpy(values).unsqueeze(0) for values in (deviation, step_std))
         return GraphState(state.adjusted, *changed, state.features)
 
-    def _of_all_loops(self) -> tuple[Array, Array]:
-        """Weights ``(n,)`` and information ``(n, 3)`` of all loops, those without a share in the equations included."""
-        weights, information = np.zeros(self._loops.start.shape[1]), np.zeros((self._loops.start.shape[1], 3))
-        if (solution := self._solution) is not None:
-            weights, information = np.maximum(solution.weights, 0.0), np.maximum(solution.information, 0.0)
-        weights[self._used], information[self._used] = self._weights, self._information
-        return weights, information
+
+def resumed(
+    gate: RobustLoopGate,
+    steps: MetaSteps,
+    loops: Loops,
+    adjusted: Tensor,
+    stiffness: Tensor,
+    odometry_noise: Tensor,
+    solution: Solution,
+    last: int,
+) -> Iterator[OptimizedMetaPoses]:
+    """The result that begins at an earlier solution, of one trajectory.
+
+    New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the ``last``
+    one. Others keep what an annealing of all loops gave them.
+
+    Args:
+        adjusted: relative poses ``(1, n, 3)`` with all adjustments; stiffness: of the last iteration.
+    """
+    step_std = _softened(steps, stiffness, odometry_noise)
+    own, relative, std = adjusted[0].double().numpy(), solution.relative[0].numpy(), steps.std[0].double().numpy()
+    every = _Equations(gate, std, loops, solution)
+
+    def results() -> Iterator[OptimizedMetaPoses]:
+        deviation = relative - own
+        deviation[:, 2] = np.remainder(deviation[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+        before = std
+        for iteration in (0, last):
+            every.judge(own + deviation, before, iteration)
+            deviation, equations = every.solve(deviation, step_std)
+            before = step_std
+        poses = torch.from_numpy(own + deviation).unsqueeze(0).to(steps.relative.dtype)
+        closed = _closed(loops, every, equations, torch.float64)
+        yield OptimizedMetaPoses([poses], torch.from_numpy(step_std).unsqueeze(0), closed)
+
+    return results()
+
+
+def _closed(loops: Loops, of: _Equations, equations: FactorisedInformation, kind: torch.dtype) -> ClosedLoops:
+    weights, information = (
+        torch.from_numpy(values.copy()).unsqueeze(0).to(kind) for values in (of.all_weights, of.all_information)
+    )
+    return ClosedLoops(loops, weights, information, equations)
+
+
+def _softened(steps: MetaSteps, stiffness: Tensor, odometry_noise: Tensor) -> Array:
+    """Deviations ``(n, 3)`` with which the odometry is believed."""
+    step_std = steps.std[0].double().numpy().copy()
+    factor = np.exp(3.0 * np.tanh(stiffness.double().numpy() / 3.0))
+    step_std[steps.key_frames :] *= (factor[0] if factor.ndim == 3 else factor) * odometry_noise.double().numpy()
+    return step_std
 
 
 def _of(layer: nn.Linear) -> tuple[Array, Array]:

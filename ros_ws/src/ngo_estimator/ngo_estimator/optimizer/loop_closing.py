@@ -16,7 +16,7 @@ from ngo_estimator.optimizer.gauss_newton import chain_factors, gauss_newton_ste
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances, spread_over_span
-from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
+from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -65,7 +65,6 @@ class LoopClosing:
         find_overlaps: gives further loops under corrected poses ``(batch, poses + 1, 3)``, or None.
         odometry_noise: ``(3,)`` factors between the deviations of ``steps`` and those of the odometry's real errors.
         correction_std: ``(3,)`` unit of residuals and deviations for the convolutions.
-        solution: an earlier one, whose belief in the loops that it knew stays.
     """
 
     def __init__(
@@ -76,10 +75,9 @@ class LoopClosing:
         find_overlaps: Callable[[Tensor], Loops | None],
         odometry_noise: Tensor,
         correction_std: Tensor,
-        solution: Solution | None = None,
     ) -> None:
         self._gate, self._steps, self._loops, self._find_overlaps = gate, steps, loops, find_overlaps
-        self._odometry_noise, self._correction_std, self._solution = odometry_noise, correction_std, solution
+        self._odometry_noise, self._correction_std = odometry_noise, correction_std
         self._gated: _GatedLoops
         self._closed: ClosedLoops | None = None
 
@@ -100,10 +98,6 @@ class LoopClosing:
         if loops.most_drift is not None:
             expected = torch.minimum(expected, loops.most_drift)
         weights, information = self._gate(loops, residuals, expected, iteration)
-        if (solution := self._solution) is not None:
-            known, before = (torch.from_numpy(part) for part in (solution.known, solution.information))
-            weights = torch.where(known, torch.from_numpy(solution.weights), weights)
-            information = torch.where(known.unsqueeze(-1), before, information)
         self._gated = _GatedLoops(poses, loops, residuals, weights, information)
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:

@@ -223,8 +223,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
                 running it.
-            solution: of an optimisation that took these corrections, to go on from: there are two iterations then.
-                Its belief in loops stays; only new loops are judged.
+            solution: of an optimisation that took these corrections, to go on from. There is one result then, for a
+                single trajectory on the CPU without gradients. The belief in loops stays; only new ones are judged.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -232,11 +232,11 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
-        resumes = corrections is not None and solution is not None
-        closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops, solution if resumes else None)
+        if loops is None:
+            return self._annealed(steps, NoLoopClosing(), self._phases(steps, loops, corrections))
         if corrections is not None and solution is not None:
-            return self._resumed(steps, closing, corrections, solution)
-        return self._annealed(steps, closing, self._phases(steps, loops, corrections))
+            return self._resumed(steps, loops, corrections, solution)
+        return self._annealed(steps, self._loop_closing(steps, loops), self._phases(steps, loops, corrections))
 
     def _annealed(
         self,
@@ -260,29 +260,22 @@ class NeuralGraphOptimizer(AttentionNetwork):
             yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made, left)
 
     def _resumed(
-        self,
-        steps: MetaSteps,
-        closing: LoopClosing | NoLoopClosing,
-        corrections: Sequence[Correction],
-        solution: Solution,
+        self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
     ) -> Iterator[OptimizedMetaPoses]:
-        """The results that begin at an earlier solution.
+        from ngo_estimator.optimizer import compiled_closing  # see _loop_closing
 
-        New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last
-        one. Others keep what an annealing of all loops gave them.
-        """
         before = GraphState.initial(steps)
         adjusted = before.adjusted.clone()
         for adjustment, _ in corrections:
             adjusted[:, steps.key_frames :] += adjustment
         state, stiffness = _without_fixed(before, replace(before, adjusted=adjusted), corrections[-1].stiffness, steps)
-        state = replace(state, deviation=se2.wrapped(solution.relative - state.adjusted.double()))
-        results = []
-        for left, iteration in ((1, 0), (0, self.config.iterations - 1)):
-            closing.look(state, iteration)
-            state = closing.close(state, stiffness)
-            results.append(state.relative.to(steps.relative.dtype))
-            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, left=left)
+        # Where others must agree with a new loop, all of them are looked at.
+        which = None if self.config.search.witnesses else np.flatnonzero(~solution.known)
+        believed = self._agreeing(compiled_closing.without_contradictions(loops, steps, which), steps)
+        last = self.config.iterations - 1
+        return compiled_closing.resumed(
+            self.loop_gate, steps, believed, state.adjusted, stiffness, self.odometry_noise, solution, last
+        )
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
@@ -302,23 +295,20 @@ class NeuralGraphOptimizer(AttentionNetwork):
         found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
         return without_contradictions(found, steps)
 
-    def _loop_closing(self, steps: MetaSteps, loops: Loops, solution: Solution | None) -> LoopClosing:
+    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
         find_overlaps = partial(self.overlaps, steps, loops)
         closing, test = LoopClosing, without_contradictions
-        witnesses = self.config.search.witnesses
         if not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu":
             # The compiler's library takes 100 MB: only those pay for it that optimise.
             from ngo_estimator.optimizer import compiled_closing
 
             closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
-            if solution is not None and not witnesses:
-                test = partial(test, which=np.flatnonzero(~solution.known))
-        believed = test(loops, steps)
-        if witnesses:
-            believed = agreeing(believed, steps, witnesses)
-        return closing(
-            self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std, solution
-        )
+        believed = self._agreeing(test(loops, steps), steps)
+        return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+
+    def _agreeing(self, loops: Loops, steps: MetaSteps) -> Loops:
+        witnesses = self.config.search.witnesses
+        return agreeing(loops, steps, witnesses) if witnesses else loops
 
 
 def _without_fixed(
