@@ -51,26 +51,25 @@ class _Equations:
         linear = [layer for layer in (*gate.layers, gate.head) if isinstance(layer, nn.Linear)]
         self._layers = [array for layer in linear for array in _of(layer)]
         self._components = gate.components.double().numpy()
-        nodes, measured = loops.nodes[0].numpy(), loops.measured[0].double().numpy()
-        limits = np.full((len(nodes), 3), np.inf) if loops.most_drift is None else loops.most_drift[0].double().numpy()
-        constants = _constants(
-            loops.similarity[0].numpy(), loops.logit[0].numpy(), loops.log_scale[0].numpy(), loops.spread[0].numpy(),
-            loops.log_length[0].numpy(), gate.noise.double().numpy(),
-        )  # fmt: skip
-        self.all_weights, self.all_information = np.zeros(len(nodes)), np.zeros((len(nodes), 3))
-        """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
-        used, judged = loops.valid[0].numpy(), np.ones(len(nodes), np.bool_)
+        count = loops.start.shape[1]
+        known, weights, information = np.zeros(count, np.bool_), np.zeros(count), np.zeros((count, 3))
         if solution is not None:
-            known, judged = solution.known, ~solution.known
-            used = np.where(known, solution.weights >= _LEAST_WEIGHT, used)
-            self.all_weights[known], self.all_information[known] = solution.weights[known], solution.information[known]
-        self._used = used = np.flatnonzero(used)
-        self._judged = np.flatnonzero(judged[used])
+            known, weights, information = solution.known, solution.weights, solution.information
+        self._used = used = np.flatnonzero(np.where(known, weights >= _LEAST_WEIGHT, loops.valid[0].numpy()))
+        self._judged = np.flatnonzero(~known[used])
+        self.all_weights, self.all_information = np.maximum(weights, 0.0), np.maximum(information, 0.0)
+        """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
         self.weights, self._information = self.all_weights[used], self.all_information[used]
-        self.nodes = nodes = nodes[used]
-        """Of the loops that have a share ``(m, 2)``; likewise ``weights`` ``(m,)``, and residuals behind ``judge``."""
-        self._measured, self._most_drift, self._constants = measured[used], limits[used], constants[used]
-        self._structure = GraphStructure(nodes, len(std) + 1, chain=True)
+        limits = loops.measured.new_full((1, count, 3), torch.inf) if loops.most_drift is None else loops.most_drift
+        record = (
+            loops.start, loops.end, loops.measured, limits, loops.similarity, loops.logit, loops.log_scale,
+            loops.spread, loops.log_length,
+        )  # fmt: skip
+        self.nodes, self._measured, self._most_drift, self._constants = _constants(
+            *(field[0].numpy() for field in record), gate.noise.double().numpy(), used
+        )
+        """Of the loops that have a share ``(m, ...)``; likewise ``weights``, and residuals behind ``judge``."""
+        self._structure = GraphStructure(self.nodes, len(std) + 1, chain=True)
 
     def judge(self, relative: Array, step_std: Array, iteration: int) -> None:
         """Judge the loops under poses of which these are the relative ones ``(n, 3)``, with their deviations."""
@@ -250,17 +249,35 @@ def _residual(poses: Array, nodes: Array, measured: Array, residual: Array) -> N
 
 @njit(cache=True, error_model="numpy")
 def _constants(
-    similarity: Array, logit: Array, log_scale: Array, spread: Array, log_length: Array, noise: Array
-) -> Array:
-    """What is the same under all poses ``(n, 10)``: ``Loops.description``, that of the length, variances, and logit."""
-    constants = np.empty((len(logit), 10))
-    for k in range(len(logit)):
-        row = constants[k]
-        row[0], row[1], row[6], row[9] = similarity[k], logit[k] / 5.0, log_length[k] / 3.0, logit[k]
+    start: Array,
+    end: Array,
+    measured: Array,
+    limits: Array,
+    similarity: Array,
+    logit: Array,
+    log_scale: Array,
+    spread: Array,
+    log_length: Array,
+    noise: Array,
+    used: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Of the loops ``used``: nodes, measurements, what limits their drift, and what the gate sees under all poses.
+
+    The last are ``(m, 10)``: ``Loops.description``, that of the length, variances, and logit.
+    """
+    count = len(used)
+    nodes, constants = np.empty((count, 2), np.int64), np.empty((count, 10))
+    poses, most = np.empty((2, count, 3))
+    for k in range(count):
+        loop, row = used[k], constants[k]
+        nodes[k, 0], nodes[k, 1] = start[loop], end[loop] + 1
+        for c in range(3):
+            poses[k, c], most[k, c] = measured[loop, c], limits[loop, c]
+        row[0], row[1], row[6], row[9] = similarity[loop], logit[loop] / 5.0, log_length[loop] / 3.0, logit[loop]
         for c in range(2):
-            row[2 + c], row[4 + c] = log_scale[k, c], spread[k, c] - log_scale[k, c]
-            row[7 + c] = math.exp(2.0 * log_scale[k, c]) * noise[c]
-    return constants
+            row[2 + c], row[4 + c] = log_scale[loop, c], spread[loop, c] - log_scale[loop, c]
+            row[7 + c] = math.exp(2.0 * log_scale[loop, c]) * noise[c]
+    return nodes, poses, most, constants
 
 
 @njit(cache=True, error_model="numpy")
