@@ -90,9 +90,7 @@ def turned_covariance(yaw: float, covariance: Array) -> Array:
 
 
 @njit(cache=True)
-def carried(
-    pose: Array, covariance: Array, odometry: Array, relative: Array, variance: Array
-) -> tuple[Array, Array]:
+def carried(pose: Array, covariance: Array, odometry: Array, relative: Array, variance: Array) -> tuple[Array, Array]:
     """A pose and its covariance after further steps, as ``planar_covariance.propagate`` has it for each.
 
     Args:

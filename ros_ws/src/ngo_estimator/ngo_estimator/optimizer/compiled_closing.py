@@ -49,7 +49,7 @@ class _Equations:
 
     def __init__(self, gate: RobustLoopGate, std: Array, loops: Loops, solution: Solution | None = None) -> None:
         linear = [layer for layer in (*gate.layers, gate.head) if isinstance(layer, nn.Linear)]
-        self._layers = [array for layer in linear for array in _of(layer)]
+        self._layers = tuple(_of(layer) for layer in linear)
         self._components = gate.components.double().numpy()
         count = loops.start.shape[1]
         known, weights, information = np.zeros(count, np.bool_), np.zeros(count), np.zeros((count, 3))
@@ -61,12 +61,10 @@ class _Equations:
         """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
         self.weights, self._information = self.all_weights[used], self.all_information[used]
         limits = loops.measured.new_full((1, count, 3), torch.inf) if loops.most_drift is None else loops.most_drift
-        record = (
-            loops.start, loops.end, loops.measured, limits, loops.similarity, loops.logit, loops.log_scale,
-            loops.spread, loops.log_length,
-        )  # fmt: skip
-        self.nodes, self._measured, self._most_drift, self._constants = _constants(
-            *(field[0].numpy() for field in record), gate.noise.double().numpy(), used
+        fields = (loops.similarity, loops.logit, loops.log_scale, loops.spread, loops.log_length)
+        record = tuple(field[0].numpy() for field in (loops.start, loops.end, loops.measured, limits, *fields))
+        self.nodes, self._measured, self._most_drift, self._constants = _picked(
+            record, gate.noise.double().numpy(), used
         )
         """Of the loops that have a share ``(m, ...)``; likewise ``weights``, and residuals behind ``judge``."""
         self._structure = GraphStructure(self.nodes, len(std) + 1, chain=True)
@@ -75,7 +73,7 @@ class _Equations:
         """Judge the loops under poses of which these are the relative ones ``(n, 3)``, with their deviations."""
         self.poses, self.residuals = _judge(
             relative, step_std, self.nodes, self._measured, self._most_drift, self._constants, self._judged,
-            RobustLoopGate.ANNEALING**iteration, self._components, *self._layers, self.weights, self._information,
+            RobustLoopGate.ANNEALING**iteration, self._components, self._layers, self.weights, self._information,
         )  # fmt: skip
         self.all_weights[self._used], self.all_information[self._used] = self.weights, self._information
 
@@ -129,8 +127,11 @@ class CompiledClosing(LoopClosing):
         step_std = _softened(self._steps, stiffness, self._odometry_noise)
         deviation, equations = self._equations.solve(state.deviation[0].double().numpy(), step_std)
         self._closed = _closed(self._loops, self._equations, equations, state.deviation.dtype)
-        changed = (torch.from_numpy(values).unsqueeze(0) for values in (deviation, step_std))
-        return GraphState(state.adjusted, *changed, state.features)
+        return replace(
+            state,
+            deviation=torch.from_numpy(deviation).unsqueeze(0),
+            step_std=torch.from_numpy(step_std).unsqueeze(0),
+        )
 
 
 def resumed(
@@ -248,23 +249,12 @@ def _residual(poses: Array, nodes: Array, measured: Array, residual: Array) -> N
 
 
 @njit(cache=True, error_model="numpy")
-def _constants(
-    start: Array,
-    end: Array,
-    measured: Array,
-    limits: Array,
-    similarity: Array,
-    logit: Array,
-    log_scale: Array,
-    spread: Array,
-    log_length: Array,
-    noise: Array,
-    used: Array,
-) -> tuple[Array, Array, Array, Array]:
+def _picked(record: tuple[Array, ...], noise: Array, used: Array) -> tuple[Array, Array, Array, Array]:
     """Of the loops ``used``: nodes, measurements, what limits their drift, and what the gate sees under all poses.
 
     The last are ``(m, 10)``: ``Loops.description``, that of the length, variances, and logit.
     """
+    start, end, measured, limits, similarity, logit, log_scale, spread, log_length = record
     count = len(used)
     nodes, constants = np.empty((count, 2), np.int64), np.empty((count, 10))
     poses, most = np.empty((2, count, 3))
@@ -291,18 +281,13 @@ def _judge(
     judged: Array,
     annealing: float,
     components: Array,
-    weight_1: Array,
-    bias_1: Array,
-    weight_2: Array,
-    bias_2: Array,
-    weight_3: Array,
-    bias_3: Array,
+    layers: tuple[tuple[Array, Array], ...],
     gates: Array,
     information: Array,
 ) -> tuple[Array, Array]:
     """Poses ``(n + 1, 3)`` and residuals of all loops; gates and information of the ``judged``, as ``RobustLoopGate``.
 
-    ``components`` ``(2,)`` are those of the gate; weights and biases are those of its layers.
+    ``components`` ``(2,)`` are those of the gate; ``layers`` are the weights and biases of its layers.
     """
     poses = chained(relative)
     residuals, expected = np.empty((len(nodes), 3)), np.empty(3)
@@ -311,6 +296,7 @@ def _judge(
     if len(judged) == 0:
         return poses, residuals
     prefix = _drifts(poses, step_std)
+    (weight_1, bias_1), (weight_2, bias_2), (weight_3, bias_3) = layers
     hidden_1, hidden_2, belief = np.empty_like(bias_1), np.empty_like(bias_2), np.empty_like(bias_3)
     inputs = np.empty(weight_1.shape[0], np.float32)
     for k in judged:
