@@ -43,7 +43,8 @@ class OnlineTrajectory(CorrectedTrajectory):
 
     All of an update is done at the step that completes a meta-pose. With ``iterations_per_step`` it is spread over the
     steps before the next one: features, three searches for loops, and iterations. Attention and convolutions are run
-    for each eighth meta-pose then, as what they give hardly changes from one to the next.
+    for each 32nd meta-pose then, as what they give hardly changes from one to the next. All loops are judged for each
+    eighth, and new ones alone between.
     """
 
     _graph: MetaGraph
