@@ -5,7 +5,8 @@
 
 What is measured runs on one core with one thread: the nodes as real processes that are fed over DDS from another core,
 the core and its peers in a process of their own. The last line is one JSON object, whose ms are by the clock; exit code
-1 where a bar is missed. "cpu" is processor time, which other processes disturb less.
+1 where a bar is missed. "cpu" is processor time, which other processes disturb less. The longest of hundreds of frames
+is judged by it: by the clock, that is the frame in which the system did something else.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ BARS = {
     "ratio_to_gtsam_lm": 1.0,
     "ratio_to_isam2": 2.0,
     "everything_to_gtsam_lm": 0.35,
-    "longest_to_median": 3.0,
+    "cpu_longest_to_median": 3.0,
     "ngo_node_p99_to_median": 2.5,
     "local_node_p99_to_median": 2.5,
     "ngo_node_resident_mb": 350.0,
@@ -59,8 +60,9 @@ class Arguments:
     """Frames in the window, which is full when latencies are measured."""
     live: int = 840
     """Frames that are then sent at 35 Hz."""
-    repeats: int = 24
-    """Meta-poses at the end of the full window at which the optimizer and its peers are timed."""
+    repeats: int = 32
+    """Meta-poses at the end of the full window at which the optimizer and its peers are timed: from one run of the
+    network to the next."""
     end_to_end_frames: int = 1000
     """Frames through simulator, local_node and ngo_node as fast as they go."""
     out: Path = CACHE
@@ -172,7 +174,7 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
         ("everything_to_gtsam_lm", "everything / LM"),
         ("longest_to_median", "the core's longest frame / its median"),
     ):
-        bar = f"{BARS[key]:g}" if key in BARS else ""
+        bar = f"{BARS[key]:g}" if key in BARS else f"cpu {BARS[of_cpu]:g}" if (of_cpu := f"cpu_{key}") in BARS else ""
         row(f"{name} (by the clock, by cpu)", lambda r, k=key: f"{r[k]:.2f}, {r[f'cpu_{k}']:.2f}", bar)
     row("loops in the window", lambda r: str(r["loops"]))
     for node in ("ngo_node", "local_node"):
