@@ -92,7 +92,7 @@ class SessionConfig:
                 "wait_for_subscribers": 2 + self.views,
                 "wait_for_flow_control": True,
                 # Enough for local_node to take several at once.
-                "max_in_flight": 16,
+                "max_in_flight": 8,
             },
         )
 
@@ -105,8 +105,8 @@ class Session:
         self._config = config
         self._domain_id = domain_id
         self._out = out
-        self._truth: dict[int, Poses] = {}
-        self._odometry: dict[int, Poses] = {}
+        self._truth: dict[int, bytes] = {}
+        self._odometry: dict[int, bytes] = {}
         self._path = b""
         self._image_times, self._path_times = StampTimes(), StampTimes()
 
@@ -177,7 +177,7 @@ class Session:
         message = deserialize_message(self._path, PathMessage)
         corrected = {_stamp_ns(pose.header.stamp): _xyyaw(pose.pose) for pose in message.poses}
         try:
-            trajectories = match(self._truth, self._odometry, corrected)
+            trajectories = match(_poses(self._truth), _poses(self._odometry), corrected)
         except ValueError as error:
             raise GraphError(str(error)) from None
         result = evaluate(self._config.world, self._config.seed, trajectories)
@@ -204,10 +204,10 @@ class Session:
         }
 
     def _on_truth(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
-        self._truth[header_stamp_ns(cdr)] = _xyyaw(deserialize_message(cdr, Odometry).pose.pose)
+        self._truth[header_stamp_ns(cdr)] = cdr
 
     def _on_odometry(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
-        self._odometry[header_stamp_ns(cdr)] = _xyyaw(deserialize_message(cdr, Odometry).pose.pose)
+        self._odometry[header_stamp_ns(cdr)] = cdr
 
     def _on_path(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
         self._path = cdr
@@ -232,6 +232,11 @@ def maze_of(world: str, seed: int) -> Maze:
 
 def _stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _poses(messages: dict[int, bytes]) -> dict[int, Poses]:
+    """Poses of serialised odometry by stamp: read at the end, so that the run does not wait for it."""
+    return {stamp: _xyyaw(deserialize_message(cdr, Odometry).pose.pose) for stamp, cdr in messages.items()}
 
 
 def _xyyaw(pose: Pose) -> Poses:
