@@ -61,6 +61,7 @@ class ImageInput:
         )
         self._inputs: list[Input] = []
         self._taking = False
+        self._most_at_once = 0
         self._missed = self._newly_missed = 0
         self._unlikeness, self._largest_unlikeness = 0.0, 0.0
         self._unfamiliar = self._repeated = self._newly_unfamiliar = self._newly_repeated = 0
@@ -144,6 +145,7 @@ class ImageInput:
         """Run the networks over the next frames, and publish their steps in order."""
         began_s = time.perf_counter()
         estimates = self._core.update_all(pairs)
+        self._most_at_once = max(self._most_at_once, len(pairs))
         took_s = (time.perf_counter() - began_s) / len(pairs)
         for estimate in estimates:
             if isinstance(estimate, RejectedFrame):
@@ -180,6 +182,7 @@ class ImageInput:
         waiting = f"{self._sensor}s waiting for {'velocities' if self._core.uses_twist else 'actions'}"
         return {
             waiting: str(self._pairing.waiting),
+            f"most {self._sensor}s at once": str(self._most_at_once),
             "missed frames": str(self._missed),
             "restarts": str(self._core.restarts),
             **(unlike if self._core.tells_unlike_input else {}),
