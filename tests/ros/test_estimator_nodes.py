@@ -207,16 +207,14 @@ def test_a_node_that_fell_behind_takes_several_frames_at_once_in_order(graph: Gr
     graph.start_run()
     graph.play(0, 1)
     graph.wait_for_step(1)
-    graph.local.process.send_signal(signal.SIGSTOP)
+    graph.local.send(signal.SIGSTOP)
     graph.play(*range(2, 42))
-    graph.local.process.send_signal(signal.SIGCONT)
+    graph.local.send(signal.SIGCONT)
     graph.wait_for_step(41)
     assert graph.steps() == [(k, k + 1) for k in range(41)]
     for estimate, message in zip(graph.expected(*range(42)), graph.out.relative_poses, strict=True):
         np.testing.assert_allclose(relative_step(message).relative_xyyaw, estimate.relative_xyyaw, atol=1e-6)
-    graph.probe.spin_until(
-        lambda: graph.diagnostics.values("/local_node").get("most images at once") == str(AT_ONCE), "so many at once"
-    )
+    graph.diagnostics.wait_for_value("/local_node", "most images at once", lambda most: int(most) == AT_ONCE)
 
 
 def test_a_restarted_source_starts_both_anew_with_one_line_each(graph: Graph) -> None:
