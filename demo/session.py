@@ -72,10 +72,13 @@ class SessionConfig:
         }
         depth = {"relative_pose_depth": window["relative_pose_depth"]}
         writes = {"map_update_interval": MAP_INTERVAL_S, "save_directory": str(out.absolute())}
+        # At some hundred frames a second a path is out of the usual queue before a busy recorder has it.
+        kept = {f"qos_overrides./ngo/{name}.publisher.depth": 100 for name in ("path", "trajectory")}
+        corrected = {"path_rate_hz": 0.0, **window, **kept}
         mapper = {"world": self.world, **writes, **depth, **weights}
         return [
             # A path after every frame, for the latency.
-            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
+            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, **corrected, **weights}),
             NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
             *([NodeSpec("ngo_estimator", "ngo_map", mapper)] if self.draws_map else []),
         ]

@@ -256,7 +256,8 @@ class LocalOdometry:
             else:
                 self._steps.append((*own, features[k : k + 1]))
                 drive = (torch.cat(part) for part in zip(*self._steps, strict=True))
-                own = tuple(values[-1:] for values in self._network.remembered(*drive))
+                mean, deviation = self._network.remembered(*drive)
+                own = mean[-1:], deviation[-1:]
             corrected.append(own)
         means, deviations = (torch.cat(part) for part in zip(*corrected, strict=True))
         return means, deviations
