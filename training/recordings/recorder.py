@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-from ngo_common.nodes.waiting import waiting_messages
+from ngo_common.waiting import waiting_messages
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.writer import RecordingWriter
 

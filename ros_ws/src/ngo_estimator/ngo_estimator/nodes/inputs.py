@@ -9,7 +9,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible, qos_po
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ngo_common.nodes.qos import overridable
-from ngo_common.nodes.waiting import waiting_messages
+from ngo_common.waiting import waiting_messages
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.odometry.source_guard import SourceGuard
 

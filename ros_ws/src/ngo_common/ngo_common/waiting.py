@@ -3,10 +3,8 @@
 from collections.abc import Iterator
 from typing import Any
 
-from rclpy.subscription import Subscription
 
-
-def waiting_messages(subscription: Subscription, most: int) -> Iterator[tuple[Any, dict[str, Any]]]:
+def waiting_messages(subscription: Any, most: int) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Up to ``most`` messages that have come and wait, each with its info, as the executor takes them.
 
     A turn of rclpy's executor costs more than many a message. Call this in a callback of the executor's thread.
