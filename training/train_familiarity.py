@@ -50,7 +50,7 @@ FACTORS = (0.7, 1.0, 1.4, 2.0)
 
 _WANTED = 0.97
 _MARGIN = 1.25
-"""Recordings are few: another drive of the same place exceeds the percentile of one by up to 15 %, faults 4 to 30 times."""
+"""Recordings are few: other drives of the place exceed the percentile of one by up to 15 %, faults 4 to 30 times."""
 _NEEDS_TOLD = ("frozen", "repeating")  # such frames are familiar: only who is told of motion can know
 _WINDOWS = (64, 256)  # steps over which errors of what is told are counted: those that last grow with them
 _CLEAR = 0.1  # of the deviation of steps: what tells a component this well is taken alone
