@@ -12,6 +12,7 @@ import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array, compose, wrap
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
+from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
 
@@ -71,6 +72,7 @@ class MotionPrior:
         self.config = config
         self._stamp_ns = 0
         self._motion = ConstantVelocity(np.array((config.largest_m_s, config.largest_m_s, config.largest_rad_s)))
+        self._usual = UsualMotion(0.0, config.largest_m_s)
         self._expected: Array | None = None  # by the velocity alone
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None
@@ -141,7 +143,10 @@ class MotionPrior:
         still = np.array((config.still_m, config.still_m, math.radians(config.still_deg)))
         largest = np.array((config.largest_m, config.largest_m, math.radians(config.largest_deg)))
         self._expected = mean = compose(last, constant)
-        changes = np.minimum(0.5 * self._changes(elapsed), largest / elapsed)
+        changes = 0.5 * self._changes(elapsed)
+        changes[:2] = np.maximum(changes[:2], self._usual.rate_m_s * math.sqrt(elapsed))
+        changes = np.minimum(changes, largest / elapsed)
+        self._motion.largest[:2] = self._usual.largest_m_s
         total = self._motion.predict(last[2], elapsed, still, changes)
         information = np.linalg.inv(total).astype(np.float64)
         return Prediction(mean, total, information, (mean,))
@@ -173,6 +178,10 @@ class MotionPrior:
             change = pose - self._expected
             change[2] = wrap(change[2])
             self._motion.update(change, covariance)
+            if unsure or float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) > self.config.still_m**2:
+                self._usual.interrupt()
+            else:
+                self._usual.observe(step, elapsed)
             if unsure:
                 self._motion.velocity = 0.5 * self._motion.velocity
         shared = self._motion.shared()
