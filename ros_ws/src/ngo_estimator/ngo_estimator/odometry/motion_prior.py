@@ -22,7 +22,8 @@ class MotionPriorConfig:
 
     Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
     ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
-    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Wheels are doubted
+    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Robots
+    that were seen to change their speed by more get more of both (``UsualMotion``). Wheels are doubted
     where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or ``doubt_deg`` and
     ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most ``longest_freeze_s``, while constant
     velocity moves by ``frozen_m``.
@@ -72,7 +73,7 @@ class MotionPrior:
         self.config = config
         self._stamp_ns = 0
         self._motion = ConstantVelocity(np.array((config.largest_m_s, config.largest_m_s, config.largest_rad_s)))
-        self._usual = UsualMotion(0.0, config.largest_m_s)
+        self._usual = UsualMotion(config.largest_m_s)
         self._expected: Array | None = None  # by the velocity alone
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None

@@ -13,6 +13,11 @@ from ngo_estimator.geometry.planar_motion import Array
 _SPAN_S = 0.4
 """Velocities are means over at least so long: shorter ones are noise."""
 
+_FIRST_RATE_M_S = 0.1
+"""Deviation of the velocity's change in one second, before it was measured; it counts as some spans."""
+
+_FIRST_SPANS = 5
+
 _MEMORY = 100
 """Spans, over which means are taken."""
 
@@ -21,12 +26,11 @@ _LARGEST_CHANGE = 4.0
 
 
 class UsualMotion:
-    """Means over the last measured velocities; begins with ``rate_m_s``, the deviation (m/s) of the velocity's change
-    in one second, and ``largest_m_s``, that of a velocity that nothing tells. Both never fall below what they were."""
+    """Means over the last measured velocities. ``least_m_s`` is the least deviation of a velocity that nothing tells."""
 
-    def __init__(self, rate_m_s: float, largest_m_s: float) -> None:
-        self._least_rate, self._least_largest = rate_m_s, largest_m_s
-        self._changes = max(rate_m_s, 0.1) ** 2  # squared change of the velocity a second
+    def __init__(self, least_m_s: float) -> None:
+        self._least = least_m_s
+        self._changes = _FIRST_RATE_M_S**2  # squared change of the velocity a second
         self._mean, self._square = np.zeros(2), 0.0
         self._spans = 0
         self._way, self._elapsed = np.zeros(2), 0.0
@@ -34,13 +38,13 @@ class UsualMotion:
 
     @property
     def rate_m_s(self) -> float:
-        """Deviation of the velocity's change in one second."""
-        return max(self._least_rate, math.sqrt(self._changes))
+        """Deviation (m/s) of the velocity's change in one second."""
+        return math.sqrt(self._changes)
 
     @property
     def largest_m_s(self) -> float:
-        """Deviation of a velocity that nothing has told for long: that of the difference of two velocities."""
-        return max(self._least_largest, math.sqrt(2.0 * max(self._square - float(self._mean @ self._mean), 0.0)))
+        """Deviation (m/s) of a velocity that nothing has told for long: that of the difference of two velocities."""
+        return max(self._least, math.sqrt(2.0 * max(self._square - float(self._mean @ self._mean), 0.0)))
 
     def observe(self, step: Array, elapsed: float) -> None:
         """A step ``(3,)`` that walls told, ``elapsed`` seconds long."""
@@ -54,7 +58,7 @@ class UsualMotion:
             # Means over two neighbouring spans of a velocity that wanders differ by two thirds of its change.
             rate = 3.0 * float(change @ change) / (span_s + self._last[1])
             self._spans = min(self._spans + 1, _MEMORY)
-            weight = 1.0 / (self._spans + 5)
+            weight = 1.0 / (self._spans + _FIRST_SPANS)
             self._changes += weight * (min(rate, _LARGEST_CHANGE**2 * self.rate_m_s**2) - self._changes)
             self._mean = self._mean + (velocity - self._mean) / self._spans
             self._square += (float(velocity @ velocity) - self._square) / self._spans
