@@ -116,7 +116,7 @@ def test_a_corridor_is_measured_by_its_wheels() -> None:
 
 
 def test_what_comes_into_view_is_kept_where_the_robot_may_have_come_far() -> None:
-    """A robot stands in a corridor, for all that walls tell: what is new makes a key scan, and what is known makes none."""
+    """A robot stands in a corridor, for all that walls tell: what is new makes key scans, what is known makes none."""
     poses, cabinet = np.zeros((60, 3)), np.array((((2.0, 0.4), (2.0, 0.9)), ((2.0, 0.4), (3.0, 0.4))))
     scans = scans_along(HALLWAY, poses, fan(181))
     assert sum(estimate.is_key for estimate in drive(scans)[0]) == 1

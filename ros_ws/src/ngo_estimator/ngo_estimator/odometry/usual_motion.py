@@ -1,7 +1,7 @@
 """How fast a robot's velocity changes, learned from the motions that walls tell.
 
-Not in the paper. Robots differ: one takes seconds to reach 0.5 m/s, another reaches 3 m/s in one. Where a corridor hides
-the motion, what such a robot may have done meanwhile is learned from where walls showed it.
+Not in the paper. Robots differ: one takes seconds to reach 0.5 m/s, another reaches 3 m/s in one. Where a corridor
+hides the motion, what such a robot may have done meanwhile is learned from where walls showed it.
 """
 
 import math
@@ -26,7 +26,10 @@ _LARGEST_CHANGE = 4.0
 
 
 class UsualMotion:
-    """Means over the last measured velocities. ``least_m_s`` is the least deviation of a velocity that nothing tells."""
+    """Means over the last measured velocities.
+
+    ``least_m_s`` is the least deviation of a velocity that nothing tells.
+    """
 
     def __init__(self, least_m_s: float) -> None:
         self._least = least_m_s
