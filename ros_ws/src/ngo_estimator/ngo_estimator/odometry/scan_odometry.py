@@ -27,13 +27,14 @@ class ScanOdometryConfig:
 
     A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one, unless another was taken within
     ``known_m`` of it and turned alike. Where no wheels lead, one is that may be as far away by its deviation, if it
-    shows something new: less than ``known_share`` of its points lie on lines. The last ``submap_scans`` of these are
-    what the next scan is registered to. A search precedes the registration where the prediction may be ``poor_m`` or
-    ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
-    ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on
-    lines, or where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than ``least_share`` do, or ``least_points``, the prediction stands. A
-    registration of less than ``good_share`` that is ``farthest_deviations`` from the prediction is no better than it.
-    Where no wheels lead, one of less than ``sure_share`` after a search is as likely as the prediction.
+    shows something new: less than ``known_share`` of its points lie on lines. The last ``submap_scans`` of these
+    are what the next scan is registered to. A search precedes the registration where the prediction may be
+    ``poor_m`` or ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
+    ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
+    where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
+    ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that
+    is ``farthest_deviations`` from the prediction is no better than it. Where no wheels lead, one of less than
+    ``sure_share`` after a search is as likely as the prediction.
     """
 
     key_distance_m: float = 0.3
