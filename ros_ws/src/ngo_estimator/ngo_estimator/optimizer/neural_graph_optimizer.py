@@ -20,10 +20,10 @@ from ngo_estimator.networks.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
-from ngo_estimator.optimizer.loop_agreement import agreeing
 from ngo_estimator.optimizer.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
+from ngo_estimator.optimizer.loop_judge import LoopJudge
 from ngo_estimator.optimizer.meta_poses import (
     Correction,
     GraphState,
@@ -135,6 +135,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
             self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
             self.odometry_noise: Tensor
             self.loop_gate = RobustLoopGate()
+            if config.search.least_belief:
+                self.loop_judge = LoopJudge()
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
 
@@ -301,8 +303,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
 
             closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
         believed = test(loops, steps)
-        if self.config.search.witnesses:
-            believed = agreeing(believed, steps, self.config.search.witnesses)
+        if self.config.search.least_belief:
+            believed = self.loop_judge.judged(believed, steps, self.config.search.least_belief)
         return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
 
 
