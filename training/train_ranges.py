@@ -100,9 +100,7 @@ def with_ranges(networks: PlaceNetworks, seeing: PlaceNetworks) -> PlaceNetworks
             f"the encoder to begin with has width {seeing.config.width} and sees ranges: {seeing.config.sees_ranges}; "
             f"expected width {networks.config.width}, and ranges"
         )
-    config = dataclasses.replace(
-        networks.config, registration=seeing.config.registration, least_sure=_LEAST_SURE
-    )
+    config = dataclasses.replace(networks.config, registration=seeing.config.registration, least_sure=_LEAST_SURE)
     result = PlaceNetworks(config)
     head = {f"encoder.ranges.{k}": v for k, v in seeing.encoder.ranges.state_dict().items()}
     result.load_state_dict({**networks.state_dict(), **head})

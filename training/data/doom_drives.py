@@ -42,6 +42,9 @@ TEST_MAPS: tuple[Map, ...] = (
 ROOMS: Map = ("rooms", "")
 """Stands for the generated level of a drive's seed."""
 
+MAZES: Map = ("mazes", "")
+"""Stands for the maze of a drive's seed."""
+
 _PLACES, _PLACE_SHARES = ("map", "rooms", "maze"), (0.5, 0.3, 0.2)
 _DRIVERS = {
     "map": (("explorer", "learned", "random"), (0.85, 0.1, 0.05)),
@@ -57,6 +60,12 @@ def map_drive(
     of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False, watch: Watch | None = None
 ) -> Episode:
     """A drive of ``frames`` frames on a map, from its own start or one that the seed draws."""
+    if of == MAZES:
+        env = WORLDS["maze3d"].make_random(np.random.default_rng(seed), tells_walls=watch is not None)
+        try:
+            return record_episode(env, "random_goals", frames, seed, watch=watch)
+        finally:
+            env.close()
     config = Maze3DConfig(level="rooms") if of == ROOMS else Maze3DConfig(wad=of[0], map=of[1])
     env = Maze3D(config, tells_walls=watch is not None)
     try:

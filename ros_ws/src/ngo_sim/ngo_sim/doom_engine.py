@@ -53,9 +53,7 @@ class DoomEngine:
     tells_walls: whether ``walls`` is to be asked, which costs time in each step.
     """
 
-    def __init__(
-        self, width: int, height: int, field_of_view_deg: int, tics: int, tells_walls: bool = False
-    ) -> None:
+    def __init__(self, width: int, height: int, field_of_view_deg: int, tics: int, tells_walls: bool = False) -> None:
         self._resolution = RESOLUTIONS[width, height]
         self._field_of_view_deg, self._tics, self._tells_walls = field_of_view_deg, tics, tells_walls
         self._game: vizdoom.DoomGame | None = None
