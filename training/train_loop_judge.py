@@ -87,13 +87,15 @@ class Judged(NamedTuple):
         return (self.off[:, 0] < TRUE_M) & (self.off[:, 1] < TRUE_RAD)
 
 
-def untrained(folder: Path, search: LoopSearch = SEARCH) -> NeuralGraphOptimizer:
+def untrained(folder: Path, search: LoopSearch | None = None) -> NeuralGraphOptimizer:
     """A robust pose graph without a network, for the local network in ``folder``."""
     network, _ = load_local(folder, "doom")
     aggregation = PoseAggregationConfig(
         motion_feature_size=network.config.feature_size, relative_std=network.config.relative_std
     )
-    return NeuralGraphOptimizer(NeuralGraphOptimizerConfig(aggregation=aggregation, network=False, search=search))
+    return NeuralGraphOptimizer(
+        NeuralGraphOptimizerConfig(aggregation=aggregation, network=False, search=search or SEARCH)
+    )
 
 
 @torch.no_grad()
@@ -160,6 +162,8 @@ def main(arguments: Arguments) -> None:
             features = features_of(world, drive, folder, networks)
             drives.append(judged_of(optimizer, networks.place.pair_head, features))
     loops = together(drives)
+    if len(loops.off) < 2:
+        raise runs.RunError(f"there are {len(loops.off)} loops to learn from; expected drives that return")
     judge = learn(loops, arguments.steps, arguments.learning_rate, arguments.seed)
     optimizer.loop_judge.load_state_dict(judge.state_dict())
     metrics = {"loops": len(loops.off), "true": float(loops.true.double().mean())}

@@ -108,9 +108,11 @@ def _levels(
     place: str, seeds: Sequence[int], frames: int, driver: str, rng: np.random.Generator, watch: Watch | None
 ) -> Iterator[Episode]:
     """An episode in the level or the maze of each seed; the size of all mazes is drawn by ``rng``."""
-    walls = {"tells_walls": watch is not None}
-    rooms = place == "rooms"
-    env: Any = Maze3D(Maze3DConfig(level="rooms"), **walls) if rooms else WORLDS["maze3d"].make_random(rng, **walls)
+    env: Any
+    if place == "rooms":
+        env = Maze3D(Maze3DConfig(level="rooms"), tells_walls=watch is not None)
+    else:
+        env = WORLDS["maze3d"].make_random(rng, tells_walls=watch is not None)
     try:
         env.preload(seeds)
         for seed in seeds:
