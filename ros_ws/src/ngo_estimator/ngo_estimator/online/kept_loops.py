@@ -182,6 +182,7 @@ class KeptLoops:
             logit=loops.logit.float().clamp(min=-20.0),
             similarity=loops.similarity.float(),
             embeddings=_batch(embeddings),
+            by_poses=_batch(self.overlap),
             length=_batch(self.end - self.start),
             most_drift=loops.most_drift.float(),
         )

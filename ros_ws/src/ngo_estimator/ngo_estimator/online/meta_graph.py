@@ -510,7 +510,7 @@ class MetaGraph:
         Nothing limits the motion within it, so that each place that looks alike would do.
         """
         search = self._optimizer.config.search
-        if search.registrations or search.witnesses or not self._blind.values.any():
+        if search.registrations or search.least_belief or not self._blind.values.any():
             return loops
         blind = (summed_variances(self._blind.values, active) > 0.0).any(axis=1)
         before = torch.from_numpy(np.concatenate(([0], blind.cumsum())))

@@ -20,10 +20,10 @@ from ngo_estimator.networks.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
-from ngo_estimator.optimizer.loop_agreement import agreeing
 from ngo_estimator.optimizer.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
+from ngo_estimator.optimizer.loop_judge import LoopJudge
 from ngo_estimator.optimizer.meta_poses import (
     Correction,
     GraphState,
@@ -137,6 +137,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
             self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
             self.odometry_noise: Tensor
             self.loop_gate = RobustLoopGate()
+            if config.search.least_belief:
+                self.loop_judge = LoopJudge()
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
 
@@ -269,8 +271,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
             adjusted[:, steps.key_frames :] += adjustment
         state, stiffness = _without_fixed(before, replace(before, adjusted=adjusted), corrections[-1].stiffness, steps)
         # Where others must agree with a new loop, all of them are looked at.
-        which = None if self.config.search.witnesses else np.flatnonzero(~solution.known)
-        believed = self._agreeing(compiled_closing.without_contradictions(loops, steps, which), steps)
+        which = None if self.config.search.least_belief else np.flatnonzero(~solution.known)
+        believed = self._judged(compiled_closing.without_contradictions(loops, steps, which), steps)
         last = self.config.iterations - 1
         return compiled_closing.resumed(
             self.loop_gate, steps, believed, state.adjusted, stiffness, self.odometry_noise, solution, last
@@ -302,12 +304,12 @@ class NeuralGraphOptimizer(AttentionNetwork):
             from ngo_estimator.optimizer import compiled_closing
 
             closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
-        believed = self._agreeing(test(loops, steps), steps)
+        believed = self._judged(test(loops, steps), steps)
         return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
 
-    def _agreeing(self, loops: Loops, steps: MetaSteps) -> Loops:
-        witnesses = self.config.search.witnesses
-        return agreeing(loops, steps, witnesses) if witnesses else loops
+    def _judged(self, loops: Loops, steps: MetaSteps) -> Loops:
+        least = self.config.search.least_belief
+        return self.loop_judge.judged(loops, steps, least) if least else loops
 
 
 def _without_fixed(
