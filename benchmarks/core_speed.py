@@ -44,7 +44,7 @@ class Times:
         return result
 
     def mean(self, last: int) -> dict[str, float]:
-        """Of the last of both: the network runs for each eighth meta-pose, which a median would not see."""
+        """Of the last of both: the network runs for each 32nd meta-pose, which a median would not see."""
         return {"ms": float(np.mean(self.wall_ms[-last:])), "cpu_ms": float(np.mean(self.cpu_ms[-last:]))}
 
 

@@ -35,6 +35,8 @@ _START_S, _ANSWER_S, _RETRY_S = 90.0, 60.0, 0.3
 _IN_FLIGHT = 4
 _ENCODINGS = {"maze2d": "32FC4", "maze3d": "rgb8"}
 
+_PATH = ("ngo/path", PathMessage)
+
 Frame = Sequence[tuple[str, Any]]
 """Topics and messages of one frame, in the order in which they are published; the answer is to the first of them."""
 
@@ -62,7 +64,7 @@ class Feed:
         self._graph, self._name = graph, name
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=graph.domain_id)
-        self._node = rclpy.create_node("feed", context=self._context, start_parameter_services=False)
+        self._node = rclpy.create_node(f"feed_of_{name}", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publishers = {topic: self._node.create_publisher(kind, topic, 5000) for topic, kind in inputs.items()}
@@ -131,6 +133,12 @@ class Feed:
             )
         return [1e3 * (self.answered[stamp] - self._sent[stamp]) for stamp in stamps]
 
+    def hear(self) -> float:
+        """Wait for a message on the answer's topic; returns when the first one came, by the monotonic clock."""
+        what = f"the first message of {self._name}"
+        self._graph.wait_for(lambda: bool(self.answered), what, _START_S, self._spin)
+        return min(self.answered.values())
+
     def _send(self, frame: Frame) -> int:
         stamp = frame[0][1].header.stamp
         key = stamp.sec * 1_000_000_000 + stamp.nanosec
@@ -161,7 +169,7 @@ def ngo_node(
     parameters = {"world": world_name, "path_rate_hz": 0.0, "window_frames": window, "threads": 1}
     spec = NodeSpec("ngo_estimator", "ngo_node", parameters)
     inputs = {"relative_pose": RelativePose}
-    return _measured(spec, inputs, ("ngo/path", PathMessage), frames, live, cores, logs, again=True)
+    return _measured(spec, inputs, _PATH, frames, live, cores, logs, again=True)
 
 
 def local_node(world_name: str, seed: int, before: int, live: int, cores: tuple[int, int], logs: Path) -> Latencies:
@@ -182,6 +190,26 @@ def local_node(world_name: str, seed: int, before: int, live: int, cores: tuple[
     )
     inputs = {"image": Image, "action": DiscreteAction}
     return _measured(spec, inputs, ("relative_pose", RelativePose), frames, live, cores, logs, again=False)
+
+
+def first_path_s(world_name: str, seed: int, cores: tuple[int, int], logs: Path) -> float:
+    """Time from the start of both nodes, while the simulator's camera runs at 10 Hz, to the first path."""
+    simulator = NodeSpec("ngo_sim", world_name, {"seed": seed, "rate": 10.0})
+    nodes = [
+        NodeSpec("ngo_estimator", name, {"world": world_name, "threads": 1}) for name in ("ngo_node", "local_node")
+    ]
+    with (
+        Graph(logs) as graph,
+        running_on(*cores),
+        Feed(graph, world_name, {}, ("image", Image)) as camera,
+        Feed(graph, "ngo_node", {}, _PATH) as path,
+    ):
+        graph.start(simulator)
+        camera.hear()
+        begin = time.monotonic()
+        for node in nodes:
+            graph.start(node)
+        return path.hear() - begin
 
 
 def _measured(

@@ -5,7 +5,8 @@
 
 What is measured runs on one core with one thread: the nodes as real processes that are fed over DDS from another core,
 the core and its peers in a process of their own. The last line is one JSON object, whose ms are by the clock; exit code
-1 where a bar is missed. "cpu" is processor time, which other processes disturb less.
+1 where a bar is missed. "cpu" is processor time, which other processes disturb less. The longest of hundreds of frames
+is judged by it: by the clock, that is the frame in which the system did something else.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from rich.table import Table
 
 from benchmarks.core_speed import core_speed, local_core_ms
 from benchmarks.drives import CACHE
-from benchmarks.node_latency import RATE_HZ, Latencies, local_node, ngo_node
+from benchmarks.node_latency import RATE_HZ, Latencies, first_path_s, local_node, ngo_node
 from benchmarks.pinned import in_process, running_on, two_cores
 from demo.graph import GraphError
 from demo.session import Session, SessionConfig
@@ -35,11 +36,12 @@ BARS = {
     "ratio_to_gtsam_lm": 1.0,
     "ratio_to_isam2": 2.0,
     "everything_to_gtsam_lm": 0.35,
-    "longest_to_median": 3.0,
+    "cpu_longest_to_median": 3.0,
     "ngo_node_p99_to_median": 2.5,
     "local_node_p99_to_median": 2.5,
     "ngo_node_resident_mb": 350.0,
     "local_node_resident_mb": 350.0,
+    "first_path_s": 4.0,
 }
 """What is to be below."""
 
@@ -59,8 +61,9 @@ class Arguments:
     """Frames in the window, which is full when latencies are measured."""
     live: int = 840
     """Frames that are then sent at 35 Hz."""
-    repeats: int = 24
-    """Meta-poses at the end of the full window at which the optimizer and its peers are timed."""
+    repeats: int = 32
+    """Meta-poses at the end of the full window at which the optimizer and its peers are timed: from one run of the
+    network to the next."""
     end_to_end_frames: int = 1000
     """Frames through simulator, local_node and ngo_node as fast as they go."""
     out: Path = CACHE
@@ -91,7 +94,7 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
     local = local_node(world, arguments.seed, _LOCAL_BEFORE, arguments.live, cores, logs)
     say.print(f"{world}: ngo_node")
     ngo = ngo_node(world, arguments.seed, arguments.window, arguments.live, cores, logs, arguments.out)
-    say.print(f"{world}: end to end")
+    say.print(f"{world}: the first path, end to end")
     result = {
         **_named("ngo_node", ngo, core_ms),
         **_named("local_node", local, local_ms[_LOCAL_BEFORE:]),
@@ -106,6 +109,7 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         "longest_to_median": float(np.max(core_ms) / np.median(core_ms)),
         "cpu_longest_to_median": float(np.max(core_cpu_ms) / np.median(core_cpu_ms)),
         "cpu_s_a_minute_at_10_hz": 0.6 * float(np.mean(core_cpu_ms)),
+        "first_path_s": first_path_s(world, arguments.seed, cores, logs),
         "end_to_end_frames_per_s": end_to_end(world, arguments),
         "times_bound": core["update"]["ms"] / core["work"]["bound_ms"],
         **core,
@@ -172,7 +176,7 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
         ("everything_to_gtsam_lm", "everything / LM"),
         ("longest_to_median", "the core's longest frame / its median"),
     ):
-        bar = f"{BARS[key]:g}" if key in BARS else ""
+        bar = f"{BARS[key]:g}" if key in BARS else f"cpu {BARS[of_cpu]:g}" if (of_cpu := f"cpu_{key}") in BARS else ""
         row(f"{name} (by the clock, by cpu)", lambda r, k=key: f"{r[k]:.2f}, {r[f'cpu_{k}']:.2f}", bar)
     row("loops in the window", lambda r: str(r["loops"]))
     for node in ("ngo_node", "local_node"):
@@ -185,6 +189,7 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
     row("work of an update: Mflop, MB", lambda r: f"{r['work']['flops'] / 1e6:.0f}, {r['work']['bytes'] / 1e6:.0f}")
     row("the machine: Gflop/s, GB/s", lambda r: f"{r['work']['gflops']:.0f}, {r['work']['gbytes']:.0f}")
     row("least time for it (ms), update / that", lambda r: f"{r['work']['bound_ms']:.1f}, {r['times_bound']:.1f}")
+    row("from the start of both nodes to the first path (s)", lambda r: f"{r['first_path_s']:.2f}", "4")
     row("end to end on two cores, none lost (frames/s)", lambda r: f"{r['end_to_end_frames_per_s']:.0f}")
     return shown
 

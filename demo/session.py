@@ -72,10 +72,13 @@ class SessionConfig:
         }
         depth = {"relative_pose_depth": window["relative_pose_depth"]}
         writes = {"map_update_interval": MAP_INTERVAL_S, "save_directory": str(out.absolute())}
+        # At some hundred frames a second a path is out of the usual queue before a busy recorder has it.
+        kept = {f"qos_overrides./ngo/{name}.publisher.depth": 100 for name in ("path", "trajectory")}
+        corrected = {"path_rate_hz": 0.0, **window, **kept}
         mapper = {"world": self.world, **writes, **depth, **weights}
         return [
             # A path after every frame, for the latency.
-            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, "path_rate_hz": 0.0, **window, **weights}),
+            NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, **corrected, **weights}),
             NodeSpec("ngo_estimator", "local_node", {"world": self.world, **local, **weights}),
             *([NodeSpec("ngo_estimator", "ngo_map", mapper)] if self.draws_map else []),
         ]
@@ -91,6 +94,8 @@ class SessionConfig:
                 "rate": float(self.rate),
                 "wait_for_subscribers": 2 + self.views,
                 "wait_for_flow_control": True,
+                # Enough for local_node to take several at once.
+                "max_in_flight": 8,
             },
         )
 
@@ -103,8 +108,8 @@ class Session:
         self._config = config
         self._domain_id = domain_id
         self._out = out
-        self._truth: dict[int, Poses] = {}
-        self._odometry: dict[int, Poses] = {}
+        self._truth: dict[int, bytes] = {}
+        self._odometry: dict[int, bytes] = {}
         self._path = b""
         self._image_times, self._path_times = StampTimes(), StampTimes()
 
@@ -175,7 +180,7 @@ class Session:
         message = deserialize_message(self._path, PathMessage)
         corrected = {_stamp_ns(pose.header.stamp): _xyyaw(pose.pose) for pose in message.poses}
         try:
-            trajectories = match(self._truth, self._odometry, corrected)
+            trajectories = match(_poses(self._truth), _poses(self._odometry), corrected)
         except ValueError as error:
             raise GraphError(str(error)) from None
         result = evaluate(self._config.world, self._config.seed, trajectories)
@@ -202,10 +207,10 @@ class Session:
         }
 
     def _on_truth(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
-        self._truth[header_stamp_ns(cdr)] = _xyyaw(deserialize_message(cdr, Odometry).pose.pose)
+        self._truth[header_stamp_ns(cdr)] = cdr
 
     def _on_odometry(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
-        self._odometry[header_stamp_ns(cdr)] = _xyyaw(deserialize_message(cdr, Odometry).pose.pose)
+        self._odometry[header_stamp_ns(cdr)] = cdr
 
     def _on_path(self, cdr: bytes, published_ns: int, received_ns: int) -> None:
         self._path = cdr
@@ -230,6 +235,11 @@ def maze_of(world: str, seed: int) -> Maze:
 
 def _stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _poses(messages: dict[int, bytes]) -> dict[int, Poses]:
+    """Poses of serialised odometry by stamp: read at the end, so that the run does not wait for it."""
+    return {stamp: _xyyaw(deserialize_message(cdr, Odometry).pose.pose) for stamp, cdr in messages.items()}
 
 
 def _xyyaw(pose: Pose) -> Poses:

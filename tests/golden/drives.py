@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.odometry.frame_pairing import PairedFrame
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
@@ -46,15 +47,14 @@ class GoldenDrive:
         np.savez_compressed(FOLDER / f"{world}.npz", **vars(self))
 
 
-def estimates(drive: GoldenDrive, local: LocalOdometry) -> list[RelativeStep]:
-    """The relative poses that the local odometry makes of the frames."""
-    steps: list[RelativeStep] = []
+def estimates(drive: GoldenDrive, local: LocalOdometry, at_once: int = 1) -> list[RelativeStep]:
+    """The relative poses that the local odometry makes of the frames, so many at once."""
+    frames = []
     for number, frame in enumerate(drive.frames):
         action = int(drive.actions[number - 1]) if number and local.uses_action else None
-        step = local.update(FIRST_STAMP_NS + number * int(drive.period_ns), frame, action)
-        if step is not None:
-            steps.append(step)
-    return steps
+        frames.append(PairedFrame(FIRST_STAMP_NS + number * int(drive.period_ns), frame, action))
+    found = [each for at in range(0, len(frames), at_once) for each in local.update_all(frames[at : at + at_once])]
+    return [step for step in found if isinstance(step, RelativeStep)]
 
 
 def corrected(steps: list[RelativeStep], online: OnlineTrajectory) -> tuple[Trajectory, TrajectoryUpdate]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ngo_estimator.mapping import scan_map
-from ngo_estimator.offline import warm_up_trajectory
+from ngo_estimator.offline import warm_up_scans, warm_up_trajectory
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 
 from .relative_poses import WORLD, write_weights
@@ -23,7 +23,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Estimators and maps, compiled: in a fresh clone a node takes longer to start than tests wait for it."""
-    warm_up_trajectory.warm_up_scans()
+    warm_up_scans.warm_up_scans()
     scan_map.warm_up()
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("compiled")

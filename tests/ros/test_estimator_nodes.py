@@ -25,7 +25,7 @@ from visualization_msgs.msg import Marker
 from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.nodes.messages import relative_step, to_ns, to_time
 from ngo_estimator.nodes.path_message import plain_path
-from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 
 from .estimator_graph import FIRST_RUN_NS, STEP_NS, Graph, image_message, scan
@@ -201,6 +201,20 @@ def test_a_late_action_delays_its_frame_and_a_lost_one_drops_it(graph: Graph) ->
     assert graph.steps() == [(0, 1), (1, 3), (3, 4)]
     graph.local.wait_for_log("dropped image without action: the action on 'action' that led to it did not come")
     graph.local.wait_for_log("dropped action: action is 7; expected one of")
+
+
+def test_a_node_that_fell_behind_takes_several_frames_at_once_in_order(graph: Graph) -> None:
+    graph.start_run()
+    graph.play(0, 1)
+    graph.wait_for_step(1)
+    graph.local.send(signal.SIGSTOP)
+    graph.play(*range(2, 42))
+    graph.local.send(signal.SIGCONT)
+    graph.wait_for_step(41)
+    assert graph.steps() == [(k, k + 1) for k in range(41)]
+    for estimate, message in zip(graph.expected(*range(42)), graph.out.relative_poses, strict=True):
+        np.testing.assert_allclose(relative_step(message).relative_xyyaw, estimate.relative_xyyaw, atol=1e-6)
+    graph.diagnostics.wait_for_value("/local_node", "most images at once", lambda most: int(most) == AT_ONCE)
 
 
 def test_a_restarted_source_starts_both_anew_with_one_line_each(graph: Graph) -> None:

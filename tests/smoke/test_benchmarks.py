@@ -83,7 +83,7 @@ def test_a_long_run(world: Literal["maze2d", "scan"], tmp_path: Path, capsys: py
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"window": 60}, "window, repeats are 60, 24"),
+        ({"window": 60}, "window, repeats are 60, 32"),
         ({"repeats": 1}, "window, repeats are 2000, 1"),
         ({"live": 0}, "live, end_to_end_frames are 0, 1000"),
     ],

@@ -1,12 +1,13 @@
 """The table of Doom maps from networks that learned nothing: choices, JSON and page."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 import pytest
 
-from ngo_estimator.checkpoint import write_untrained
-from training import results_doom, tune_doom
+from ngo_estimator.checkpoint import OPTIMIZER, load_place, save_checkpoint, write_untrained
+from training import results_doom, train_loop_judge, tune_doom
 from training.scoring.doom_rows import METRICS, ROWS
 
 
@@ -16,10 +17,18 @@ def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setitem(results_doom._MAPS, "test", (("take_cover.wad", "MAP01"),))
     monkeypatch.setattr(results_doom, "draw_levels", lambda path: None)
     monkeypatch.setattr(tune_doom, "VALIDATION_MAPS", (("simpler_basic.wad", "MAP01"),))
-    for name in ("DRIFTS", "WITNESSES", "STEP_SCALES", "LOOP_SCALES"):
+    for name in ("DRIFTS", "BELIEFS", "STEP_SCALES", "LOOP_SCALES"):
         monkeypatch.setattr(tune_doom, name, getattr(tune_doom, name)[:1])
+    monkeypatch.setattr(tune_doom, "FEWER", 1)
+    # Networks that learned nothing see no ranges.
+    search = dataclasses.replace(train_loop_judge.SEARCH, registrations=0, overlaps=0)
+    monkeypatch.setattr(train_loop_judge, "SEARCH", search)
     folders = {"weights": tmp_path / "weights", "runs": tmp_path / "runs", "out": tmp_path / "out"}
     folders["out"].mkdir()
+    folder = folders["weights"] / "doom"
+    details = {"place_encoder_sha256": load_place(folder, "doom")[1]["sha256"]}
+    judging = train_loop_judge.untrained(folder)
+    save_checkpoint(folder / f"{OPTIMIZER}.safetensors", judging, OPTIMIZER, "doom", details)
     tune_doom.main(tune_doom.Arguments(seeds=1, frames=120, **folders))
     result = results_doom.main(results_doom.Arguments(seeds=2, frames=120, docs=tmp_path / "docs", **folders))
     assert json.loads((tmp_path / "out" / "doom.json").read_text()) == result

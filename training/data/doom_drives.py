@@ -8,7 +8,7 @@ test maps are in no seed.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,9 @@ import numpy as np
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, WORLDS
+
+Watch = Callable[[Any, np.ndarray], None]
+"""What is called with the world and the observation of each frame, and may ask the world for its walls."""
 
 Map = tuple[str, str]
 """A WAD file that ViZDoom ships, and the name of a map in it."""
@@ -39,6 +42,9 @@ TEST_MAPS: tuple[Map, ...] = (
 ROOMS: Map = ("rooms", "")
 """Stands for the generated level of a drive's seed."""
 
+MAZES: Map = ("mazes", "")
+"""Stands for the maze of a drive's seed."""
+
 _PLACES, _PLACE_SHARES = ("map", "rooms", "maze"), (0.5, 0.3, 0.2)
 _DRIVERS = {
     "map": (("explorer", "learned", "random"), (0.85, 0.1, 0.05)),
@@ -50,16 +56,25 @@ CALIBRATION = 1000
 """The last ones of the optimizer's seeds, which drive on the maps for validation."""
 
 
-def map_drive(of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False) -> Episode:
+def map_drive(
+    of: Map, seed: int, frames: int, driver: str = "explorer", drawn_start: bool = False, watch: Watch | None = None
+) -> Episode:
     """A drive of ``frames`` frames on a map, from its own start or one that the seed draws."""
-    env = Maze3D(Maze3DConfig(level="rooms") if of == ROOMS else Maze3DConfig(wad=of[0], map=of[1]))
+    if of == MAZES:
+        env = WORLDS["maze3d"].make_random(np.random.default_rng(seed), tells_walls=watch is not None)
+        try:
+            return record_episode(env, "random_goals", frames, seed, watch=watch)
+        finally:
+            env.close()
+    config = Maze3DConfig(level="rooms") if of == ROOMS else Maze3DConfig(wad=of[0], map=of[1])
+    env = Maze3D(config, tells_walls=watch is not None)
     try:
-        return record_episode(env, driver, frames, seed, {"drawn_start": True} if drawn_start else None)
+        return record_episode(env, driver, frames, seed, {"drawn_start": True} if drawn_start else None, watch)
     finally:
         env.close()
 
 
-def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
+def doom_episodes(seeds: Sequence[int], frames: int, watch: Watch | None = None) -> Iterator[Episode]:
     """Episodes of ``frames`` frames, one for each of ``seeds``.
 
     Training seeds share what the first one draws: levels or mazes of their own, or one long drive on a map, in parts.
@@ -72,29 +87,36 @@ def doom_episodes(seeds: Sequence[int], frames: int) -> Iterator[Episode]:
         driver = str(rng.choice(names, p=shares))
         if place == "map":
             of = TRAIN_MAPS[int(rng.integers(len(TRAIN_MAPS)))]
-            long = map_drive(of, seeds[0], len(seeds) * (frames - 1) + 1, driver, drawn_start=True)
+            long = map_drive(of, seeds[0], len(seeds) * (frames - 1) + 1, driver, True, watch)
             yield from _parts(long, frames)
         else:
-            yield from _levels(place, seeds, frames, driver, rng)
+            yield from _levels(place, seeds, frames, driver, rng, watch)
         return
     for seed in seeds:
         place, rng = _ONE_BY_ONE[seed % len(_ONE_BY_ONE)], np.random.default_rng([seed, 2])
         learned_from = seed in OPTIMIZER_TRAIN_SEEDS and seed < OPTIMIZER_TRAIN_SEEDS[-CALIBRATION]
         if place == "map" and learned_from:
-            yield map_drive(TRAIN_MAPS[int(rng.integers(len(TRAIN_MAPS)))], seed, frames, drawn_start=True)
+            of = TRAIN_MAPS[int(rng.integers(len(TRAIN_MAPS)))]
+            yield map_drive(of, seed, frames, drawn_start=True, watch=watch)
         elif place == "map":
-            yield map_drive(VALIDATION_MAPS[seed % len(VALIDATION_MAPS)], seed, frames)
+            yield map_drive(VALIDATION_MAPS[seed % len(VALIDATION_MAPS)], seed, frames, watch=watch)
         else:
-            yield from _levels(place, [seed], frames, _DRIVERS[place][0][seed % 2], rng)
+            yield from _levels(place, [seed], frames, _DRIVERS[place][0][seed % 2], rng, watch)
 
 
-def _levels(place: str, seeds: Sequence[int], frames: int, driver: str, rng: np.random.Generator) -> Iterator[Episode]:
+def _levels(
+    place: str, seeds: Sequence[int], frames: int, driver: str, rng: np.random.Generator, watch: Watch | None
+) -> Iterator[Episode]:
     """An episode in the level or the maze of each seed; the size of all mazes is drawn by ``rng``."""
-    env: Any = Maze3D(Maze3DConfig(level="rooms")) if place == "rooms" else WORLDS["maze3d"].make_random(rng)
+    env: Any
+    if place == "rooms":
+        env = Maze3D(Maze3DConfig(level="rooms"), tells_walls=watch is not None)
+    else:
+        env = WORLDS["maze3d"].make_random(rng, tells_walls=watch is not None)
     try:
         env.preload(seeds)
         for seed in seeds:
-            yield record_episode(env, driver, frames, seed)
+            yield record_episode(env, driver, frames, seed, watch=watch)
     finally:
         env.close()
 

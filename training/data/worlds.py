@@ -117,9 +117,9 @@ class World(Domain):
         return tuple(f"validation_{table}" for table in self.unseen_tables)
 
     def make(
-        self, rows: int | None = None, extra_openings: int | None = None, aliased: bool = False
+        self, rows: int | None = None, extra_openings: int | None = None, aliased: bool = False, **more: Any
     ) -> gymnasium.Env[Any, Any]:
-        """An environment with mazes of this size, by default the simulator's own."""
+        """An environment with mazes of this size, by default the simulator's own; ``more`` goes to the 3D one."""
         changes: dict[str, Any] = {"aliased": aliased}
         if rows is not None:
             changes.update(rows=rows, cols=rows)
@@ -131,7 +131,7 @@ class World(Domain):
             return Maze2D(Maze2DConfig(**changes))
         from ngo_sim.maze3d import Maze3D, Maze3DConfig  # loads ViZDoom, which the 2D world does without
 
-        return Maze3D(Maze3DConfig(**changes))
+        return Maze3D(Maze3DConfig(**changes), **more)
 
     def table_seeds(self, table: str, split: str) -> range:
         """Seeds of a table's episodes in the ``validation`` or ``test`` split."""
@@ -163,7 +163,7 @@ class World(Domain):
         """The name of the driver of a table's trajectories."""
         return self.tables[table].driver or self.driver
 
-    def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN) -> gymnasium.Env[Any, Any]:
+    def make_random(self, rng: np.random.Generator, size: MazeSize = DRAWN, **more: Any) -> gymnasium.Env[Any, Any]:
         """An environment with mazes of ``size``; a random size and number of openings where that has None."""
         rows = int(rng.integers(self.rows[0], self.rows[1] + 1))
         openings = int(rng.integers(self.extra_openings[0], self.extra_openings[1] + 1))
@@ -171,6 +171,7 @@ class World(Domain):
             rows if size.rows is None else size.rows,
             openings if size.extra_openings is None else size.extra_openings,
             size.aliased,
+            **more,
         )
 
 

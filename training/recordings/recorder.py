@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Callable, Mapping
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -12,9 +14,16 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
+from ngo_common.waiting import waiting_messages
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.writer import RecordingWriter
+
+_BUNCH_S = 0.02
+"""Messages of so long are taken together."""
+_MOST = 100
+"""Messages of one topic that are taken together."""
 
 Listener = Callable[[bytes, int, int], None]
 """Called with the serialised message, and when it was published and received (wall clock, ns)."""
@@ -40,6 +49,8 @@ class Recorder:
         self.node = rclpy.create_node("recorder", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._topics: list[tuple[Subscription, Callable[[bytes, dict[str, Any]], None]]] = []
+        self._taken_s = 0.0
         self._listeners: dict[str, Listener] = {}
         self.counts: dict[str, int] = {}
         for topic, type_name in (topics or {}).items():
@@ -71,8 +82,20 @@ class Recorder:
         return self.node.count_subscribers(topic) > besides
 
     def spin_once(self, timeout_s: float = 0.05) -> None:
-        """Take the messages that are there; wait up to timeout_s for one."""
+        """Take the messages that are there; wait up to timeout_s for one.
+
+        A turn of the executor costs as much as many messages, so they are taken in bunches.
+        """
+        time.sleep(max(0.0, self._taken_s + min(timeout_s, _BUNCH_S) - time.monotonic()))
         self._executor.spin_once(timeout_sec=timeout_s)
+        self._taken_s = time.monotonic()
+        bunch = [
+            (info["received_timestamp"], received, cdr, info)
+            for subscription, received in self._topics
+            for cdr, info in waiting_messages(subscription, _MOST)
+        ]
+        for _, received, cdr, info in sorted(bunch, key=itemgetter(0)):
+            received(cdr, info)
         self.writer.flush_if_due()
 
     def subscribe(self, topic: str, type_name: str, reliable: bool = True, transient_local: bool = False) -> None:
@@ -105,4 +128,4 @@ class Recorder:
             if topic in self._listeners:
                 self._listeners[topic](cdr, published_ns, received_ns)
 
-        self.node.create_subscription(message_type, topic, received, qos, raw=True)
+        self._topics.append((self.node.create_subscription(message_type, topic, received, qos, raw=True), received))

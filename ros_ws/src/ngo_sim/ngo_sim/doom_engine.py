@@ -20,6 +20,7 @@ from vizdoom import Button, GameVariable, ScreenResolution
 
 from ngo_sim.doom_map import UNITS_PER_M
 from ngo_sim.doom_wad import Lump, read_wad, write_lumps
+from ngo_sim.doom_walls import walls_at
 
 SHIPPED = Path(vizdoom.__file__).parent
 """Where ViZDoom keeps the two games of freedoom, and below it its scenarios."""
@@ -49,11 +50,12 @@ class DoomEngine:
     """ViZDoom's process.
 
     width, height: of an observation, one of RESOLUTIONS; what is rendered is twice as large. tics: in a step.
+    tells_walls: whether ``walls`` is to be asked, which costs time in each step.
     """
 
-    def __init__(self, width: int, height: int, field_of_view_deg: int, tics: int) -> None:
+    def __init__(self, width: int, height: int, field_of_view_deg: int, tics: int, tells_walls: bool = False) -> None:
         self._resolution = RESOLUTIONS[width, height]
-        self._field_of_view_deg, self._tics = field_of_view_deg, tics
+        self._field_of_view_deg, self._tics, self._tells_walls = field_of_view_deg, tics, tells_walls
         self._game: vizdoom.DoomGame | None = None
         self._harmless = False
 
@@ -105,6 +107,7 @@ class DoomEngine:
         game.set_seed(_ENGINE_SEED)
         game.set_available_buttons([Button.MOVE_FORWARD_BACKWARD_DELTA, Button.TURN_LEFT_RIGHT_DELTA, Button.USE])
         game.set_available_game_variables([GameVariable.POSITION_X, GameVariable.POSITION_Y, GameVariable.ANGLE])
+        game.set_sectors_info_enabled(self._tells_walls)
         # The camera of a walking player goes up and down by default.
         game.set_game_args("+movebob 0 +stillbob 0" + (" -nomonsters" if self._harmless else ""))
         with _WORKING_DIRECTORY_LOCK:
@@ -140,6 +143,13 @@ class DoomEngine:
         """
         # The engine turns clockwise for a positive number, and by that number in each tic.
         return self._act([thrust, -turn_deg / self._tics, use], self._tics)
+
+    def walls(self) -> NDArray[np.float64]:
+        """The walls at the height of the eye, ``(n, 4)`` as of ``walls_at``, doors and lifts as they are now."""
+        assert self._game is not None
+        sectors = self._game.get_state().sectors
+        assert sectors is not None
+        return walls_at(sectors, self._game.get_game_variable(GameVariable.CAMERA_POSITION_Z))
 
     def _act(self, buttons: list[float], tics: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         assert self._game is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,12 +31,17 @@ class Episode:
 
 
 def record_episode(
-    env: gymnasium.Env[Any, Any], driver_name: str, frames: int, seed: int, options: dict[str, Any] | None = None
+    env: gymnasium.Env[Any, Any],
+    driver_name: str,
+    frames: int,
+    seed: int,
+    options: dict[str, Any] | None = None,
+    watch: Callable[[Any, npt.NDArray[Any]], None] | None = None,
 ) -> Episode:
     """Record `frames` (at least 1) of a Maze2D or Maze3D; world, noise and driver are functions of seed.
 
     driver_name is one of driver_choice.DRIVER_NAMES; ValueError where the world does not suit it. options are those of
-    the environment's reset.
+    the environment's reset. ``watch`` is called with the world and the observation of each frame.
     """
     if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 1:
         raise ValueError(f"frames is {frames!r}; it must be an integer of at least 1")
@@ -46,9 +52,13 @@ def record_episode(
     actions = np.empty(frames - 1, dtype=np.uint8)
     poses_xyyaw = np.empty((frames, 3))
     observations[0], poses_xyyaw[0] = observation, info["pose_xyyaw"]
+    if watch is not None:
+        watch(world, observation)
     for frame in range(frames - 1):
         action = driver.action(info["pose_xyyaw"], observation)
         observation, _, _, _, info = env.step(action)
         actions[frame] = action
         observations[frame + 1], poses_xyyaw[frame + 1] = observation, info["pose_xyyaw"]
+        if watch is not None:
+            watch(world, observation)
     return Episode(observations, actions, poses_xyyaw, world.period_s, world.maze)

@@ -25,6 +25,7 @@ from ngo_sim.doom_map import (
     textmap,
     wall_faces,
 )
+from ngo_sim.doom_walls import wall_ranges
 from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_aliased, check_maze_size, kruskal_maze, repeated_maze
 from ngo_sim.rooms_level import rooms_textmap
@@ -159,7 +160,9 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": TICS_PER_S}
 
-    def __init__(self, config: Maze3DConfig | None = None, render_mode: str | None = None) -> None:
+    def __init__(
+        self, config: Maze3DConfig | None = None, render_mode: str | None = None, tells_walls: bool = False
+    ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; it must be None or 'rgb_array'")
         self.config = config if config is not None else Maze3DConfig()
@@ -171,7 +174,7 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         shape = (self.config.height, self.config.width, 3)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         size = self.config.width, self.config.height
-        self._engine = DoomEngine(*size, self.config.field_of_view_deg, self.config.frame_skip)
+        self._engine = DoomEngine(*size, self.config.field_of_view_deg, self.config.frame_skip, tells_walls)
         weakref.finalize(self, self._engine.close)
         self._preloaded: dict[_Seeds, DoomWorld] = {}
         self._loaded: dict[_Seeds, DoomWorld] = {}
@@ -262,6 +265,13 @@ class Maze3D(gymnasium.Env[NDArray[np.uint8], np.int64]):
         walled_in = self.maze is None and action == Action.FORWARD and travelled < _STANDING_M
         self._steps_walled_in = self._steps_walled_in + 1 if walled_in else 0
         return mean_2x2(self._picture), travelled, False, False, self._info()
+
+    def wall_ranges(self, angles_rad: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Distances (rays,) in m of the first walls at the height of the eye, along rays in the robot's frame.
+
+        They are of the latest picture. For an environment with tells_walls, in any level.
+        """
+        return wall_ranges(self._engine.walls(), self._pose_xyyaw, angles_rad)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The picture as rendered, uint8 (2 height, 2 width, 3); None without a mode or before a reset."""

@@ -13,6 +13,7 @@ from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import SmootherConfig
+from ngo_estimator.odometry.frame_pairing import PairedFrame
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame, UnusableImage
 from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations, place_config
@@ -309,3 +310,51 @@ def test_loading_checks_that_the_networks_belong_together(world: str, tmp_path: 
     with pytest.raises(CheckpointError) as error:
         LocalOdometry.load(tmp_path)
     assert "place_encoder.json" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["actions", "memory", "twist"])
+def test_frames_at_once_are_as_one_by_one_with_gaps_refused_frames_and_restarts(kind: str) -> None:
+    memory = SmootherConfig(8, (0.1, 0.02, 0.05), dilations=(1, 2), width=8, causal=True)
+    settings = {
+        "actions": {"actions": 3, "action_history": 3},
+        "memory": {"actions": 3, "memory": memory},
+        "twist": {"actions": 0, "twist": True},
+    }[kind]
+
+    def core() -> LocalOdometry:
+        torch.manual_seed(0)
+        config = local_config("maze2d", feature_size=8, relative_std=(0.1, 0.02, 0.05), **settings)  # type: ignore[arg-type]
+        network = LocalPoseNetwork(config)
+        if network.memory is not None:  # as one that has learned
+            torch.nn.init.normal_(network.memory.head.weight)
+        return LocalOdometry(network, PlaceNetworks(place_config("maze2d", code_size=16)), "maze2d")
+
+    images = frames(16)
+    broken = np.full_like(images[0], np.nan)
+    # Step 6 is missing, one comes twice, one late, one is broken; then the source restarts, twice.
+    numbers = [0, 1, 2, 3, 4, 5, 7, 7, 6, 8, 9, -100, -99, -98, -200, -199]
+    played = [
+        PairedFrame(k * PERIOD_NS, broken if at == 9 else images[at], at % 3, np.array([0.1 * at, 0.0, 0.2]))
+        for at, k in enumerate(numbers)
+    ]
+    single, together = core(), core()
+    expected: list[LocalEstimate | RejectedFrame | None] = []
+    for frame in played:
+        try:
+            expected.append(single.update(frame.stamp_ns, frame.image, frame.action, frame.twist))
+        except RejectedFrame as error:
+            expected.append(error)
+    found = [result for at in (0, 1, 9) for result in together.update_all(played[at : {0: 1, 1: 9, 9: 16}[at]])]
+    assert [type(result) for result in found] == [type(result) for result in expected]
+    assert sum(result is None for result in found) == together.restarts + 1 == single.restarts + 1 == 3
+    for ours, one in zip(found, expected, strict=True):
+        if isinstance(ours, RejectedFrame):
+            assert str(ours) == str(one)
+        if not isinstance(ours, LocalEstimate):
+            continue
+        for name, value in vars(ours).items():
+            theirs = getattr(one, name)
+            if isinstance(value, np.ndarray):
+                np.testing.assert_allclose(value, theirs, rtol=1e-4, atol=1e-6, err_msg=name)
+            else:
+                assert value == theirs, name

@@ -47,17 +47,33 @@ def test_an_open_direction_tells_no_velocity() -> None:
     assert expected[2] == pytest.approx(0.03, abs=2e-3)
 
 
+def test_a_robot_that_was_seen_to_speed_up_may_do_so_where_no_wall_tells_it() -> None:
+    """It speeds up to 3 m/s and stops again; then it enters a corridor slowly and speeds up there."""
+    prior, pose, truth = MotionPrior(MotionPriorConfig()), np.zeros(3), 0.0
+    prior.begin(0, pose, None)
+    for k in range(1, 221):
+        truth += 0.1 * 1.5 * (1.0 - math.cos(2.0 * math.pi * k / 40.0))
+        before, prediction = pose, prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
+        covariance, pose = SURE, np.array((truth, 0.0, 0.0))
+        if k > 200:
+            covariance = np.diag((prediction.covariance[0, 0], 1e-6, 1e-8))
+            pose = np.array((prediction.mean[0], 0.0, 0.0))
+        prior.accept(k * PERIOD_NS, pose, covariance, pose - before, covariance, False, False, False)
+    assert abs(truth - pose[0]) > 1.0
+    assert abs(truth - pose[0]) < 3.0 * math.sqrt(covariance[0, 0])
+
+
 @pytest.mark.parametrize("keys", [1, 4, 1000])
 def test_an_error_of_the_velocity_adds_up_over_key_scans(keys: int) -> None:
     """Along a corridor errors of 120 drives are as large as the sum of what their key scans say, however many."""
-    config = MotionPriorConfig(acceleration_m_s2=0.5, largest_m_s=1.0)
+    config = MotionPriorConfig(acceleration_m_s2=2.0, largest_m_s=4.0)
     random, errors, variance = np.random.default_rng(keys), [], 0.0
     for _ in range(120):
         prior, pose, truth, speed = MotionPrior(config), np.zeros(3), 0.0, 0.4
         prior.begin(0, pose, None)
         total = 0.0
         for k in range(1, 41):
-            speed += 0.025 * random.standard_normal()
+            speed += 0.1 * random.standard_normal()
             truth += 0.1 * speed + config.still_m * random.standard_normal()
             before, prediction = pose, prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
             open_ahead = k > 10

@@ -115,6 +115,15 @@ def test_a_corridor_is_measured_by_its_wheels() -> None:
         assert deviations[0] > 0.02 > 0.012 > deviations[1]
 
 
+def test_what_comes_into_view_is_kept_where_the_robot_may_have_come_far() -> None:
+    """A robot stands in a corridor, for all that walls tell: what is new makes key scans, what is known makes none."""
+    poses, cabinet = np.zeros((60, 3)), np.array((((2.0, 0.4), (2.0, 0.9)), ((2.0, 0.4), (3.0, 0.4))))
+    scans = scans_along(HALLWAY, poses, fan(181))
+    assert sum(estimate.is_key for estimate in drive(scans)[0]) == 1
+    seen = scans_along(np.concatenate((HALLWAY, cabinet)), poses, fan(181))
+    assert sum(estimate.is_key for estimate in drive([*scans[:30], *seen[30:]])[0]) > 1
+
+
 def test_keys_are_by_motion() -> None:
     poses = round_trip(81)
     estimates, odometry = drive(scans_along(ROOM, poses, fan(241, 240.0)))

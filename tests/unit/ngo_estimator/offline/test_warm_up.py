@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry import branch_and_bound, scan_matching, scan_points, scan_registration_kernels
-from ngo_estimator.offline.warm_up_trajectory import warm_up_networks, warm_up_scans
+from ngo_estimator.offline.warm_up_scans import warm_up_scans
+from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer import block_cholesky, compiled_closing, shared_views_kernel
 from tests.unit.ngo_estimator.online.test_online_trajectory import make_steps

@@ -566,3 +566,26 @@ def test_loading_checks_that_the_networks_belong_together(tmp_path: Path) -> Non
     with pytest.raises(CheckpointError, match="another place encoder") as error:
         OnlineTrajectory.load(tmp_path, 100)
     assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_spread_over_steps_loops_are_judged_anew_more_often_than_the_network_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    optimizer, kinds = small_optimizer("loops", True), []
+    core = OnlineTrajectory(optimizer, small_pair_head(), 1200, iterations_per_step=1)
+    iterate = optimizer.iterate
+
+    def kind(steps: object, loops: object, corrections: object, solution: object) -> object:
+        kinds.append("network" if corrections is None else "anew" if solution is None else "resumed")
+        return iterate(steps, loops, corrections, solution)
+
+    monkeypatch.setattr(optimizer, "iterate", kind)
+    for step in make_steps(1600):
+        core.update(step)
+    core.finish()
+    newest = kinds[-80:]
+    judged = [number for number, of in enumerate(newest) if of != "resumed"]
+    assert max(np.diff(judged)) == 8
+    ran = [number for number, of in enumerate(newest) if of == "network"]
+    assert len(ran) >= 3 and min(np.diff(ran)) > 8
+    assert kinds[:8] == ["network"] * 8  # a short trajectory changes a lot with each meta-pose

@@ -1,6 +1,9 @@
 """The graph leaves the odometry of unfamiliar frames as it is, and closes no loops with them."""
 
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,3 +69,23 @@ def test_behind_a_blind_stretch_a_small_correction_gives_way_to_the_odometry(wor
     moved = np.linalg.norm((trajectory.poses_xyyaw - trajectory.odometry_xyyaw)[: half - 16, :2], axis=1)
     assert moved.max() > 1e-3  # what was known before stays corrected
     assert update.covariance[0, 0] > 4.0
+
+
+def test_place_codes_alone_close_no_loop_across_a_blind_stretch(tmp_path: Path) -> None:
+    """Nothing limits the motion within it: each place that looks alike would do."""
+    torch.set_num_threads(1)
+    steps = estimates(GoldenDrive.load("maze2d"), LocalOdometry.load(WEIGHTS / "maze2d"))
+    folder = shutil.copytree(WEIGHTS / "maze2d", tmp_path / "maze2d")
+    described = json.loads((folder / "neural_graph_optimizer.json").read_text())
+    described["config"]["search"]["registrations"] = 0
+    (folder / "neural_graph_optimizer.json").write_text(json.dumps(described))
+    core, half = OnlineTrajectory.load(folder, world="maze2d"), len(steps) // 2 // 8 * 8
+
+    def across(stretch: range) -> int:
+        core.reset()
+        corrected([replace(step, unlikeness=2.0 if k in stretch else 0.0) for k, step in enumerate(steps)], core)
+        believed = core._graph.loop_frames[core._graph.loop_weights > 0.1]
+        return int(((believed[:, 0] < half) & (believed[:, 1] >= half)).sum())
+
+    assert across(range(0)) > 0
+    assert across(range(half, half + 4)) == 0

@@ -39,7 +39,10 @@ def all_between(a: Array, b: Array) -> Array:
     """``between`` of poses ``(n, 3)``, row by row; either may be a single one ``(1, 3)`` for all rows of the other."""
     result = np.empty((len(b) if len(a) == 1 else len(a), 3))
     for k in range(len(result)):
-        result[k] = between(a[0 if len(a) == 1 else k], b[0 if len(b) == 1 else k])
+        i, j = 0 if len(a) == 1 else k, 0 if len(b) == 1 else k
+        cos, sin = math.cos(a[i, 2]), math.sin(a[i, 2])
+        x, y = b[j, 0] - a[i, 0], b[j, 1] - a[i, 1]
+        result[k, 0], result[k, 1], result[k, 2] = cos * x + sin * y, -sin * x + cos * y, wrap(b[j, 2] - a[i, 2])
     return result
 
 
@@ -47,8 +50,13 @@ def all_between(a: Array, b: Array) -> Array:
 def chained(relative: Array) -> Array:
     """Poses ``(n + 1, 3)``, the origin in front, of relative ones ``(n, 3)``, each seen from the one before."""
     poses = np.zeros((len(relative) + 1, 3))
+    x, y, yaw = 0.0, 0.0, 0.0
     for k in range(len(relative)):
-        poses[k + 1] = compose(poses[k], relative[k])
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        x += cos * relative[k, 0] - sin * relative[k, 1]
+        y += sin * relative[k, 0] + cos * relative[k, 1]
+        yaw = wrap(yaw + relative[k, 2])
+        poses[k + 1, 0], poses[k + 1, 1], poses[k + 1, 2] = x, y, yaw
     return poses
 
 
@@ -79,3 +87,30 @@ def turned_covariance(yaw: float, covariance: Array) -> Array:
     cos, sin = math.cos(yaw), math.sin(yaw)
     turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
     return turn @ covariance @ turn.T
+
+
+@njit(cache=True)
+def carried(pose: Array, covariance: Array, odometry: Array, relative: Array, variance: Array) -> tuple[Array, Array]:
+    """A pose and its covariance after further steps, as ``planar_covariance.propagate`` has it for each.
+
+    Args:
+        pose: ``(3,)`` where the steps begin, covariance: ``(3, 3)`` of it.
+        odometry: poses ``(n + 1, 3)`` by odometry where they begin and after each.
+        relative: the steps ``(n, 3)``, with independent errors of this ``variance`` ``(n, 3)``.
+    """
+    last = pose
+    for k in range(len(relative)):
+        last = compose(pose, between(odometry[0], odometry[k + 1]))
+        yaw = last[2] - relative[k, 2]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        lever = np.eye(3)
+        lever[0, 2] = -(sin * relative[k, 0] + cos * relative[k, 1])
+        lever[1, 2] = cos * relative[k, 0] - sin * relative[k, 1]
+        result = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                for m in range(3):
+                    for n in range(3):
+                        result[i, j] += lever[i, m] * covariance[m, n] * lever[j, n]
+        covariance = result + turned_covariance(yaw, np.diag(variance[k]))
+    return last, covariance

@@ -25,7 +25,8 @@ class PlaceConfig:
 
     ``offset_scale_m`` is the typical distance of two frames of one place: the unit of the pair head's output.
     A code has ``code_size`` learned numbers; with ``registration`` ranges follow (m, 0 where there is none), so that
-    pairs can be measured by these: those of a row with depth, or what a network says of a picture.
+    pairs can be measured by these: those of a row with depth, or what a network says of a picture. Of a picture with a
+    smaller share of sure ranges than ``least_sure`` there are none: it shows something that the network does not know.
     """
 
     image: ImageFormat
@@ -35,6 +36,7 @@ class PlaceConfig:
     embedding_size: int = 64
     pair_hidden_size: int = 384
     registration: RegistrationConfig | None = None
+    least_sure: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width <= 2.0:
@@ -43,6 +45,8 @@ class PlaceConfig:
             raise ValueError(f"offset_scale_m is {self.offset_scale_m}; expected a positive distance")
         if min(self.code_size, self.embedding_size, self.pair_hidden_size) < 1:
             raise ValueError("code_size, embedding_size and pair_hidden_size must be at least 1")
+        if not 0.0 <= self.least_sure <= 1.0:
+            raise ValueError(f"least_sure is {self.least_sure}; expected a share of 0 to 1")
         if self.registration is None or self.sees_ranges:
             return
         if not self.image.has_depth:
@@ -130,7 +134,9 @@ class PlaceEncoder(nn.Module):
         if self.config.registration is None:
             return code
         if seen is not None:
-            return torch.cat((code, seen.ranges), dim=-1)
+            ranges = seen.ranges
+            sure = (ranges > 0.0).float().mean(dim=-1, keepdim=True) >= self.config.least_sure
+            return torch.cat((code, ranges * sure), dim=-1)
         ranges = images[:, 0, :, -1].float()
         return torch.cat((code, torch.where(ranges.isfinite(), ranges, 0.0)), dim=-1)
 

@@ -9,6 +9,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible, qos_po
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ngo_common.nodes.qos import overridable
+from ngo_common.waiting import waiting_messages
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.odometry.source_guard import SourceGuard
 
@@ -54,6 +55,11 @@ class Input:
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos),
             qos_overriding_options=overridable(),
         )
+
+    def take_waiting(self, most: int) -> None:
+        """Take up to ``most`` of the messages that wait, without another turn of the executor for each."""
+        for message, info in waiting_messages(self._subscription, most):
+            self._on_message(message, info)
 
     def close(self) -> None:
         """End the subscription."""

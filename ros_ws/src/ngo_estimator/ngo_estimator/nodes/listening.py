@@ -19,12 +19,13 @@ class Listening:
         self._node, self._status, self._timeout_s = node, status, timeout_s
         self._inputs: list[Input] = []
 
-    def to(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
+    def to(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> Input:
         """Take the messages of one publisher; their frames, where they have any, tell publishers apart."""
 
         take = self._safe(topic, callback)
         made = Input(self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s)
         self._inputs.append(made)
+        return made
 
     def to_all(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
         """Take the messages of all publishers."""

@@ -61,16 +61,19 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
 
     All that it runs is compiled by then, which ``logger`` tells where it takes long.
     """
-    # Imported here because torch takes seconds: a bad parameter is said at once.
-    from ngo_estimator.offline.warm_up_trajectory import warm_up_networks, warm_up_scans
-    from ngo_estimator.online.online_trajectory import OnlineTrajectory
-    from ngo_estimator.online.scan_trajectory import ScanTrajectory
 
+    # Imported here because torch takes seconds: a bad parameter is said at once. A lidar's estimators take half a one.
     def load(folder: Path, world: str) -> "CorrectedTrajectory":
         if is_lidar(folder):
+            from ngo_estimator.offline.warm_up_scans import warm_up_scans
+            from ngo_estimator.online.scan_trajectory import ScanTrajectory
+
             with compiling(logger):
                 warm_up_scans()
             return ScanTrajectory.load(folder, world, settings.iterations_per_step)
+        from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
+        from ngo_estimator.online.online_trajectory import OnlineTrajectory
+
         online = OnlineTrajectory.load(
             folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
         )

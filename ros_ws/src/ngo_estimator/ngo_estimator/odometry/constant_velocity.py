@@ -21,7 +21,7 @@ class ConstantVelocity:
 
     def __init__(self, largest: Array) -> None:
         self.velocity = np.zeros(3)
-        self._largest = largest
+        self.largest = largest
         self._joint = np.zeros((6, 6))  # of pose and velocity
         self._drift = np.zeros((3, 6))  # errors of the last key scan's pose, against both
         self._predicted = np.zeros((3, 3))
@@ -34,7 +34,7 @@ class ConstantVelocity:
         """
         cos, sin = np.cos(yaw), np.sin(yaw)
         # An error of the velocity is forgotten as new ones come, so that it stays below the largest.
-        kept = np.sqrt(np.clip(1.0 - (velocity_noise / self._largest) ** 2, 0.0, 1.0))
+        kept = np.sqrt(np.clip(1.0 - (velocity_noise / self.largest) ** 2, 0.0, 1.0))
         changes, moves = np.eye(6), np.eye(6)
         changes[_V, _V] = np.diag(kept)
         moves[_R, _V] = elapsed * np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,18 @@ class Judged:
     repeated: bool
 
 
+@dataclass(frozen=True)
+class Told:
+    """What led to a step: action and mean velocity ``(3,)``, where the networks take them.
+
+    ``after_gap``: frames are missing before it, so that what was told earlier is of no account.
+    """
+
+    action: int | None
+    twist: np.ndarray | None = None
+    after_gap: bool = False
+
+
 class FamiliarityWatch:
     """The familiarity of one stream of observations.
 
@@ -63,38 +76,40 @@ class FamiliarityWatch:
         self._apart: deque[np.ndarray] = deque(maxlen=self._config.memory)
         self._actions = [NO_ACTION] * HISTORY
 
-    def forget_actions(self) -> None:
-        """Forget what was told before: frames are missing."""
-        self._actions = [NO_ACTION] * HISTORY
-
     def judge(
         self,
         images: tuple[Tensor, Tensor],
         early: Tensor,
-        told: tuple[int | None, np.ndarray | None],
-        step: tuple[Tensor, ...],
-    ) -> Judged:
-        """Judge a step.
+        told: Sequence[Told],
+        steps: tuple[Tensor, Tensor, Tensor],
+    ) -> list[Judged]:
+        """Judge the next ``n`` steps, in order.
 
         Args:
-            images: the earlier and the later observation ``(1, height, width, channels)``.
-            early: the place encoder's early features of the later one.
-            told: action and mean velocity ``(3,)`` between them, where the networks take them.
-            step: the network's motion ``(1, 3)``, variance ``(1, 3)`` and motion feature ``(1, motion_size)``.
+            images: the earlier and the later observation of each ``(n, height, width, channels)``.
+            early: the place encoder's early features of the later ones.
+            told: what led to each.
+            steps: the network's motions ``(n, 3)``, variances ``(n, 3)`` and motion features ``(n, motion_size)``.
         """
-        action, twist = told
-        self._actions = [*self._actions[1:], NO_ACTION if action is None else action]
-        twists = None if twist is None else torch.tensor(np.asarray(twist)[None], dtype=torch.float32)
-        known = told_vector(self._config, torch.tensor([self._actions]), twists, 1)
-        relative, variance, feature = step
+        histories = []
+        for each in told:
+            before = [NO_ACTION] * HISTORY if each.after_gap else self._actions
+            self._actions = [*before[1:], NO_ACTION if each.action is None else each.action]
+            histories.append(self._actions)
+        twists = (
+            torch.tensor(np.array([each.twist for each in told]), dtype=torch.float32) if self._config.twist else None
+        )
+        known = told_vector(self._config, torch.tensor(histories), twists, len(told))
+        relative, variance, features = steps
         changed = change(*images)
         with torch.inference_mode():
-            distances = self._familiarity.distances(look(early), feature.float(), known, relative.float(), changed)[0]
-            other = self._familiarity.told_motion(known)[0].double().numpy()
-        return self._judged(distances.double().numpy(), float(changed), other, relative[0], variance[0])
+            distances = self._familiarity.distances(look(early), features.float(), known, relative.float(), changed)
+            others = self._familiarity.told_motion(known)
+        rows = zip(distances.double().numpy(), changed.tolist(), others.double().numpy(), strict=True)
+        return [self._judged(*row, relative[k], variance[k]) for k, row in enumerate(rows)]
 
     def judge_drive(self, images: Tensor, actions: np.ndarray | None, steps: tuple[Tensor, ...]) -> list[Judged]:
-        """Judge all steps of a drive, from its beginning, as ``judge`` would one by one.
+        """Judge all steps of a drive, from its beginning.
 
         Args:
             images: ``(n + 1, height, width, channels)``; actions: ``(n,)``, where the networks take them.
@@ -102,20 +117,13 @@ class FamiliarityWatch:
         """
         self.reset()
         relative, variance, features = steps
-        padded = np.concatenate((np.full(HISTORY - 1, NO_ACTION), [] if actions is None else actions)).astype(np.int64)
-        histories = torch.from_numpy(np.lib.stride_tricks.sliding_window_view(padded, HISTORY).copy())
         found = []
         for at in torch.arange(len(relative)).split(_CHUNK):
-            known = told_vector(self._config, None if actions is None else histories[at], None, len(at))
-            changed = change(images[at], images[at + 1])
+            told = [Told(None if actions is None else int(actions[k])) for k in at.tolist()]
             with torch.inference_mode():
-                looks = look(self._encoder.early(images[at + 1]))
-                distances = self._familiarity.distances(
-                    looks, features[at].float(), known, relative[at].float(), changed
-                )
-                others = self._familiarity.told_motion(known)
-            rows = zip(distances.double().numpy(), changed.tolist(), others.double().numpy(), at.tolist(), strict=True)
-            found += [self._judged(one, moved, other, relative[k], variance[k]) for one, moved, other, k in rows]
+                early = self._encoder.early(images[at + 1])
+            pairs = images[at], images[at + 1]
+            found += self.judge(pairs, early, told, (relative[at], variance[at], features[at]))
         return found
 
     def _judged(

@@ -1,6 +1,7 @@
 """Local odometry: frames in, relative poses out (no ROS here)."""
 
 from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,12 @@ from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.familiarity import Familiarity
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
-from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
-from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
+from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch, Told
+from ngo_estimator.odometry.frame_pairing import PairedFrame
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame, UnusableImage
+
+AT_ONCE = 8
+"""Frames for which the networks run at once where so many are there."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +98,10 @@ class LocalOdometry:
 
     def reset(self) -> None:
         """Forget all frames: the next one is the new origin of ``odom``."""
-        self._last_stamp_ns: int | None = None
+        self._last: _Taken | None = None
         self._origin_stamp_ns = 0
-        self._last_image = torch.empty(0)
         self._origin_code: np.ndarray | None = None
         self._odom = torch.zeros(3, dtype=torch.float64)
-        self._actions = [NO_ACTION] * self._network.config.action_history
         memory = self._network.config.memory
         self._steps: deque[tuple[torch.Tensor, ...]] = deque(maxlen=1 if memory is None else memory.reach + 1)
         if self._watch is not None:
@@ -122,74 +125,164 @@ class LocalOdometry:
         Raises:
             RejectedFrame: a frame that cannot be used; the state is as before.
         """
+        (result,) = self.update_all([PairedFrame(stamp_ns, image, action, twist)])
+        if isinstance(result, RejectedFrame):
+            raise result
+        return result
+
+    def update_all(self, frames: Sequence[PairedFrame]) -> list[LocalEstimate | RejectedFrame | None]:
+        """Take the next frames, in order, and run the networks once for all of them.
+
+        Up to ``AT_ONCE`` make each of them cheaper. The results are those of one frame after the other but for the
+        rounding of single precision.
+
+        Returns:
+            For each frame what ``update`` returns or raises.
+        """
+        results: list[LocalEstimate | RejectedFrame | None] = []
+        left = deque(frames)
+        while left:
+            found: list[_Step | RejectedFrame] = []
+            last, begins = self._last, False
+            while left and not begins:
+                try:
+                    step = self._step(last, left[0])
+                except RejectedFrame as error:
+                    found.append(error)
+                else:
+                    if begins := step is None:
+                        break
+                    found.append(step)
+                    last = step.later
+                left.popleft()
+            estimates = self._estimates([step for step in found if isinstance(step, _Step)])
+            results += [next(estimates) if isinstance(each, _Step) else each for each in found]
+            if begins:
+                self._begin(left.popleft())
+                results.append(None)
+        return results
+
+    def _step(self, last: "_Taken | None", frame: PairedFrame) -> "_Step | None":
+        """The step from the last frame to this one, or None where an odometry begins; raises ``RejectedFrame``."""
         try:
-            self._network.config.image.check(image)
+            self._network.config.image.check(frame.image)
         except ValueError as error:
             raise UnusableImage(str(error)) from error
-        frame = torch.from_numpy(np.array(image)).unsqueeze(0)
-        last = self._last_stamp_ns
-        if last is None or stamp_ns <= last - RESTART_AFTER_NS:
-            if last is not None:
-                self.reset()
-                self.restarts += 1
-            self._origin_stamp_ns = stamp_ns
-            self._last_stamp_ns, self._last_image = stamp_ns, frame
-            with torch.inference_mode():
-                self._origin_code = self._encoder(frame)[0].numpy()
+        stamp_ns, action, twist = frame.stamp_ns, frame.action, frame.twist
+        if last is None or stamp_ns <= last.stamp_ns - RESTART_AFTER_NS:
             return None
-        if stamp_ns == last:
+        if stamp_ns == last.stamp_ns:
             raise DuplicateFrame(f"frame at {stamp_ns} ns came twice")
-        if stamp_ns < last:
-            raise LateFrame(f"frame at {stamp_ns} ns is {(last - stamp_ns) / 1e9:.3f} s older than the last one")
-        missed = max(0, round((stamp_ns - last) * 1e-9 / self.period_s) - 1)
-        actions = None
+        if stamp_ns < last.stamp_ns:
+            late_s = (last.stamp_ns - stamp_ns) / 1e9
+            raise LateFrame(f"frame at {stamp_ns} ns is {late_s:.3f} s older than the last one")
+        missed = max(0, round((stamp_ns - last.stamp_ns) * 1e-9 / self.period_s) - 1)
+        actions: list[int] = []
         if self.uses_action:
             if action is None or not 0 <= action < self._network.config.actions:
                 raise UnusableImage(f"action is {action}; expected 0 to {self._network.config.actions - 1}")
             # Of frames that were missed nobody says what the robot did, and what it did before them is longer ago.
-            before = [NO_ACTION] * (len(self._actions) - 1) if missed else self._actions[1:]
-            actions = torch.tensor([[*before, action]])
-        twists = None
-        if self.uses_twist:
-            if twist is None or np.shape(twist) != (3,) or not np.isfinite(twist).all():
-                raise UnusableImage(f"twist is {twist}; expected three finite numbers (m/s, m/s, rad/s)")
-            twists = torch.tensor(np.asarray(twist)[None], dtype=torch.float32)
+            before = [NO_ACTION] * (len(last.actions) - 1) if missed else last.actions[1:]
+            actions = [*before, action]
+        if self.uses_twist and (twist is None or np.shape(twist) != (3,) or not np.isfinite(twist).all()):
+            raise UnusableImage(f"twist is {twist}; expected three finite numbers (m/s, m/s, rad/s)")
+        return _Step(last, _Taken(stamp_ns, _tensor(frame.image), actions), action, twist, missed)
+
+    def _begin(self, frame: PairedFrame) -> None:
+        """Let this frame be the origin of ``odom``."""
+        if self._last is not None:
+            self.reset()
+            self.restarts += 1
+        image = _tensor(frame.image)
         with torch.inference_mode():
-            relative, log_std, feature = self._network(self._last_image, frame, actions, twists)
-            early = self._encoder.early(frame)
-            code = self._encoder.code_of(frame, early)
-            if missed:
-                self._steps.clear()
-            else:
-                self._steps.append((relative, log_std, feature))
-                drive = (torch.cat(part) for part in zip(*self._steps, strict=True))
-                relative, log_std = (values[-1:] for values in self._network.remembered(*drive))
-        variance, unlikeness, repeated = torch.exp(2.0 * log_std[0].double()), 0.0, False
+            self._origin_code = self._encoder(image)[0].numpy()
+        self._origin_stamp_ns = frame.stamp_ns
+        self._last = _Taken(frame.stamp_ns, image, [NO_ACTION] * self._network.config.action_history)
+
+    def _estimates(self, steps: "list[_Step]") -> Iterator[LocalEstimate]:
+        """Run the networks over steps that follow each other; the state is that behind each step handed out."""
+        if not steps:
+            return
+        earlier, later = (torch.cat([getattr(step, end).image for step in steps]) for end in ("earlier", "later"))
+        actions = torch.tensor([step.later.actions for step in steps]) if self.uses_action else None
+        twists = (
+            torch.tensor(np.array([step.twist for step in steps]), dtype=torch.float32) if self.uses_twist else None
+        )
+        with torch.inference_mode():
+            relative, log_std, features = self._network(earlier, later, actions, twists)
+            early = self._encoder.early(later)
+            codes = self._encoder.code_of(later, early).numpy()
+            if self._network.memory is not None:
+                relative, log_std = self._remembered(steps, relative, log_std, features)
+        variance, unlike = torch.exp(2.0 * log_std.double()), [(0.0, False)] * len(steps)
         if self._watch is not None:
-            if missed:
-                self._watch.forget_actions()
-            step = relative, variance.unsqueeze(0), feature
-            judged = self._watch.judge((self._last_image, frame), early, (action, twist), step)
-            unlikeness, repeated = judged.unlikeness, judged.repeated
-            relative, variance = torch.from_numpy(judged.relative).unsqueeze(0), torch.from_numpy(judged.variance)
+            told = [Told(step.action, step.twist, step.missed > 0) for step in steps]
+            judged = self._watch.judge((earlier, later), early, told, (relative, variance, features))
+            unlike = [(each.unlikeness, each.repeated) for each in judged]
+            relative = torch.from_numpy(np.array([each.relative for each in judged]))
+            variance = torch.from_numpy(np.array([each.variance for each in judged]))
         # A pair further apart than in training: the network's own belief holds no longer, so a typical step for every
         # missing frame is added to it.
-        variance = variance + (missed * self._network.relative_std.double()) ** 2
-        self._odom = se2.compose(self._odom, relative[0].double())
-        self._actions = [] if actions is None else actions[0].tolist()
-        self._last_stamp_ns, self._last_image = stamp_ns, frame
-        origin_code, self._origin_code = self._origin_code, None
-        return LocalEstimate(
-            stamp_ns=stamp_ns,
-            from_stamp_ns=last,
-            relative_xyyaw=relative[0].double().numpy(),
-            covariance=torch.diag(variance).numpy(),
-            origin_stamp_ns=self._origin_stamp_ns,
-            odom_xyyaw=self._odom.numpy().copy(),
-            motion_feature=feature[0].numpy(),
-            place_code=code[0].numpy(),
-            from_place_code=origin_code,
-            missed_frames=missed,
-            unlikeness=unlikeness,
-            repeated=repeated,
-        )
+        missed = torch.tensor([[step.missed] for step in steps])
+        variance, relative = variance + (missed * self._network.relative_std.double()) ** 2, relative.double()
+        for k, step in enumerate(steps):
+            self._odom = se2.compose(self._odom, relative[k])
+            self._last = step.later
+            origin_code, self._origin_code = self._origin_code, None
+            yield LocalEstimate(
+                stamp_ns=step.later.stamp_ns,
+                from_stamp_ns=step.earlier.stamp_ns,
+                relative_xyyaw=relative[k].numpy().copy(),
+                covariance=torch.diag(variance[k]).numpy(),
+                origin_stamp_ns=self._origin_stamp_ns,
+                odom_xyyaw=self._odom.numpy().copy(),
+                motion_feature=features[k].numpy().copy(),
+                place_code=codes[k].copy(),
+                from_place_code=origin_code,
+                missed_frames=step.missed,
+                unlikeness=unlike[k][0],
+                repeated=unlike[k][1],
+            )
+
+    def _remembered(
+        self, steps: "list[_Step]", relative: torch.Tensor, log_std: torch.Tensor, features: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Steps ``(n, 3)`` and the logarithms of their deviations, corrected by those before them, up to a gap."""
+        corrected = []
+        for k, step in enumerate(steps):
+            own = relative[k : k + 1], log_std[k : k + 1]
+            if step.missed:
+                self._steps.clear()
+            else:
+                self._steps.append((*own, features[k : k + 1]))
+                drive = (torch.cat(part) for part in zip(*self._steps, strict=True))
+                mean, deviation = self._network.remembered(*drive)
+                own = mean[-1:], deviation[-1:]
+            corrected.append(own)
+        means, deviations = (torch.cat(part) for part in zip(*corrected, strict=True))
+        return means, deviations
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A frame ``(1, height, width, channels)`` of the odometry, and the latest actions up to it."""
+
+    stamp_ns: int
+    image: torch.Tensor
+    actions: list[int]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Two frames that follow each other, and what led from one to the other."""
+
+    earlier: _Taken
+    later: _Taken
+    action: int | None
+    twist: np.ndarray | None
+    missed: int
+
+
+def _tensor(image: np.ndarray) -> torch.Tensor:
+    """A copy of an image ``(1, height, width, channels)``: callers may use theirs again."""
+    return torch.from_numpy(np.array(image)).unsqueeze(0)

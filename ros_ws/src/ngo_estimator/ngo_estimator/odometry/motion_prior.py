@@ -12,6 +12,7 @@ import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array, compose, wrap
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
+from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
 
@@ -21,7 +22,8 @@ class MotionPriorConfig:
 
     Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
     ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
-    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Wheels are doubted
+    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Robots
+    that were seen to change their speed by more get more of both (``UsualMotion``). Wheels are doubted
     where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or ``doubt_deg`` and
     ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most ``longest_freeze_s``, while constant
     velocity moves by ``frozen_m``.
@@ -71,6 +73,7 @@ class MotionPrior:
         self.config = config
         self._stamp_ns = 0
         self._motion = ConstantVelocity(np.array((config.largest_m_s, config.largest_m_s, config.largest_rad_s)))
+        self._usual = UsualMotion(config.largest_m_s)
         self._expected: Array | None = None  # by the velocity alone
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None
@@ -141,7 +144,10 @@ class MotionPrior:
         still = np.array((config.still_m, config.still_m, math.radians(config.still_deg)))
         largest = np.array((config.largest_m, config.largest_m, math.radians(config.largest_deg)))
         self._expected = mean = compose(last, constant)
-        changes = np.minimum(0.5 * self._changes(elapsed), largest / elapsed)
+        changes = 0.5 * self._changes(elapsed)
+        changes[:2] = np.maximum(changes[:2], self._usual.rate_m_s * math.sqrt(elapsed))
+        changes = np.minimum(changes, largest / elapsed)
+        self._motion.largest[:2] = self._usual.largest_m_s
         total = self._motion.predict(last[2], elapsed, still, changes)
         information = np.linalg.inv(total).astype(np.float64)
         return Prediction(mean, total, information, (mean,))
@@ -173,6 +179,10 @@ class MotionPrior:
             change = pose - self._expected
             change[2] = wrap(change[2])
             self._motion.update(change, covariance)
+            if unsure or float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) > self.config.still_m**2:
+                self._usual.interrupt()
+            else:
+                self._usual.observe(step, elapsed)
             if unsure:
                 self._motion.velocity = 0.5 * self._motion.velocity
         shared = self._motion.shared()

@@ -26,18 +26,21 @@ class ScanOdometryConfig:
     """How scans become odometry.
 
     A scan is a key scan ``key_distance_m`` or ``key_turn_deg`` from the last one, unless another was taken within
-    ``known_m`` of it and turned alike. The last ``submap_scans`` of these are what the next scan is registered to. A
-    search precedes the registration where the prediction may be ``poor_m`` or ``poor_deg`` wrong (one deviation); its
-    window is ``search_deviations`` wide to each side, at most ``largest_window_m`` and ``largest_window_deg``. Where
-    fewer than ``good_share`` of the points lie on lines, or where no wheels lead and the prediction may be ``wide_m``
-    wrong, a ``wide`` search follows. Where fewer than ``least_share`` do, or ``least_points``, the prediction stands. A
-    registration of less than ``good_share`` that is ``farthest_deviations`` from the prediction is no better than it.
-    Where no wheels lead, one of less than ``sure_share`` after a search is as likely as the prediction.
+    ``known_m`` of it and turned alike. Where no wheels lead, one is that may be as far away by its deviation, if it
+    shows something new: less than ``known_share`` of its points lie on lines. The last ``submap_scans`` of these
+    are what the next scan is registered to. A search precedes the registration where the prediction may be
+    ``poor_m`` or ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
+    ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
+    where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
+    ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that
+    is ``farthest_deviations`` from the prediction is no better than it. Where no wheels lead, one of less than
+    ``sure_share`` after a search is as likely as the prediction.
     """
 
     key_distance_m: float = 0.3
     key_turn_deg: float = 15.0
     known_m: float = 0.3
+    known_share: float = 0.95
     submap_scans: int = 30
     poor_m: float = 0.1
     poor_deg: float = 5.0
@@ -67,10 +70,11 @@ class ScanOdometryConfig:
             raise ValueError(
                 f"submap_scans, least_points are {self.submap_scans}, {self.least_points}; expected at least 1 and 3"
             )
-        if not 0.0 < self.least_share <= self.good_share <= self.sure_share <= 1.0:
+        shares = (self.least_share, self.good_share, self.sure_share)
+        if not (0.0 < shares[0] <= shares[1] <= shares[2] <= 1.0 and 0.0 < self.known_share <= 1.0):
             raise ValueError(
-                f"least_share, good_share, sure_share are {self.least_share}, {self.good_share}, {self.sure_share}; "
-                "expected 0 < least_share <= good_share <= sure_share <= 1"
+                f"least_share, good_share, sure_share are {shares} and known_share is {self.known_share}; "
+                "expected 0 < least_share <= good_share <= sure_share <= 1, and known_share over 0 to 1"
             )
 
 
@@ -260,6 +264,9 @@ class ScanOdometry:
         distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
         passed = between(self._passed, pose)
         passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
+        if not prediction.by_wheels and found.share < self.config.known_share:
+            # It may have come as far along a corridor, where only the next key scan holds what comes into view.
+            passes = passes or math.sqrt(max(covariance[0, 0], covariance[1, 1])) >= distance_m
         # Where the robot may be elsewhere, nobody knows what it would see.
         certain = float(max(covariance[0, 0], covariance[1, 1])) < self.config.poor_m**2
         is_key = passes and not (certain and self._submap.knows(scan, pose, self.config.known_m, turn_rad))

@@ -11,9 +11,9 @@ import numpy as np
 from ngo_estimator.data.observations import observation
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, UNFAMILIAR, RelativeStep
 from ngo_estimator.odometry.familiarity_watch import NOT_FITTED
-from ngo_estimator.odometry.frame_pairing import FramePairing
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
+from ngo_estimator.odometry.frame_pairing import FramePairing, PairedFrame
+from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
+from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.files import SpatialPoses, seconds
@@ -48,7 +48,7 @@ class RecordedRun:
 
 
 class RecordingRun:
-    """Feeds frames through both cores as the nodes do with messages.
+    """Feeds frames through both cores as the nodes do with messages, the networks several frames at once.
 
     Args:
         local, online: the cores, which begin anew.
@@ -119,6 +119,7 @@ class RecordingRun:
         self._local.reset()
         self._online.reset()
         self._pairing.reset()
+        self._paired: list[PairedFrame] = []
         truth, before_ns = Truth(), None
         for frame in frames:
             self.frames += 1
@@ -134,7 +135,9 @@ class RecordingRun:
             if not self._taken(frame):
                 continue
             truth.add(frame)
-            yield from self._steps()
+            self._paired += self._pairing.ready()
+            while len(self._paired) >= AT_ONCE:
+                yield from self._steps()
         yield from self._finished(truth)
         if missing := self._pairing.dropped + self._pairing.waiting:
             self.rejected["no action or velocity led to it"] = missing
@@ -150,9 +153,12 @@ class RecordingRun:
         return True
 
     def _steps(self) -> Iterator[RecordedStep]:
-        for pair in self._pairing.ready():
+        """Those of the next frames, as many as the networks take at once."""
+        pairs, self._paired = self._paired[:AT_ONCE], self._paired[AT_ONCE:]
+        for pair, local in zip(pairs, self._local.update_all(pairs), strict=True):
             try:
-                local = self._local.update(pair.stamp_ns, pair.image, pair.action, pair.twist)
+                if isinstance(local, RejectedFrame):
+                    raise local
                 if local is None:
                     continue
                 update = self._online.update(local)
@@ -173,8 +179,9 @@ class RecordingRun:
         self.rejected[reason] += 1
         self.examples.setdefault(reason, example)
 
-    def _finished(self, truth: "Truth") -> Iterator[RecordedRun]:
-        """The trajectory that ends here, if there is one."""
+    def _finished(self, truth: "Truth") -> Iterator[RecordedStep | RecordedRun]:
+        """The last steps of the trajectory that ends here, and the whole of it, if there is one."""
+        yield from self._steps()
         self._online.finish()
         trajectory = self._online.trajectory()
         self._local.reset()

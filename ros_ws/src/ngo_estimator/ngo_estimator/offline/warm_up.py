@@ -8,9 +8,7 @@ from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarStep
 from ngo_recordings.scan_stream import LidarScan
 
-STEP_NS = 100_000_000
-"""Time between two frames of a drive that warms up."""
-
+_STEP_NS = 100_000_000
 _RAYS = 180
 _HALF_M = np.array([6.0, 4.0])  # of the room
 _STEP_M = 0.45
@@ -28,9 +26,9 @@ def warm_up_odometry() -> list[LidarStep]:
         directions = np.stack((np.cos(angles + pose[2]), np.sin(angles + pose[2])), axis=1)
         with np.errstate(divide="ignore"):
             ranges = ((np.sign(directions) * _HALF_M - pose[:2]) / directions).min(axis=1)
-        odometry.add_wheels(step * STEP_NS, between(first, pose))
+        odometry.add_wheels(step * _STEP_NS, between(first, pose))
         increment = 2.0 * math.pi / _RAYS
-        odometry.add_scan(LidarScan(step * STEP_NS, -math.pi, increment, ranges, 0.05, 30.0, 0.0, "laser"))
+        odometry.add_scan(LidarScan(step * _STEP_NS, -math.pi, increment, ranges, 0.05, 30.0, 0.0, "laser"))
         steps += odometry.ready()
         turn = math.pi if step % 15 == 14 else 0.02
         pose = compose(pose, np.array([_STEP_M, 0.0, turn]))

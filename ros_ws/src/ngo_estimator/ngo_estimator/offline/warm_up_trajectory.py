@@ -1,4 +1,4 @@
-"""Compiles what trajectories run before the first frame comes: the first time it takes some ten seconds."""
+"""Compiles what trajectories of networks run before the first frame comes: the first time it takes some ten seconds."""
 
 import math
 
@@ -6,20 +6,11 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.planar_motion import compose
-from ngo_estimator.offline.warm_up import STEP_NS, warm_up_odometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
 
+_STEP_NS = 100_000_000
 _BLOCKS = 12  # of a drive through a ring of so many steps, which closes loops from its second turn on
 _RING = 32
-
-
-def warm_up_scans() -> None:
-    """Both estimators of a lidar, over the drive of ``warm_up_odometry``."""
-    online = ScanTrajectory()
-    for step in warm_up_odometry():
-        online.update(step)
-    online.finish()
 
 
 def warm_up_networks(trajectory: OnlineTrajectory) -> None:
@@ -32,8 +23,8 @@ def warm_up_networks(trajectory: OnlineTrajectory) -> None:
         pose = compose(pose, relative)
         trajectory.update(
             RelativeStep(
-                stamp_ns=step * STEP_NS,
-                from_stamp_ns=(step - 1) * STEP_NS,
+                stamp_ns=step * _STEP_NS,
+                from_stamp_ns=(step - 1) * _STEP_NS,
                 relative_xyyaw=relative,
                 covariance=np.diag([1e-4, 1e-4, 1e-5]),
                 origin_stamp_ns=0,

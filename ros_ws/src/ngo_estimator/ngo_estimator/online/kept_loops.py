@@ -123,9 +123,14 @@ class KeptLoops:
         """At most ``most`` of these loops, in their order: the likeliest, and of equal ones those measured best."""
         if len(numbers) <= most:
             return numbers
-        logit, heading = self.loops.logit[0].numpy()[numbers], self.loops.log_scale[0, :, 1].numpy()[numbers]
-        chosen: np.ndarray = np.sort(numbers[np.lexsort((heading, -logit))[:most]])
-        return chosen
+        logit = self.loops.logit[0].numpy()[numbers]
+        least = np.partition(logit, -most)[-most]
+        chosen, equal = logit > least, np.flatnonzero(logit == least)
+        if len(equal) > 1:
+            equal = equal[np.argsort(self.loops.log_scale[0, :, 1].numpy()[numbers[equal]], kind="stable")]
+        chosen[equal[: most - np.count_nonzero(chosen)]] = True
+        best: np.ndarray = numbers[chosen]
+        return best
 
     def without_doubtful(self, first: int, most: int) -> KeptLoops:
         """The loops, of those that end before node ``first`` only the believed ones, and at most ``most`` of them."""
@@ -177,6 +182,7 @@ class KeptLoops:
             logit=loops.logit.float().clamp(min=-20.0),
             similarity=loops.similarity.float(),
             embeddings=_batch(embeddings),
+            by_poses=_batch(self.overlap),
             length=_batch(self.end - self.start),
             most_drift=loops.most_drift.float(),
         )

@@ -14,7 +14,7 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import all_between, between, chained, compose
+from ngo_estimator.geometry.planar_motion import all_between, between, carried, chained, compose
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
 from ngo_estimator.online.blind_stretches import shrunk_corrections, summed_variances
@@ -23,6 +23,7 @@ from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.online.step_log import StepLog
+from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.normal_equations import FactorisedInformation
@@ -40,8 +41,8 @@ _AGAIN = 8
 _TOLD_LATE = 16
 """Frames before the first unfamiliar one that were taken for familiar and may not have been: a mean over them tells."""
 
-_RESUMED = 2
-"""Iterations of an optimisation that goes on from the last solution."""
+_RESUMED = 1
+"""Results of an optimisation that goes on from the last solution."""
 
 _BUFFERS = ("relative", "log_std", "motion", "steps", "std", "optimized_std", "features", "familiar", "fixed")
 """Names of the newest rows: the first three and ``familiar`` of each step, the others of each block; without a network
@@ -63,6 +64,7 @@ class _Running:
     first: int
     numbers: np.ndarray
     runs_network: bool
+    anneals: bool
     taken: int = 0
     result: OptimizedMetaPoses | None = None
 
@@ -99,7 +101,8 @@ class _Corrections:
 class MetaGraph:
     """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
 
-    The network runs for each ``network_every``-th block; between, what it gave is taken again.
+    The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
+    ``anneal_every``-th block all loops are judged from the odometry on; between, only new ones.
     """
 
     def __init__(
@@ -109,6 +112,7 @@ class MetaGraph:
         window: int,
         key_frames: int,
         network_every: int = 1,
+        anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
@@ -156,7 +160,8 @@ class MetaGraph:
         self._work: list[Callable[[int], None]] = []  # what is left of taking in the newest block
         self._begun = False
         self._running: _Running | None = None
-        self._network_every = network_every
+        self._network_every, self._anneal_every = network_every, anneal_every
+        self._annealed = 0  # blocks when all loops were judged last
         self._corrections: _Corrections | None = None
         self._begun_s = 0.0
         self.optimized, self.fault = False, ""
@@ -491,12 +496,25 @@ class MetaGraph:
         loops, numbers, solution = None, np.zeros(0, np.int64), None
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
+            loops = self._verified(loops, np.concatenate((keys, np.arange(first, self.blocks + 1))))
             # Across blind stretches the poses are not those of the solution.
-            if corrections is not None and not self._blind.values[first:].any():
+            if not self._annealing_is_due and not self._blind.values[first:].any():
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         runs_network = self._optimizer.config.network and corrections is None
-        self._running = _Running(iterations, keys, first, numbers, runs_network)
+        self._running = _Running(iterations, keys, first, numbers, runs_network, solution is None)
+
+    def _verified(self, loops: Loops, active: np.ndarray) -> Loops:
+        """The loops between the ``active`` nodes; none across a blind stretch where place codes alone tell them.
+
+        Nothing limits the motion within it, so that each place that looks alike would do.
+        """
+        search = self._optimizer.config.search
+        if search.registrations or search.least_belief or not self._blind.values.any():
+            return loops
+        blind = (summed_variances(self._blind.values, active) > 0.0).any(axis=1)
+        before = torch.from_numpy(np.concatenate(([0], blind.cumsum())))
+        return replace(loops, valid=loops.valid & (before[loops.end + 1] == before[loops.start]))
 
     def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
@@ -516,6 +534,12 @@ class MetaGraph:
         seen = self._corrections.stiffness.shape[1]
         return self.blocks - self._corrections.first - seen >= min(self._network_every, 1 + seen // 8)
 
+    @property
+    def _annealing_is_due(self) -> bool:
+        """Whether all loops are to be judged anew, from the odometry on."""
+        seen = self._annealed - self._first
+        return self._network_is_due or self.blocks - self._annealed >= min(self._anneal_every, 1 + seen // 8)
+
     def _iterate(self) -> None:
         """Prepare an optimisation, or run its next iteration."""
         if self._running is None:
@@ -529,7 +553,7 @@ class MetaGraph:
         """Parts of the update to come."""
         if self._running is not None and self._running.result is not None:
             return self._running.result.left
-        iterations = self._optimizer.config.iterations if self._network_is_due else _RESUMED
+        iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
         return len(self._work) + (self._running is None) + iterations
 
     @torch.inference_mode()
@@ -594,6 +618,8 @@ class MetaGraph:
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._end, self._information = end, result.equations
         self._result_keys, self._result_first, self._result_last = keys, first, self.blocks
+        if running.anneals:
+            self._annealed = self.blocks
         if running.runs_network and self._network_every > 1:
             self._corrections = _Corrections.of(first, result.corrections)
         return moved
@@ -664,12 +690,10 @@ class MetaGraph:
             covariance: that of the last node in the map ``(3, 3)``.
         """
         whole = self.blocks * self._block
-        odometry, node = self.odometry.values[whole:], self._nodes.values[-1]
-        poses = [compose(node, between(odometry[0], row)) for row in odometry]
-        steps, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
-        for pose, step, deviation in zip(poses[1:], steps, log_std, strict=True):
-            covariance = propagate(covariance, pose, step, np.diag(np.exp(2.0 * deviation)))
-        return poses[-1], covariance
+        relative, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
+        return carried(
+            self._nodes.values[-1], covariance, self.odometry.values[whole:], relative, np.exp(2.0 * log_std)
+        )
 
     def _buffers(self) -> dict[str, SlidingRows]:
         rows = (
@@ -695,6 +719,7 @@ class MetaGraph:
             "first": np.array(self._first),
             "blind": self._blind.values,
             "recalled": np.array(self._recalled),
+            "annealed": np.array(self._annealed),
             "kept": self._kept,
             "gone": self._gone,
             "active": self._active,
@@ -727,7 +752,7 @@ class MetaGraph:
         self.odometry.restore(arrays, "odometry")
         self._nodes.restore(arrays, "nodes")
         self._blind.restore(arrays, "blind")
-        self._recalled = taken_integer(arrays, "recalled")
+        self._recalled, self._annealed = (taken_integer(arrays, name) for name in ("recalled", "annealed"))
         for name, rows in self._buffers().items():
             rows.restore(part(arrays, name))
         self._pose, self._covariance = (

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
@@ -349,11 +350,27 @@ class OnlineLoops:
 
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
-        kept, odometry = self._kept, self._odometry.values
-        frame = kept.frame[numbers] + 1
-        offset = all_between(odometry[kept.start[numbers] * self._block], odometry[frame])
-        measured = all_between(offset, kept.measured.numpy()[numbers])
-        return np.stack((frame, kept.end[numbers] * self._block), axis=1), measured
+        kept = self._kept
+        nodes = kept.start, kept.frame, kept.end
+        return _edges(self._odometry.values, *nodes, kept.measured.numpy(), numbers, self._block)
+
+
+@njit(cache=True)
+def _edges(
+    odometry: np.ndarray,
+    start: np.ndarray,
+    frame: np.ndarray,
+    end: np.ndarray,
+    measured: np.ndarray,
+    numbers: np.ndarray,
+    block: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    frames = np.empty((len(numbers), 2), np.int64)
+    begins = np.empty((len(numbers), 3))
+    for k, number in enumerate(numbers):
+        frames[k] = frame[number] + 1, end[number] * block
+        begins[k] = odometry[start[number] * block]
+    return frames, all_between(all_between(begins, odometry[frames[:, 0]]), measured[numbers])
 
 
 def _at(offsets: _Offsets, which: int) -> np.ndarray:

@@ -26,8 +26,9 @@ from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 _VARIANCES = (1e-12, 1e4)
 """What lies below or above is exact or unknown, and float32 has no room for it."""
 
-_NETWORK_EVERY = 8
-"""Meta-poses from one run of attention and convolutions to the next, where work is spread over steps."""
+_NETWORK_EVERY, _ANNEAL_EVERY = 32, 8
+"""Meta-poses from one run of attention and convolutions to the next, and from one judgement of all loops to the next,
+where work is spread over steps."""
 
 
 class OnlineTrajectory(CorrectedTrajectory):
@@ -42,7 +43,8 @@ class OnlineTrajectory(CorrectedTrajectory):
 
     All of an update is done at the step that completes a meta-pose. With ``iterations_per_step`` it is spread over the
     steps before the next one: features, three searches for loops, and iterations. Attention and convolutions are run
-    for each eighth meta-pose then, as what they give hardly changes from one to the next.
+    for each 32nd meta-pose then, as what they give hardly changes from one to the next. All loops are judged for each
+    eighth, and new ones alone between.
     """
 
     _graph: MetaGraph
@@ -76,7 +78,7 @@ class OnlineTrajectory(CorrectedTrajectory):
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
         self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
-        self._network_every = _NETWORK_EVERY if iterations_per_step else 1
+        self._every = (_NETWORK_EVERY, _ANNEAL_EVERY) if iterations_per_step else (1, 1)
         super().__init__(iterations_per_step or self._new_graph().work)
 
     @classmethod
@@ -132,8 +134,7 @@ class OnlineTrajectory(CorrectedTrajectory):
 
     def _new_graph(self) -> MetaGraph:
         blocks = self._window // self._block
-        every = self._network_every
-        return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, every, lambda: self._log)
+        return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, *self._every, lambda: self._log)
 
     def _checked(self, step: RelativeStep) -> RelativeStep:
         check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_length)

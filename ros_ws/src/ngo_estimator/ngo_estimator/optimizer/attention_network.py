@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -105,17 +106,16 @@ class AttentionPhases:
         """Attention vectors a ``(batch, blocks, width)`` ("Attention Phase")."""
         return self._network.attend(state.features, self._similarity) @ state.features
 
-    def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
-        """One "Optimization" phase: Delta P + beta nabla P, and the next features F.
+    def optimise(self, state: GraphState, loops: Callable[[GraphState], Tensor]) -> tuple[GraphState, Tensor]:
+        """Both phases once: ``attend``, then "Optimization", Delta P + beta nabla P and the next features F.
 
         Args:
-            attended: ``(batch, blocks, width)``, the result of ``attend``.
-            loops: ``(batch, blocks, loop_channels)``, the loops for the convolutions.
+            loops: gives the loops for the convolutions ``(batch, blocks, loop_channels)``.
 
         Returns:
             The next state, and the stiffness ``(batch, blocks, 3)`` of each meta-step (width 0 without loops).
         """
-        hidden = self._convolve(torch.cat((state.features, attended, loops), dim=-1))
+        hidden = self._convolve(torch.cat((state.features, self.attend(state), loops(state)), dim=-1))
         parts = nn.functional.linear(hidden, self._weight, self._bias).split(self._sizes, dim=-1)
         feature, beta, change = parts[:3]
         stiffness = parts[3] if len(parts) > 3 else hidden[..., :0]

@@ -16,7 +16,7 @@ from ngo_estimator.optimizer.gauss_newton import chain_factors, gauss_newton_ste
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
 from ngo_estimator.optimizer.loop_residuals import loop_residuals, odometry_variances, spread_over_span
-from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
+from ngo_estimator.optimizer.meta_poses import ClosedLoops, GraphState, MetaSteps
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -44,7 +44,10 @@ class NoLoopClosing:
 
     closed = None
 
-    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
+    def look(self, state: GraphState, iteration: int) -> None:
+        """Nothing."""
+
+    def channels(self, state: GraphState) -> Tensor:
         """No channels."""
         return state.features[..., :0]
 
@@ -85,14 +88,8 @@ class LoopClosing:
             raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
         return self._closed
 
-    def look(self, state: GraphState, iteration: int, solution: Solution | None = None) -> Tensor:
-        """Judge the loops under the current poses; the third iteration adds overlaps to them.
-
-        With an earlier ``solution``, its belief in the loops that it knew stays.
-
-        Returns:
-            The loops for the convolutions ``(batch, blocks, CHANNELS)``.
-        """
+    def look(self, state: GraphState, iteration: int) -> None:
+        """Judge the loops under the current poses; the third iteration adds overlaps to them."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._loops = self._loops.and_also(overlaps)
         loops, poses = self._loops, state.poses
@@ -101,12 +98,7 @@ class LoopClosing:
         if loops.most_drift is not None:
             expected = torch.minimum(expected, loops.most_drift)
         weights, information = self._gate(loops, residuals, expected, iteration)
-        if solution is not None:
-            known, before = (torch.from_numpy(part) for part in (solution.known, solution.information))
-            weights = torch.where(known, torch.from_numpy(solution.weights), weights)
-            information = torch.where(known.unsqueeze(-1), before, information)
         self._gated = _GatedLoops(poses, loops, residuals, weights, information)
-        return self._channels(state, residuals, weights)
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """Take a Gauss-Newton step from the poses of the last ``look``, so that the gated loops close.
@@ -131,10 +123,13 @@ class LoopClosing:
         self._closed = ClosedLoops(gated.loops, gated.weights, gated.information, None)
         return replace(state, deviation=deviation, step_std=step_std)
 
-    def _channels(self, state: GraphState, residuals: Tensor, weights: Tensor) -> Tensor:
-        """The residuals spread over their loops, in the frame of each pose, and the deviation and support there."""
-        keys, poses = self._steps.key_frames, state.poses
-        spread, support = spread_over_span(self._loops, residuals, weights, state.adjusted.shape[1])
+    def channels(self, state: GraphState) -> Tensor:
+        """The loops of the last ``look`` for the convolutions ``(batch, blocks, CHANNELS)``.
+
+        Their residuals are spread over the loops, in the frame of each pose; the deviation and support there follow.
+        """
+        gated, keys, poses = self._gated, self._steps.key_frames, state.poses
+        spread, support = spread_over_span(gated.loops, gated.residuals, gated.weights, state.adjusted.shape[1])
         spread, support = spread[:, keys:], support[:, keys:]
         local = torch.cat((se2.rotate(-poses[:, keys:-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
         bent = torch.cat((local, state.deviation[:, keys:]), dim=-1)

@@ -33,8 +33,8 @@ class LoopSearch:
     With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
     With ``drift_m`` and ``drift_rad``, candidates are the most similar of those frames alone that may show the same
     place by the odometry, which drifts so much in the first of the steps between (``may_show_one_place``).
-    With ``witnesses``, a loop must be as the odometry allows, and others nearby must agree: so many for each of the
-    odometry's deviations by which it is off (``loop_agreement``).
+    With ``least_belief``, a judge has learned how likely a loop is to join one place, by the odometry between its
+    poses and by others nearby: one that is less likely is left out (``loop_judge``).
     """
 
     per_pose: int = 4
@@ -44,7 +44,7 @@ class LoopSearch:
     views: int = 5
     registrations: int = 0
     overlaps: int = 0
-    witnesses: int = 0
+    least_belief: float = 0.0
     drift_m: float = 0.0
     drift_rad: float = 0.0
 
@@ -56,8 +56,8 @@ class LoopSearch:
             )
         if not 1 <= self.views <= len(VIEWS):
             raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
-        if self.witnesses < 0:
-            raise ValueError(f"witnesses is {self.witnesses}; expected 0 (none) or more")
+        if not 0.0 <= self.least_belief < 1.0:
+            raise ValueError(f"least_belief is {self.least_belief}; expected 0 (loops are not judged) to below 1")
         if min(self.drift_m, self.drift_rad) < 0.0 or (self.drift_m > 0.0) != (self.drift_rad > 0.0):
             raise ValueError(
                 f"drift_m, drift_rad are {self.drift_m}, {self.drift_rad}; expected two positive numbers, or 0 and 0 "
@@ -84,6 +84,7 @@ class Loops:
     inner product of the embeddings, ``frame`` the earlier frame itself, and ``valid`` false for fill. ``embeddings``
     ``(batch, blocks, embedding_size)`` are those of the frames at the ends of the meta-poses.
 
+    ``by_poses`` ``(batch, loops)`` says which of them were found by poses, not by how places look; None: all alike.
     ``length`` ``(batch, loops)`` counts the meta-poses on a loop, where those between its ends stand for several each;
     ``most_drift`` ``(batch, loops, 3)`` is how far at most its residual varies by what is known without it. ``scans``
     are the frames' ranges, where overlaps are still to be looked for.
@@ -99,6 +100,7 @@ class Loops:
     similarity: Tensor
     valid: Tensor
     embeddings: Tensor
+    by_poses: Tensor | None = None
     length: Tensor | None = None
     most_drift: Tensor | None = None
     scans: Scans | None = None
@@ -263,6 +265,7 @@ _PER_LOOP = (
     "logit",
     "similarity",
     "valid",
+    "by_poses",
     "length",
     "most_drift",
 )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.networks.pose_aggregation import (
@@ -20,10 +20,10 @@ from ngo_estimator.networks.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.optimizer.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
-from ngo_estimator.optimizer.loop_agreement import agreeing
 from ngo_estimator.optimizer.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.optimizer.loop_gates import RobustLoopGate
+from ngo_estimator.optimizer.loop_judge import LoopJudge
 from ngo_estimator.optimizer.meta_poses import (
     Correction,
     GraphState,
@@ -35,6 +35,8 @@ from ngo_estimator.optimizer.meta_poses import (
 from ngo_estimator.optimizer.odometry_test import without_contradictions
 from ngo_estimator.optimizer.overlaps import find_overlaps
 from ngo_estimator.optimizer.registered_odometry import registered_steps
+
+_Channels = Callable[[GraphState], Tensor]
 
 _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 """Before anything is learned: errors of a relative meta-pose in units of the deviations that its steps add up to."""
@@ -135,6 +137,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
             self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
             self.odometry_noise: Tensor
             self.loop_gate = RobustLoopGate()
+            if config.search.least_belief:
+                self.loop_judge = LoopJudge()
             if not config.network:
                 self.log_scale = nn.Parameter(torch.zeros(3))
 
@@ -220,8 +224,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
                 running it.
-            solution: of an optimisation that took these corrections, to go on from: there are two iterations then.
-                Its belief in loops stays; only new loops are judged.
+            solution: of an optimisation that took these corrections, to go on from. There is one result then, for a
+                single trajectory on the CPU without gradients. The belief in loops stays; only new ones are judged.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -229,18 +233,25 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
-        closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops)
+        if loops is None:
+            return self._annealed(steps, NoLoopClosing(), self._phases(steps, loops, corrections))
         if corrections is not None and solution is not None:
-            yield from self._resumed(steps, closing, corrections, solution)
-            return
-        phases = self._phases(steps, loops, corrections)
+            return self._resumed(steps, loops, corrections, solution)
+        return self._annealed(steps, self._loop_closing(steps, loops), self._phases(steps, loops, corrections))
+
+    def _annealed(
+        self,
+        steps: MetaSteps,
+        closing: LoopClosing | NoLoopClosing,
+        phases: AttentionPhases | _NoNetwork | _Remembered,
+    ) -> Iterator[OptimizedMetaPoses]:
+        """The results that begin at the odometry: all loops are judged, allowing for less of its drift each time."""
         state, results = GraphState.initial(steps), []
         made: list[Correction] = []
         for iteration in range(self.config.iterations):
-            seen = closing.look(state, iteration)
-            attended = phases.attend(state)
+            closing.look(state, iteration)
             before = state.adjusted
-            optimised, stiffness = phases.optimise(state, attended, seen)
+            optimised, stiffness = phases.optimise(state, closing.channels)
             state, stiffness = _without_fixed(state, optimised, stiffness, steps)
             if self.config.network:
                 made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
@@ -250,29 +261,22 @@ class NeuralGraphOptimizer(AttentionNetwork):
             yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made, left)
 
     def _resumed(
-        self,
-        steps: MetaSteps,
-        closing: LoopClosing | NoLoopClosing,
-        corrections: Sequence[Correction],
-        solution: Solution,
+        self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
     ) -> Iterator[OptimizedMetaPoses]:
-        """The results that begin at an earlier solution.
+        from ngo_estimator.optimizer import compiled_closing  # see _loop_closing
 
-        New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last
-        one. Others keep what an annealing of all loops gave them.
-        """
         before = GraphState.initial(steps)
         adjusted = before.adjusted.clone()
         for adjustment, _ in corrections:
             adjusted[:, steps.key_frames :] += adjustment
         state, stiffness = _without_fixed(before, replace(before, adjusted=adjusted), corrections[-1].stiffness, steps)
-        state = replace(state, deviation=se2.wrapped(solution.relative - state.adjusted.double()))
-        results = []
-        for left, iteration in ((1, 0), (0, self.config.iterations - 1)):
-            closing.look(state, iteration, solution)
-            state = closing.close(state, stiffness)
-            results.append(state.relative.to(steps.relative.dtype))
-            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, left=left)
+        # Where others must agree with a new loop, all of them are looked at.
+        which = None if self.config.search.least_belief else np.flatnonzero(~solution.known)
+        believed = self._judged(compiled_closing.without_contradictions(loops, steps, which), steps)
+        last = self.config.iterations - 1
+        return compiled_closing.resumed(
+            self.loop_gate, steps, believed, state.adjusted, stiffness, self.odometry_noise, solution, last
+        )
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
@@ -300,10 +304,12 @@ class NeuralGraphOptimizer(AttentionNetwork):
             from ngo_estimator.optimizer import compiled_closing
 
             closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
-        believed = test(loops, steps)
-        if self.config.search.witnesses:
-            believed = agreeing(believed, steps, self.config.search.witnesses)
+        believed = self._judged(test(loops, steps), steps)
         return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+
+    def _judged(self, loops: Loops, steps: MetaSteps) -> Loops:
+        least = self.config.search.least_belief
+        return self.loop_judge.judged(loops, steps, least) if least else loops
 
 
 def _without_fixed(
@@ -324,11 +330,7 @@ class _NoNetwork:
     def __init__(self, optimizer: NeuralGraphOptimizer) -> None:
         self._stiffness = optimizer.log_scale
 
-    def attend(self, state: GraphState) -> Tensor:
-        """No attention vectors."""
-        return state.features
-
-    def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
+    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
         """The state as it is, and the stiffness ``(3,)``."""
         return state, self._stiffness
 
@@ -339,11 +341,7 @@ class _Remembered:
     def __init__(self, corrections: Sequence[Correction]) -> None:
         self._corrections = iter(corrections)
 
-    def attend(self, state: GraphState) -> Tensor:
-        """No attention vectors."""
-        return state.features
-
-    def optimise(self, state: GraphState, attended: Tensor, loops: Tensor) -> tuple[GraphState, Tensor]:
+    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
         """The state with the adjustments of the next iteration, and its stiffness."""
         adjustment, stiffness = next(self._corrections)
         adjusted = state.adjusted.clone()

@@ -11,7 +11,7 @@ from numba import njit
 from torch import Tensor
 
 from ngo_estimator.data.state_arrays import Arrays, require, taken
-from ngo_estimator.optimizer.block_cholesky import Array, BlockCholesky, BlockStructure
+from ngo_estimator.optimizer.block_cholesky import Array, BlockCholesky, BlockStructure, placed
 from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
 
 
@@ -20,19 +20,17 @@ class GraphStructure:
 
     Args:
         nodes: of all factors ``(factors, 2)``, each 0 to ``count - 1``; the pose of node 0 is known.
+        chain: whether factors between neighbours come before these.
     """
 
-    def __init__(self, nodes: Array, count: int) -> None:
+    def __init__(self, nodes: Array, count: int, chain: bool = False) -> None:
         self.count = count
-        pairs = nodes - 1
-        both = (pairs >= 0).all(1)
-        self.blocks = BlockStructure(pairs[both], count - 1)
+        nodes = _with_chain(nodes, count) if chain else nodes
+        self.blocks = BlockStructure(nodes[nodes.min(axis=1) > 0] - 1, count - 1)
         """Those of the information matrix, whose row ``k`` is node ``k + 1``."""
-        self.ranks = np.where(pairs >= 0, self.blocks.rank[pairs], -1)
-        """Places of the factors' nodes in the order of elimination ``(factors, 2)``; -1 for node 0."""
-        self.place = np.full(len(nodes), -1)
-        """Index of the block that joins a factor's nodes ``(factors,)``; -1 where one of them is node 0."""
-        self.place[both], _ = self.blocks.places(self.blocks.pairs)
+        self.ranks, self.place = placed(nodes - 1, self.blocks.rank, self.blocks.starts, self.blocks.rows)
+        """Places of the factors' nodes in the order of elimination ``(factors, 2)``; -1 for node 0. Index of the block
+        that joins a factor's nodes ``(factors,)``; -1 where one of them is node 0."""
 
     def empty(self) -> tuple[Array, Array, Array]:
         """Zeros for the blocks of a matrix, on the diagonal and below, and for a right hand side ``(nodes, 3, 1)``."""
@@ -54,7 +52,7 @@ class FactorisedInformation:
     def __init__(self, structure: BlockStructure, diagonal: Array, lower: Array) -> None:
         self._structure, self._diagonal, self._lower = structure, diagonal, lower
         diagonal = diagonal.copy()
-        diagonal[:, [0, 1, 2], [0, 1, 2]] *= 1.0 + RELATIVE_JITTER
+        np.einsum("kii->ki", diagonal)[:] *= 1.0 + RELATIVE_JITTER
         self._factor = BlockCholesky(structure, diagonal, lower.copy())
 
     def step(self, right: Array) -> Array:
@@ -109,7 +107,17 @@ class NormalEquations(FactorisedInformation):
 
 
 @njit(cache=True)
-def add_factor(
+def _with_chain(nodes: Array, count: int) -> Array:
+    """Nodes ``(n, 2)`` with those of factors between neighbours before them."""
+    both = np.empty((count - 1 + len(nodes), 2), np.int64)
+    for k in range(count - 1):
+        both[k] = k, k + 1
+    both[count - 1 :] = nodes
+    return both
+
+
+@njit(cache=True)
+def _add_factor(
     hessian: Array, gradient: Array, ranks: Array, place: int, diagonal: Array, lower: Array, right: Array
 ) -> None:
     """Add a factor to the blocks of ``GraphStructure.empty``.
@@ -138,4 +146,4 @@ def _add_all(
     ranks: Array, place: Array, hessian: Array, gradient: Array, diagonal: Array, lower: Array, right: Array
 ) -> None:
     for k in range(len(ranks)):
-        add_factor(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)
+        _add_factor(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)
