@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ngo_estimator.data.relative_step import check_step
@@ -247,6 +247,7 @@ values = st.sampled_from([0.0, 1e9, 1e-3, 1.0, -1.0, 1e6, 1e150, 1e300, -1e300, 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(-40, 40), st.tuples(values, values, values)), max_size=8))
+@example([(0, 0, (0.0, 0.0, 0.0)), (0, 0, (0.0, 0.0, 0.0)), (4, 14, (0.0, 1e9, 0.0)), (12, -23, (0.0, 0.0, 0.0))])
 def test_any_wheels_leave_finite_steps(hostile: list[tuple[int, int, tuple[float, ...]]]) -> None:
     poses = way(31)
     odometry, steps = LidarOdometry(), []

@@ -106,7 +106,8 @@ def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | 
     if step.from_stamp_ns >= step.stamp_ns:
         raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")
     if step.robot_odom_xyyaw is not None:
-        _check_values("robot_odom_xyyaw", step.robot_odom_xyyaw, (3,), LARGEST_ODOMETRY)
+        # The wheels' largest pose, carried on to the scan.
+        _check_values("robot_odom_xyyaw", step.robot_odom_xyyaw, (3,), LARGEST_ODOMETRY + LARGEST_VALUE)
     if step.key is not None:
         _check_scan("key scan", step.key.scan, step.stamp_ns)
         _check_values("relative_xyyaw of the key scan", step.key.relative_xyyaw, (3,), LARGEST_VALUE)
