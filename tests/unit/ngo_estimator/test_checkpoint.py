@@ -246,11 +246,13 @@ def test_a_wrong_configuration_is_refused(where: tuple[str, ...], value: object,
     assert_one_line(error.value, f"{LOCAL}.json")
 
 
-def test_a_description_from_before_the_compass_went_loads(weights: Path) -> None:
+def test_a_description_with_settings_that_went_loads(weights: Path) -> None:
     beside = weights / f"{OPTIMIZER}.json"
     expected = load_optimizer(weights)[0]
     edit(beside, lambda description: description["config"].update(compass=False))
     assert load_optimizer(weights)[0].config == expected.config
+    edit(beside, lambda description: description["config"]["search"].update(witnesses=0))
+    load_optimizer(weights)
     edit(beside, lambda description: description["config"].update(compass=True))
     with pytest.raises(CheckpointError, match="compass is True, which this version no longer has") as error:
         load_optimizer(weights)

@@ -1,5 +1,6 @@
 """Files of weights: a safetensors file and a JSON description beside it, read without torch."""
 
+import copy
 import hashlib
 import json
 from pathlib import Path
@@ -13,7 +14,7 @@ from ngo_common.files import read_file
 from ngo_estimator.data.configuration import config_from_dict
 
 FORMAT = 1
-RETIRED_SETTINGS = {"neural_graph_optimizer": {"compass": False}}
+RETIRED_SETTINGS = {"neural_graph_optimizer": {"compass": False, "search.witnesses": 0}}
 """Settings of earlier versions, by the kind of network, with the only value that still means the same."""
 
 Config = TypeVar("Config")
@@ -74,10 +75,12 @@ def read_weights(
 
 def _without_retired(kind: str, values: Any) -> Any:
     """The values of a configuration without settings that this version no longer has."""
-    if not isinstance(values, dict):
-        return values
-    retired = RETIRED_SETTINGS.get(kind, {})
-    for name, meant in retired.items():
-        if (value := values.get(name, meant)) is not meant:
+    kept = copy.deepcopy(values)
+    for name, meant in RETIRED_SETTINGS.get(kind, {}).items():
+        *sections, setting = name.split(".")
+        section = kept
+        for key in sections:
+            section = section.get(key) if isinstance(section, dict) else None
+        if isinstance(section, dict) and (value := section.pop(setting, meant)) is not meant:
             raise ValueError(f"{name} is {value!r}, which this version no longer has; expected {meant!r}, or none")
-    return {name: value for name, value in values.items() if name not in retired}
+    return kept
