@@ -25,6 +25,7 @@ from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.nodes.image_input import ImageInput
 from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
+from ngo_estimator.odometry.frame_pairing import PairedFrame
 
 from .estimator_graph import RUN_NS, STEP_NS, Graph, image_message, scan
 from .processes import Diagnostics, NodeProcess, Probe
@@ -209,14 +210,14 @@ def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
     executor.add_node(node)
     assert isinstance(node._input, ImageInput)
     core = node._input._core
-    update, broken_ns = core.update, RUN_NS + 2 * STEP_NS
+    update_all, broken_ns = core.update_all, RUN_NS + 2 * STEP_NS
 
-    def update_or_fail(stamp_ns: int, *inputs: Any) -> Any:
-        if stamp_ns == broken_ns:
+    def update_or_fail(pairs: list[PairedFrame]) -> Any:
+        if broken_ns in {pair.stamp_ns for pair in pairs}:
             raise RuntimeError("of two\nlines")
-        return update(stamp_ns, *inputs)
+        return update_all(pairs)
 
-    monkeypatch.setattr(core, "update", update_or_fail)
+    monkeypatch.setattr(core, "update_all", update_or_fail)
     try:
         with Probe("broken") as probe:
             images = probe.node.create_publisher(Image, "/broken/image", 100)

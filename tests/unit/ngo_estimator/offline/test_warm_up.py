@@ -42,7 +42,8 @@ def test_all_that_an_update_of_the_shipped_networks_runs_is_compiled(world: str)
     warm_up_networks(online)
     assert online.trajectory() is None
     views = [shared_views_kernel.share_views] if world == "maze3d" else []
-    closing = [compiled_closing._add_loops, compiled_closing._channels, compiled_closing._deviate]
+    names = ("_test", "_picked", "_judge", "_channels", "_linearised", "_deviated")
+    closing = [getattr(compiled_closing, name) for name in names]
     solver = [block_cholesky.factorise, block_cholesky.solve, scan_registration_kernels.register_pairs]
     for function in (*closing, *solver, *views):
         assert function.signatures, function

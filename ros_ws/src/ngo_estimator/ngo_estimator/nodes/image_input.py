@@ -144,7 +144,13 @@ class ImageInput:
     def _run(self, pairs: list[PairedFrame]) -> None:
         """Run the networks over the next frames, and publish their steps in order."""
         began_s = time.perf_counter()
-        estimates = self._core.update_all(pairs)
+        try:
+            estimates = self._core.update_all(pairs)
+        except Exception:
+            if len(pairs) == 1:
+                raise
+            self._run_one_by_one(pairs)
+            return
         self._most_at_once = max(self._most_at_once, len(pairs))
         took_s = (time.perf_counter() - began_s) / len(pairs)
         for estimate in estimates:
@@ -157,6 +163,17 @@ class ImageInput:
                 self._newly_missed += estimate.missed_frames
                 self._count_unlike(estimate.unlikeness, estimate.repeated)
             self._publish(estimate)
+
+    def _run_one_by_one(self, pairs: list[PairedFrame]) -> None:
+        """Run what failed together, so that one frame costs no other; raises the first error at the end."""
+        errors = []
+        for pair in pairs:
+            try:
+                self._run([pair])
+            except Exception as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]
 
     def _count_unlike(self, unlikeness: float, repeated: bool) -> None:
         self._unlikeness = unlikeness
