@@ -27,6 +27,6 @@ def test_familiarity_is_fitted_and_faults_are_measured(tmp_path: Path, monkeypat
     assert json.loads((tmp_path / "faults.json").read_text())["tables"] == result["tables"]
     rows = result["tables"]["maze2d"]
     assert set(rows) == {"clean", "frozen"} and rows["frozen"]["repeated"]["mean"] > 0.5
-    # Nobody verifies loops of untrained networks: none closes across what these call unfamiliar, a seventh of the drive.
+    # Nobody verifies loops of untrained networks: none closes across what these call unfamiliar.
     assert rows["clean"]["odometry_deviation_growth"]["mean"] < 2.0
     assert "| frozen |" in (tmp_path / "results_faults.md").read_text()
