@@ -1,8 +1,9 @@
 """Where the next scan is expected: by the wheels, and by the velocity that the scans measured last.
 
 The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
-Wheels that stopped at once while the scans moved (frozen), or that run away from them (a jump), are doubted: for that
-scan the prior widens by the disagreement, and both predictions are tried. The next prior counts from that scan.
+Wheels that stopped at once while the scans moved (frozen), that run away from them (a jump), or that lead to no fit
+while the velocity says something else (a slip), are doubted: for that scan the prior widens by the disagreement, and
+both predictions are tried. The next prior counts from that scan.
 """
 
 import math
@@ -101,13 +102,36 @@ class MotionPrior:
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
             return self._without_wheels(last, constant, elapsed)
-        step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
         self._expected = None
-        starts = [compose(last, step)]
+        step, _ = wheels.motion(self._last_wheels, self._now_wheels)
         off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
         turn_doubt = math.radians(self.config.doubt_deg) + self.config.acceleration_rad_s2 * elapsed**2
         jumped = off > self.config.doubt_m + self.config.doubt_m_s2 * elapsed**2 or off_rad > turn_doubt
         doubted = jumped or self._is_frozen(stamp_ns, step, constant)
+        return self._by_wheels(last, covariance, wheels, constant, doubted)
+
+    def doubt(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
+        """Another prior of the scan that ``predict`` was asked for, where the wheels led to no fit.
+
+        It is None where nothing better is known: the velocity is forgotten, or agrees with the wheels within their
+        deviations.
+        """
+        assert self._last_wheels is not None and self._now_wheels is not None
+        elapsed = (stamp_ns - self._stamp_ns) * 1e-9
+        constant = self._motion.velocity * elapsed
+        step, deviations = wheels.motion(self._last_wheels, self._now_wheels)
+        off = step - constant
+        off[2] = wrap(off[2])
+        if elapsed > self.config.longest_s or (np.abs(off) <= deviations).all():
+            return None
+        return self._by_wheels(last, covariance, wheels, constant, True)
+
+    def _by_wheels(
+        self, last: Array, covariance: Array, wheels: WheelOdometry, constant: Array, doubted: bool
+    ) -> Prediction:
+        assert self._last_wheels is not None and self._now_wheels is not None
+        step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
+        starts = [compose(last, step)]
         if doubted:
             starts.append(compose(last, constant))
         if doubted or self._doubted or self._anchor_wheels is None:
@@ -116,7 +140,8 @@ class MotionPrior:
         self._doubted = doubted
         moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
         if doubted:
-            deviations = deviations + np.array((off, off, off_rad))
+            off = math.hypot(step[0] - constant[0], step[1] - constant[1])
+            deviations = deviations + np.array((off, off, abs(wrap(step[2] - constant[2]))))
         total = np.diag(deviations**2) + self._anchor_covariance
         return Prediction(
             compose(self._anchor, moved),

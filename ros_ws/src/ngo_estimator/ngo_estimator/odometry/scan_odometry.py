@@ -150,6 +150,11 @@ class ScanOdometry:
         last_ns = self._stamp_ns
         prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, doubt, searched = self._register(scan, prediction)
+        if wheels is not None and prediction.measured and found.share < self.config.good_share:
+            doubted = self._prior.doubt(scan.stamp_ns, self._pose, self._covariance, wheels)
+            if doubted is not None:
+                prediction = doubted
+                found, doubt, searched = self._register(scan, prediction)
         unsure = self._is_unsure(found, prediction)
         pose, covariance = prediction.mean, prediction.covariance
         if not unsure:
