@@ -132,7 +132,7 @@ def test_wheels_that_stand_for_long_are_believed() -> None:
 
 @pytest.mark.parametrize("stands", [False, True])
 @pytest.mark.parametrize("between_poses", [1.0, 0.4])
-def test_a_freeze_in_a_corridor_is_bridged_and_the_wheels_way_counts_after_it(stands: bool, between_poses: float) -> None:
+def test_a_freeze_in_a_corridor_is_bridged(stands: bool, between_poses: float) -> None:
     """No wall tells the motion. The first scan after the freeze may see a part of the way that the wheels catch up.
 
     Wheels of a robot that did stand go on from there.

@@ -4,8 +4,8 @@ The prior counts from the last key scan and not from the last scan, so that its 
 Wheels that stopped at once while the scans moved (frozen), or that run away from them (a jump), are doubted: for that
 scan the prior widens by the disagreement, and both predictions are tried. The next prior counts from that scan.
 
-Wheels that stop without braking are frozen: the robot goes on by its last velocity. Once they move again, their whole way
-since the freeze began counts: it is right if they catch up, and if the robot stood.
+Wheels that stop without braking are frozen: the robot goes on by its last velocity. Once they move again, their whole
+way since the freeze began counts: it is right if they catch up, and if the robot stood.
 """
 
 import math
