@@ -126,7 +126,7 @@ class MotionPrior:
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
             return self._without_wheels(last, constant, elapsed)
         self._expected = None
-        step, _ = wheels.motion(self._last_wheels, self._now_wheels)
+        step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
         off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
         turn_doubt = math.radians(self.config.doubt_deg) + self.config.acceleration_rad_s2 * elapsed**2
         jumped = off > self.config.doubt_m + self.config.doubt_m_s2 * elapsed**2 or off_rad > turn_doubt
@@ -137,9 +137,30 @@ class MotionPrior:
             return self._through(self._freeze, last, covariance, step, constant, frozen, wheels)
         if step.any():
             self._speeds = self._speeds[1], math.hypot(step[0], step[1]) / elapsed
-        return self._by_wheels(last, covariance, wheels, constant, jumped or frozen, frozen)
+        starts = [compose(last, step)]
+        doubted = jumped or frozen
+        if doubted:
+            starts.append(compose(last, constant))
+        if doubted or self._doubted or self._anchor_wheels is None:
+            # The wheels' way since the key scan is wrong by what was doubted: count from the last scan.
+            self._anchor, self._anchor_wheels, self._anchor_covariance = last, self._last_wheels, covariance
+        self._doubted = doubted
+        moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
+        if doubted:
+            deviations = deviations + np.array((off, off, off_rad))
+        total = np.diag(deviations**2) + self._anchor_covariance
+        return Prediction(
+            compose(self._anchor, moved),
+            total,
+            np.linalg.inv(total).astype(np.float64),
+            tuple(starts),
+            by_wheels=True,
+            measured=not doubted,
+            frozen=frozen,
+            step_covariance=np.diag(step_deviations**2) if not doubted and step.any() else None,
+        )
 
-    def doubt(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
+    def without_slip(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
         """Another prior of the scan that ``predict`` was asked for, where the wheels led to no fit.
 
         It is None where nothing better is known: the velocity is forgotten, or agrees with the wheels within their
@@ -153,41 +174,15 @@ class MotionPrior:
         off[2] = wrap(off[2])
         if elapsed > self.config.longest_s or (np.abs(off) <= deviations).all():
             return None
-        return self._by_wheels(last, covariance, wheels, constant, True)
+        off_m = math.hypot(off[0], off[1])
+        total = np.diag((deviations + np.array((off_m, off_m, abs(off[2])))) ** 2) + covariance
+        mean = compose(last, step)
+        information = np.linalg.inv(total).astype(np.float64)
+        return Prediction(mean, total, information, (compose(last, constant),), by_wheels=True)
 
-    def _by_wheels(
-        self,
-        last: Array,
-        covariance: Array,
-        wheels: WheelOdometry,
-        constant: Array,
-        doubted: bool,
-        frozen: bool = False,
-    ) -> Prediction:
-        assert self._last_wheels is not None and self._now_wheels is not None
-        step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
-        starts = [compose(last, step)]
-        if doubted:
-            starts.append(compose(last, constant))
-        if doubted or self._doubted or self._anchor_wheels is None:
-            # The wheels' way since the key scan is wrong by what was doubted: count from the last scan.
-            self._anchor, self._anchor_wheels, self._anchor_covariance = last, self._last_wheels, covariance
-        self._doubted = doubted
-        moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
-        if doubted:
-            off = math.hypot(step[0] - constant[0], step[1] - constant[1])
-            deviations = deviations + np.array((off, off, abs(wrap(step[2] - constant[2]))))
-        total = np.diag(deviations**2) + self._anchor_covariance
-        return Prediction(
-            compose(self._anchor, moved),
-            total,
-            np.linalg.inv(total).astype(np.float64),
-            tuple(starts),
-            by_wheels=True,
-            measured=not doubted,
-            frozen=frozen,
-            step_covariance=np.diag(step_deviations**2) if not doubted and step.any() else None,
-        )
+    def doubt(self) -> None:
+        """The wheels' way to the newest scan is wrong: the next prior counts from that scan."""
+        self._doubted = True
 
     def _stopped_at_once(self, constant: Array, elapsed: float) -> bool:
         """Whether the wheels stand since the last scan without having braked. Scans fall between their poses, so that

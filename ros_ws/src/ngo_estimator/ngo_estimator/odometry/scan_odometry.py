@@ -20,6 +20,9 @@ from ngo_estimator.odometry.step_evidence import step_evidence
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 
+_CLEARLY_BETTER = 0.1
+"""By so much more of its points must a scan fit at the velocity's place to say that the wheels slipped."""
+
 
 @dataclass(frozen=True)
 class ScanOdometryConfig:
@@ -151,10 +154,12 @@ class ScanOdometry:
         prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, doubt, searched = self._register(scan, prediction)
         if wheels is not None and prediction.measured and found.share < self.config.good_share:
-            doubted = self._prior.doubt(scan.stamp_ns, self._pose, self._covariance, wheels)
-            if doubted is not None:
-                prediction = doubted
-                found, doubt, searched = self._register(scan, prediction)
+            other = self._prior.without_slip(scan.stamp_ns, self._pose, self._covariance, wheels)
+            if other is not None:
+                again = self._best(scan, list(other.starts), (other.mean, other.information), 0.0)
+                if again.share >= max(self.config.good_share, found.share + _CLEARLY_BETTER):
+                    prediction, found = other, again
+                    self._prior.doubt()
         unsure = self._is_unsure(found, prediction)
         pose, covariance = prediction.mean, prediction.covariance
         if not unsure:
