@@ -155,6 +155,21 @@ def test_frozen_wheels_that_jump_do_no_harm() -> None:
     assert position < 0.05 and heading < 0.02
 
 
+@pytest.mark.parametrize("degrees", [90.0, 120.0])
+def test_a_slip_that_leads_to_no_fit_is_doubted(degrees: float) -> None:
+    """One wheel slips for 0.8 s, while a noisy scanner sees little: the velocity knows the way."""
+    poses = round_trip(120)
+    steps = np.array([between(before, after) for before, after in zip(poses[:-1], poses[1:], strict=True)])
+    steps[20:28, 2] -= 0.1
+    wheels = np.zeros((120, 3))
+    for k, step in enumerate(steps):
+        wheels[k + 1] = compose(wheels[k], step)
+    estimates, _ = drive(scans_along(ROOM, poses, fan(180, degrees), noise_m=0.03), wheels)
+    position, heading = off(estimates, poses)
+    assert position < 0.1 and heading < 0.1
+    assert not any(estimate.unsure for estimate in estimates)
+
+
 def test_a_blind_lidar_is_no_worse_than_its_wheels() -> None:
     """Nothing comes back: the wheels stand, the estimate says so, and its deviations are theirs."""
     poses = round_trip(60)

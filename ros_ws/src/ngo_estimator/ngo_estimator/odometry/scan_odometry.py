@@ -20,6 +20,9 @@ from ngo_estimator.odometry.step_evidence import step_evidence
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 
+_CLEARLY_BETTER = 0.1
+"""By so much more of its points must a scan fit at the velocity's place to say that the wheels slipped."""
+
 
 @dataclass(frozen=True)
 class ScanOdometryConfig:
@@ -150,6 +153,13 @@ class ScanOdometry:
         last_ns = self._stamp_ns
         prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, doubt, searched = self._register(scan, prediction)
+        if wheels is not None and prediction.measured and found.share < self.config.good_share:
+            other = self._prior.without_slip(scan.stamp_ns, self._pose, self._covariance, wheels)
+            if other is not None:
+                again = self._best(scan, list(other.starts), (other.mean, other.information), 0.0)
+                if again.share >= max(self.config.good_share, found.share + _CLEARLY_BETTER):
+                    prediction, found = other, again
+                    self._prior.doubt()
         unsure = self._is_unsure(found, prediction)
         pose, covariance = prediction.mean, prediction.covariance
         if not unsure:
@@ -182,7 +192,8 @@ class ScanOdometry:
         poor = deviation_m > config.poor_m or deviation[2] > math.radians(config.poor_deg)
         prior = (prediction.mean, prediction.information)
         starts = list(prediction.starts)
-        open_share = 0.0 if prediction.by_wheels else config.open_share
+        # Of frozen wheels the prior is wide: what noisy normals claim to know along a corridor would decide the motion.
+        open_share = 0.0 if prediction.by_wheels and not prediction.frozen else config.open_share
         on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
         if poor:
             window = (
