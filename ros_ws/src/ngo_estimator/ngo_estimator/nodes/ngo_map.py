@@ -32,6 +32,7 @@ from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 NAME = "ngo_map"
 _SUMMARY = "Publishes a map from the ranges in relative poses, at their corrected poses."
+_AT_ONCE = 8  # relative poses that are taken where the node fell behind
 _BUDGET_S = 0.35  # of an update, for scans that the trajectory moved; the rest is moved by the next one
 
 
@@ -89,9 +90,21 @@ class NgoMap(Node):
         self._publisher = MapPublisher(self, settings.map_topic, settings.framed(settings.map_frame))
         self._listening = Listening(self, self._status, settings.source_timeout_s)
         steps = QoSProfile(depth=settings.relative_pose_depth)
-        self._listening.to(RelativePose, settings.relative_pose_topic, self._on_relative_pose, steps)
+        self._steps = self._listening.to(RelativePose, settings.relative_pose_topic, self._on_relative_poses, steps)
+        self._taking = False
         # The newest trajectory says all that those before it said.
         self._listening.to(Trajectory, settings.trajectory_topic, self._on_trajectory, QoSProfile(depth=1))
+
+    def _on_relative_poses(self, message: RelativePose) -> None:
+        """Take a message, and those that wait behind it."""
+        self._on_relative_pose(message)
+        if self._taking:
+            return
+        self._taking = True
+        try:
+            self._steps.take_waiting(_AT_ONCE - 1)
+        finally:
+            self._taking = False
 
     def _on_relative_pose(self, message: RelativePose) -> None:
         try:
