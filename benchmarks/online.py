@@ -159,7 +159,8 @@ def image_to_path(world: str, arguments: Arguments) -> dict[str, float]:
     with running_on(*two_cores()):
         session = Session(config, arguments.out / "image_to_path" / world)
         latency = session.run(lambda *_: None, with_latency=True)["latency_ms"]
-    named = {f"image_to_path_{name}_ms": latency[name] for name in ("median", "p99", "max")}
+    # The longest is that of the last frame, whose path comes again a second later.
+    named = {f"image_to_path_{name}_ms": latency[name] for name in ("median", "p99")}
     return {**named, "image_to_path_p99_to_median": latency["p99"] / latency["median"]}
 
 
@@ -206,9 +207,9 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
     row("the machine: Gflop/s, GB/s", lambda r: f"{r['work']['gflops']:.0f}, {r['work']['gbytes']:.0f}")
     row("least time for it (ms), update / that", lambda r: f"{r['work']['bound_ms']:.1f}, {r['times_bound']:.1f}")
     row("from the start of both nodes to the first path (s)", lambda r: f"{r['first_path_s']:.2f}", "4")
-    keys = [f"image_to_path_{name}_ms" for name in ("median", "p99", "max")]
+    keys = [f"image_to_path_{name}_ms" for name in ("median", "p99")]
     bar = f"p99 {BARS[keys[1]]:.1f}"
-    row("image to path at 35 Hz: median, p99, max (ms)", lambda r: ", ".join(f"{r[key]:.1f}" for key in keys), bar)
+    row("image to path at 35 Hz: median, p99 (ms)", lambda r: ", ".join(f"{r[key]:.1f}" for key in keys), bar)
     ratio = "image_to_path_p99_to_median"
     row("image to path: p99 / median", lambda r: f"{r[ratio]:.2f}", f"{BARS[ratio]:g}")
     row("end to end on two cores, none lost (frames/s)", lambda r: f"{r['end_to_end_frames_per_s']:.0f}")
