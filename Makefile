@@ -40,6 +40,8 @@ demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 
 
 # ARGS goes to every script of the chain (topics, --holdout, --reduction), TRAIN_ARGS to those that train networks alone
 # (--precision, --accelerator, --devices, --strategy, --seed, --epochs).
+# Threads that wait for each other sleep: on a busy machine they would else take most of the time.
+train: export OMP_WAIT_POLICY ?= passive
 train: build ## every network: WORLD=maze3d|maze2d, or DATA="a.mcap b.mcap" NAME=my_robot ARGS="--image /scan"; TRAIN_ARGS="--precision 32-true"
 	@$(OPEN) && for script in train_local train_place train_familiarity featurise $(if $(filter maze3d-,$(WORLD)-$(DATA)),train_smoother) \
 		train_optimizer evaluate; do \

@@ -1,5 +1,6 @@
 """From a node class to a process: signals, exit codes, ``--help``, and one line where a start fails."""
 
+import gc
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -73,6 +74,7 @@ def run_node(
         try:
             node = create()
             answer_always(node, node.services)
+            gc.freeze()  # what a start leaves behind: hundreds of thousands of objects that stay
             run(node, lambda: signalled)
         finally:
             if node is not None:

@@ -90,6 +90,41 @@ def turned_covariance(yaw: float, covariance: Array) -> Array:
 
 
 @njit(cache=True)
+def frames_between_nodes(nodes: Array, odometry: Array, block: int, shares: Array) -> Array:
+    """Poses ``(frames, 3)`` of all frames, of which each ``block``-th is a node; those behind the last follow it.
+
+    Between two nodes the correction is spread over the frames.
+
+    Args:
+        nodes: corrected poses ``(blocks + 1, 3)``.
+        odometry: poses ``(frames, 3)`` by odometry.
+        shares: of a block's correction in that of each of its frames ``(1 or blocks, block)``.
+    """
+    poses = np.empty_like(odometry)
+    poses[0] = nodes[0]
+    blocks = len(nodes) - 1
+    for b in range(blocks + 1):
+        first, last = b * block, min((b + 1) * block, len(odometry) - 1)
+        x0, y0, yaw0 = odometry[first]
+        cos0, sin0 = math.cos(yaw0), math.sin(yaw0)
+        x, y, yaw = nodes[b]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        moved = np.zeros(3)
+        if b < blocks:
+            moved = between(nodes[b], nodes[b + 1]) - between(odometry[first], odometry[last])
+            moved[2] = wrap(moved[2])
+        share = shares[b if len(shares) > 1 and b < blocks else 0]
+        for k in range(first + 1, last + 1):
+            part = share[k - first - 1]
+            to_x, to_y = odometry[k, 0] - x0, odometry[k, 1] - y0
+            in_x = cos0 * to_x + sin0 * to_y + part * moved[0]
+            in_y = -sin0 * to_x + cos0 * to_y + part * moved[1]
+            poses[k, 0], poses[k, 1] = x + cos * in_x - sin * in_y, y + sin * in_x + cos * in_y
+            poses[k, 2] = wrap(yaw + wrap(odometry[k, 2] - yaw0) + part * moved[2])
+    return poses
+
+
+@njit(cache=True)
 def carried(pose: Array, covariance: Array, odometry: Array, relative: Array, variance: Array) -> tuple[Array, Array]:
     """A pose and its covariance after further steps, as ``planar_covariance.propagate`` has it for each.
 

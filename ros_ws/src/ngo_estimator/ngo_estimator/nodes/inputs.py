@@ -3,9 +3,11 @@
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible, qos_policy_name_from_kind
+from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ngo_common.nodes.qos import overridable
@@ -19,6 +21,21 @@ _UNKNOWN = "a node of a name not known yet"
 
 class OtherPublisher(ValueError):
     """A message of another publisher than the one that is held on to."""
+
+
+class OnDemand(CallbackGroup):
+    """Keeps the executor from waking for messages: they wait for ``Input.take_waiting``."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Only events of the subscription, and no messages."""
+        return not isinstance(entity, Subscription)
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """As ``can_execute``."""
+        return self.can_execute(entity)
+
+    def ending_execution(self, entity: Any) -> None:
+        """Events do not exclude each other."""
 
 
 class Input:
@@ -38,6 +55,7 @@ class Input:
         callback: Callable[[Any], None],
         identity: Callable[[Any], Hashable],
         timeout_s: float,
+        group: CallbackGroup | None = None,
     ) -> None:
         """Have ``callback`` called with each message; ``identity`` gives the source that a message names."""
         self._node, self._status = node, status
@@ -52,6 +70,7 @@ class Input:
             topic,
             self._on_message,
             qos,
+            callback_group=group,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos),
             qos_overriding_options=overridable(),
         )

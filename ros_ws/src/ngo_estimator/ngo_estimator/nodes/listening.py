@@ -4,6 +4,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -19,11 +20,18 @@ class Listening:
         self._node, self._status, self._timeout_s = node, status, timeout_s
         self._inputs: list[Input] = []
 
-    def to(self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> Input:
+    def to(
+        self,
+        message_type: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile,
+        group: CallbackGroup | None = None,
+    ) -> Input:
         """Take the messages of one publisher; their frames, where they have any, tell publishers apart."""
 
         take = self._safe(topic, callback)
-        made = Input(self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s)
+        made = Input(self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s, group)
         self._inputs.append(made)
         return made
 

@@ -10,6 +10,7 @@ from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.parameters import LiveSettings
@@ -22,6 +23,7 @@ from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
+from ngo_estimator.nodes.step_messages import OdometryWriter, TransformsWriter
 from ngo_estimator.nodes.weights import weights_folder
 
 if TYPE_CHECKING:
@@ -76,10 +78,13 @@ class LocalNode(Node):
             self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
         )
         self._relative_pose = self._publisher(RelativePose, settings.relative_pose_topic, settings.relative_pose_depth)
+        odom_frame, base_frame = settings.framed(settings.odom_frame), settings.framed(settings.base_frame)
         if settings.publish_odometry and not self._has_odom:
             self._odometry = self._publisher(Odometry, settings.odometry_topic)
+            self._odometry_writer = OdometryWriter(odom_frame, base_frame, serialize_message)
         if settings.publish_tf and not self._has_odom:
             self._tf = self._publisher(TFMessage, settings.tf_topic)
+            self._tf_writer = TransformsWriter([(odom_frame, base_frame)], serialize_message)
         self._listening = Listening(self, self._status, settings.source_timeout_s)
         self._input.listen(self._listening, self._status)
 
@@ -91,18 +96,17 @@ class LocalNode(Node):
             self._covariance = np.zeros((3, 3))
             return
         settings = self._settings
-        odom_frame, base_frame = settings.framed(settings.odom_frame), settings.framed(settings.base_frame)
         if not self._has_odom:
             estimate = replace(estimate, robot_odom_xyyaw=None)
-        self._relative_pose.publish(messages.relative_pose_message(estimate, base_frame))
+        frame = settings.framed(settings.base_frame)
+        self._relative_pose.publish(messages.relative_pose_message(estimate, frame))
         self._covariance = propagate(
             self._covariance, estimate.odom_xyyaw, estimate.relative_xyyaw, estimate.covariance
         )
         if settings.publish_odometry and not self._has_odom:
-            self._odometry.publish(messages.odometry_message(estimate, self._covariance, odom_frame, base_frame))
+            self._odometry.publish(self._odometry_writer.write(estimate, self._covariance))
         if settings.publish_tf and not self._has_odom:
-            stamped = (estimate.stamp_ns, odom_frame, base_frame, estimate.odom_xyyaw)
-            self._tf.publish(messages.transform_message(*stamped))
+            self._tf.publish(self._tf_writer.write(estimate.stamp_ns, estimate.odom_xyyaw))
 
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
         response.success, response.message = True, self._input.reset()

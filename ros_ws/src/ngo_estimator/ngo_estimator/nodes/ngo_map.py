@@ -20,6 +20,7 @@ from ngo_common.settings import usage
 from ngo_estimator.mapping.map_files import FREE, OCCUPIED, write_map
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig, warm_up
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
+from ngo_estimator.nodes.inputs import OnDemand
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.map_publisher import MapPublisher
 from ngo_estimator.nodes.messages import relative_step
@@ -32,6 +33,7 @@ from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 NAME = "ngo_map"
 _SUMMARY = "Publishes a map from the ranges in relative poses, at their corrected poses."
+_AT_ONCE = 8  # relative poses that are taken where the node fell behind
 _BUDGET_S = 0.35  # of an update, for scans that the trajectory moved; the rest is moved by the next one
 
 
@@ -89,9 +91,25 @@ class NgoMap(Node):
         self._publisher = MapPublisher(self, settings.map_topic, settings.framed(settings.map_frame))
         self._listening = Listening(self, self._status, settings.source_timeout_s)
         steps = QoSProfile(depth=settings.relative_pose_depth)
-        self._listening.to(RelativePose, settings.relative_pose_topic, self._on_relative_pose, steps)
+        self._steps = self._listening.to(RelativePose, settings.relative_pose_topic, self._on_relative_poses, steps)
+        self._taking = False
         # The newest trajectory says all that those before it said.
-        self._listening.to(Trajectory, settings.trajectory_topic, self._on_trajectory, QoSProfile(depth=1))
+        # It is taken when the map follows it, and not at each of its changes.
+        newest = QoSProfile(depth=1)
+        self._newest = self._listening.to(
+            Trajectory, settings.trajectory_topic, self._on_trajectory, newest, OnDemand()
+        )
+
+    def _on_relative_poses(self, message: RelativePose) -> None:
+        """Take a message, and those that wait behind it."""
+        self._on_relative_pose(message)
+        if self._taking:
+            return
+        self._taking = True
+        try:
+            self._steps.take_waiting(_AT_ONCE - 1)
+        finally:
+            self._taking = False
 
     def _on_relative_pose(self, message: RelativePose) -> None:
         try:
@@ -123,6 +141,7 @@ class NgoMap(Node):
 
     def _follow(self) -> None:
         """Let the map follow the newest trajectory, and publish it if it has changed."""
+        self._newest.take_waiting(1)
         if self._trajectory is None or not self._due:
             return
         try:
@@ -164,6 +183,7 @@ class NgoMap(Node):
             raise ValueError(f"map_topic is '{request.map_topic}'; expected '{own}', or nothing")
         if not request.map_url:
             raise ValueError("map_url is empty; expected the path of the files, without an ending")
+        self._newest.take_waiting(1)
         if self._trajectory is not None and self._due:  # a file holds all that is known by now
             self._draw(self._trajectory, math.inf)
         folder = Path(self._settings.save_directory)

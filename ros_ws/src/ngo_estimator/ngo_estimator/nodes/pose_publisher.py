@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.lifecycle import LifecycleNode, LifecyclePublisher
+from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.qos import overridable
-from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.settings import NgoNodeSettings
+from ngo_estimator.nodes.step_messages import PoseWriter, TransformsWriter
 
 if TYPE_CHECKING:
     from ngo_estimator.online.tf_smoothing import SmoothedCorrection
@@ -40,22 +41,21 @@ class PosePublisher:
         topics = settings()
         self._pose = publisher(PoseWithCovarianceStamped, topics.pose_topic)
         self._tf = publisher(TFMessage, topics.tf_topic) if topics.publish_tf else None
+        map_frame, odom_frame = topics.framed(topics.map_frame), topics.framed(topics.odom_frame)
+        self._pose_writer = PoseWriter(map_frame, serialize_message)
+        self._tf_writer = TransformsWriter([(map_frame, odom_frame)], serialize_message)
 
     def publish(
         self, stamp_ns: int, pose: np.ndarray, covariance: np.ndarray, map_from_odom: np.ndarray, odom: np.ndarray
     ) -> None:
         """Publish a pose ``(3,)`` and its covariance ``(3, 3)`` in map, and what goes to ``send_transform``."""
         self.send_transform(stamp_ns, map_from_odom, odom)
-        settings = self._settings()
-        map_frame = settings.framed(settings.map_frame)
-        self._pose.publish(messages.pose_message(stamp_ns, map_frame, pose, covariance))
+        self._pose.publish(self._pose_writer.write(stamp_ns, pose, covariance))
 
     def send_transform(self, stamp_ns: int, map_from_odom: np.ndarray, odom: np.ndarray) -> None:
         """Publish map -> odom ``(3,)``, smoothed, with the robot's pose ``(3,)`` in odom."""
         if self._tf is None:
             return
-        settings = self._settings()
-        map_frame, odom_frame = settings.framed(settings.map_frame), settings.framed(settings.odom_frame)
         smoothed = self.smoothing.update(stamp_ns, map_from_odom, odom)
-        ahead_ns = round(1e9 * settings.tf_ahead_s)
-        self._tf.publish(messages.transform_message(stamp_ns + ahead_ns, map_frame, odom_frame, smoothed))
+        ahead_ns = round(1e9 * self._settings().tf_ahead_s)
+        self._tf.publish(self._tf_writer.write(stamp_ns + ahead_ns, smoothed))

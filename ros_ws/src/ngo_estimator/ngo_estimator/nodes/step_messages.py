@@ -1,15 +1,17 @@
 """The messages that both nodes publish about a step as bytes, written by numpy: much cheaper than by objects."""
 
 import struct
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.planar_covariance import to_spatial
 from ngo_estimator.nodes import messages
-from ngo_estimator.online.trajectory_update import TrajectoryUpdate
+
+if TYPE_CHECKING:  # a node imports the cores after checking its parameters
+    from ngo_estimator.data.relative_step import RelativeStep
+    from ngo_estimator.online.trajectory_update import TrajectoryUpdate
 
 ODOMETRY, POSE, TF = "/odom", "/ngo/pose", "/tf"
 TYPES = {
@@ -19,16 +21,80 @@ TYPES = {
 }
 """Types of the topics."""
 
+Serialise = Callable[[Any], bytes]
+"""Turns a message into bytes."""
+
 _NS = 1_000_000_000
-_STAMP_AT = {ODOMETRY: 4, POSE: 4, TF: 8}
-"""Behind the four bytes that say how a message is encoded, and the number of transforms."""
+_HEAD = 4
+"""Bytes that say how a message is encoded: a stamp, or the number of transforms, comes behind them."""
+
+
+class OdometryWriter:
+    """Writes ``messages.odometry_message`` of one step after the other.
+
+    The first message is serialised, as a template. In CDR all others differ from it in their stamps and in the doubles
+    behind the names alone. So it is with the writers below.
+
+    Args:
+        odom_frame, base_frame: names of the frames.
+    """
+
+    def __init__(self, odom_frame: str, base_frame: str, serialise: Serialise) -> None:
+        self._frames, self._serialise = (odom_frame, base_frame), serialise
+        self._message = bytearray()
+
+    def write(self, step: "RelativeStep", covariance: np.ndarray) -> bytes:
+        """The odometry with its covariance ``(3, 3)``, and the mean velocity of the step."""
+        if not self._message:
+            self._message += self._serialise(messages.odometry_message(step, covariance, *self._frames))
+        seconds = (step.stamp_ns - step.from_stamp_ns) / _NS
+        twist = np.zeros(6)
+        twist[[0, 1, 5]] = step.relative_xyyaw / seconds
+        parts = _pose(step.odom_xyyaw), to_spatial(covariance), twist, to_spatial(step.covariance / seconds**2)
+        return _filled(self._message, step.stamp_ns, *parts)
+
+
+class PoseWriter:
+    """Writes ``messages.pose_message`` in one frame."""
+
+    def __init__(self, frame: str, serialise: Serialise) -> None:
+        self._frame, self._serialise = frame, serialise
+        self._message = bytearray()
+
+    def write(self, stamp_ns: int, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> bytes:
+        """A pose ``(3,)`` with its covariance ``(3, 3)``."""
+        if not self._message:
+            self._message += self._serialise(messages.pose_message(stamp_ns, self._frame, pose_xyyaw, covariance))
+        return _filled(self._message, stamp_ns, _pose(pose_xyyaw), to_spatial(covariance))
+
+
+class TransformsWriter:
+    """Writes the same transforms again and again, as ``messages.transform_message`` does.
+
+    Args:
+        frames: parent and child of each transform.
+    """
+
+    def __init__(self, frames: Sequence[tuple[str, str]], serialise: Serialise) -> None:
+        self._message, self._ends = bytearray(), [2 * _HEAD]
+        message = messages.transform_message(0, *frames[0], np.zeros(3))
+        message.transforms = []
+        for parent, child in frames:
+            message.transforms += messages.transform_message(0, parent, child, np.zeros(3)).transforms
+            self._message[:] = serialise(message)
+            self._ends.append(len(self._message))
+
+    def write(self, stamp_ns: int, *parents_from_children: np.ndarray) -> bytes:
+        """Each transform ``(3,)``, all with one stamp."""
+        stamp = _stamp(stamp_ns)
+        for begin, end, xyyaw in zip(self._ends[:-1], self._ends[1:], parents_from_children, strict=True):
+            values = _pose(xyyaw).tobytes()
+            self._message[begin : begin + len(stamp)], self._message[end - len(values) : end] = stamp, values
+        return bytes(self._message)
 
 
 class StepMessages:
     """Writes the odometry, the pose and the transforms of one step after the other.
-
-    The first step's messages are serialised, as templates. In CDR those of all others differ from them in their stamps
-    and in the doubles behind the names alone.
 
     Args:
         base_frame, odom_frame, map_frame: names of the frames.
@@ -38,35 +104,21 @@ class StepMessages:
     def __init__(
         self, base_frame: str, odom_frame: str, map_frame: str, serialise: Callable[[Any, str], bytes]
     ) -> None:
-        self._base, self._odom, self._map, self._serialise = base_frame, odom_frame, map_frame, serialise
-        self._templates: dict[str, bytearray] = {}
-        self._upper_ends = 0  # bytes up to the end of the first transform
+        self._base, self._odom, self._map = base_frame, odom_frame, map_frame
+        self._odometry = OdometryWriter(odom_frame, base_frame, lambda message: serialise(message, TYPES[ODOMETRY]))
+        self._pose = PoseWriter(map_frame, lambda message: serialise(message, TYPES[POSE]))
+        frames = (map_frame, odom_frame), (odom_frame, base_frame)
+        self._transforms = TransformsWriter(frames, lambda message: serialise(message, TYPES[TF]))
 
-    def of(self, step: RelativeStep, odom_covariance: np.ndarray, update: TrajectoryUpdate) -> dict[str, bytes]:
+    def of(self, step: "RelativeStep", odom_covariance: np.ndarray, update: "TrajectoryUpdate") -> dict[str, bytes]:
         """The message of each topic; ``odom_covariance`` ``(3, 3)`` is that of the step's end in the odometry."""
-        if not self._templates:
-            plain = self.plain(step, odom_covariance, update)
-            self._templates = {name: bytearray(self._serialise(of, TYPES[name])) for name, of in plain.items()}
-            plain[TF].transforms = plain[TF].transforms[:1]
-            self._upper_ends = len(self._serialise(plain[TF], TYPES[TF]))
-        stamp = struct.pack("<iI", *divmod(step.stamp_ns, _NS))
-        seconds = (step.stamp_ns - step.from_stamp_ns) / _NS
-        twist = np.zeros(6)
-        twist[[0, 1, 5]] = step.relative_xyyaw / seconds
-        twist_covariance = to_spatial(step.covariance / seconds**2)
-        ends: dict[str, tuple[np.ndarray, ...]] = {
-            ODOMETRY: (_pose(step.odom_xyyaw), to_spatial(odom_covariance), twist, twist_covariance),
-            POSE: (_pose(update.pose_xyyaw), to_spatial(update.covariance)),
-            TF: (_pose(step.tf_odom_xyyaw),),
+        return {
+            ODOMETRY: self._odometry.write(step, odom_covariance),
+            POSE: self._pose.write(step.stamp_ns, update.pose_xyyaw, update.covariance),
+            TF: self._transforms.write(step.stamp_ns, update.map_from_odom_xyyaw, step.tf_odom_xyyaw),
         }
-        for topic, doubles in ends.items():
-            message, values, at = self._templates[topic], b"".join(part.tobytes() for part in doubles), _STAMP_AT[topic]
-            message[at : at + len(stamp)], message[-len(values) :] = stamp, values
-        transforms, upper, values = self._templates[TF], self._upper_ends, _pose(update.map_from_odom_xyyaw).tobytes()
-        transforms[upper - len(values) : upper], transforms[upper : upper + len(stamp)] = values, stamp
-        return {topic: bytes(message) for topic, message in self._templates.items()}
 
-    def plain(self, step: RelativeStep, odom_covariance: np.ndarray, update: TrajectoryUpdate) -> dict[str, Any]:
+    def plain(self, step: "RelativeStep", odom_covariance: np.ndarray, update: "TrajectoryUpdate") -> dict[str, Any]:
         """The same as objects: the slow definition of what ``of`` writes."""
         transforms = messages.transform_message(step.stamp_ns, self._map, self._odom, update.map_from_odom_xyyaw)
         below = messages.transform_message(step.stamp_ns, self._odom, self._base, step.tf_odom_xyyaw)
@@ -76,6 +128,17 @@ class StepMessages:
             POSE: messages.pose_message(step.stamp_ns, self._map, update.pose_xyyaw, update.covariance),
             TF: transforms,
         }
+
+
+def _filled(message: bytearray, stamp_ns: int, *ends: np.ndarray) -> bytes:
+    """The message with this stamp at its beginning and these doubles at its end."""
+    stamp, values = _stamp(stamp_ns), b"".join(part.tobytes() for part in ends)
+    message[_HEAD : _HEAD + len(stamp)], message[-len(values) :] = stamp, values
+    return bytes(message)
+
+
+def _stamp(stamp_ns: int) -> bytes:
+    return struct.pack("<iI", *divmod(stamp_ns, _NS))
 
 
 def _pose(pose_xyyaw: np.ndarray) -> np.ndarray:

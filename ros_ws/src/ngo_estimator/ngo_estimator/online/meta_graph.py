@@ -14,9 +14,9 @@ from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import all_between, between, carried, chained, compose
+from ngo_estimator.geometry.planar_motion import all_between, between, carried, chained, compose, frames_between_nodes
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.networks.pose_aggregation import block_variances, in_block_poses, poses_in_blocks
+from ngo_estimator.networks.pose_aggregation import block_variances, poses_in_blocks
 from ngo_estimator.online.blind_stretches import shrunk_corrections, summed_variances
 from ngo_estimator.online.kept_loops import KeptLoops
 from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
@@ -535,6 +535,13 @@ class MetaGraph:
         return self.blocks - self._corrections.first - seen >= min(self._network_every, 1 + seen // 8)
 
     @property
+    def _is_light(self) -> bool:
+        """Whether the iterations of this update run no network."""
+        if self._running is not None:
+            return not self._running.runs_network
+        return not (self._optimizer.config.network and self._network_is_due)
+
+    @property
     def _annealing_is_due(self) -> bool:
         """Whether all loops are to be judged anew, from the odometry on."""
         seen = self._annealed - self._first
@@ -567,7 +574,10 @@ class MetaGraph:
             raise RuntimeError("no optimisation has begun")
         began = time.perf_counter()
         steps_left = self._block - (len(self.odometry) - 1) % self._block
-        for _ in range(min(max(parts, -(-self._parts_left // steps_left)), self._parts_left)):
+        now = most = max(parts, -(-self._parts_left // steps_left))
+        if self._is_light:  # then the last steps do several parts, as all before iterations are the heavier ones
+            now = max(parts, self._parts_left - most * (steps_left - 1))
+        for _ in range(min(now, self._parts_left)):
             if self._work:
                 self._do(self._work.pop(0))
             else:
@@ -654,27 +664,19 @@ class MetaGraph:
 
     def frame_poses(self, before: bool = False) -> np.ndarray:
         """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
-        nodes, odometry = torch.from_numpy(self.nodes(before)), torch.from_numpy(self.odometry.values)
-        starts = odometry[: len(nodes) * self._block : self._block].unsqueeze(1)
-        whole = (len(nodes) - 1) * self._block
-        in_blocks = se2.between(starts[:-1], odometry[1 : whole + 1].unflatten(0, (-1, self._block))).unsqueeze(0)
-        steps = se2.between(nodes[:-1], nodes[1:]).unsqueeze(0)
-        in_blocks = in_block_poses(in_blocks, steps, self._shares())
-        corrected = se2.compose(nodes[:-1].unsqueeze(1), in_blocks[0]).flatten(0, 1)
-        tail = se2.compose(nodes[-1:], se2.between(starts[-1], odometry[whole + 1 :]))
-        poses: np.ndarray = torch.cat((nodes[:1], corrected, tail)).numpy()
-        return poses
+        return frames_between_nodes(self.nodes(before), self.odometry.values, self._block, self._shares())
 
-    def _shares(self) -> torch.Tensor | None:
-        """The share of a block's correction in that of each of its frames ``(blocks, block)``; None: evenly spread."""
+    def _shares(self) -> np.ndarray:
+        """The share of a block's correction in that of each of its frames ``(1 or blocks, block)``: evenly spread."""
+        frames = np.arange(1, self._block + 1, dtype=np.float64)
+        even = frames[None] / self._block
         joins = self._joins.values[self._joins.values <= self.blocks * self._block]
         if len(joins) == 0:
-            return None
-        frames = torch.arange(1, self._block + 1, dtype=torch.float64)
-        shares = (frames / self._block).expand(self.blocks, -1).clone()
+            return even
+        shares = np.repeat(even, self.blocks, axis=0)
         for frame in joins.tolist():  # the motion that nobody saw is the one that is corrected
             block = (frame - 1) // self._block
-            shares[block] = (frames >= frame - block * self._block).double()
+            shares[block] = frames >= frame - block * self._block
         return shares
 
     def places(self) -> PlaceMap:

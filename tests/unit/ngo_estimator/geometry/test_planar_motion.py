@@ -1,0 +1,35 @@
+"""Compiled motions are those of ``se2``."""
+
+import numpy as np
+import pytest
+import torch
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import frames_between_nodes
+from ngo_estimator.networks.pose_aggregation import in_block_poses
+
+BLOCK = 8
+
+
+@pytest.mark.parametrize("own_shares", [False, True])
+@pytest.mark.parametrize(("blocks", "behind"), [(0, 5), (1, 0), (1, 7), (40, 3)])
+def test_frames_follow_corrected_nodes_as_in_the_optimizer(blocks: int, behind: int, own_shares: bool) -> None:
+    rng = np.random.default_rng(20000)
+    odometry = rng.normal(0.0, 3.0, (blocks * BLOCK + 1 + behind, 3))
+    nodes = rng.normal(0.0, 3.0, (blocks + 1, 3))
+    even = np.arange(1, BLOCK + 1)[None] / BLOCK
+    shares = rng.uniform(size=(blocks, BLOCK)) if own_shares and blocks > 1 else even
+
+    steps, corrected = torch.from_numpy(odometry), torch.from_numpy(nodes)
+    starts, whole = steps[: blocks * BLOCK + 1 : BLOCK].unsqueeze(1), blocks * BLOCK
+    in_blocks = se2.between(starts[:-1], steps[1 : whole + 1].reshape(blocks, BLOCK, 3)).unsqueeze(0)
+    relative = se2.between(corrected[:-1], corrected[1:]).unsqueeze(0)
+    bent = in_block_poses(in_blocks, relative, torch.from_numpy(shares))
+    expected = torch.cat(
+        (
+            corrected[:1],
+            se2.compose(corrected[:-1].unsqueeze(1), bent[0]).reshape(-1, 3),
+            se2.compose(corrected[-1:], se2.between(starts[-1], steps[whole + 1 :])),
+        )
+    )
+    np.testing.assert_allclose(frames_between_nodes(nodes, odometry, BLOCK, shares), expected, atol=1e-13)
