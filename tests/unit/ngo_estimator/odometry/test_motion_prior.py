@@ -128,31 +128,3 @@ def test_wheels_that_stand_for_long_are_believed() -> None:
     assert not all(prediction.measured for prediction in predictions[:19])
     assert all(prediction.measured for prediction in predictions[21:])
     assert all(math.sqrt(prediction.covariance[0, 0]) < 0.04 for prediction in predictions[21:])
-
-
-@pytest.mark.parametrize("stands", [False, True])
-@pytest.mark.parametrize("between_poses", [1.0, 0.4])
-def test_a_freeze_in_a_corridor_is_bridged(stands: bool, between_poses: float) -> None:
-    """No wall tells the motion. The first scan after the freeze may see a part of the way that the wheels catch up.
-
-    Wheels of a robot that did stand go on from there.
-    """
-    truth = [0.06 * (k if not stands else min(k, 10) + max(k - 16, 0)) for k in range(25)]
-    counted = [truth[10] if 10 <= k < 17 else x for k, x in enumerate(truth)]
-    if not stands:
-        counted[17] = truth[10] + between_poses * (truth[17] - truth[10])
-    wheels, prior, pose = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
-    wheels.add(0, np.zeros(3))
-    prior.begin(0, pose, wheels)
-    covariance, poses = np.zeros((3, 3)), [0.0]
-    for k in range(1, 25):
-        wheels.add(k * PERIOD_NS, np.array((counted[k], 0.0, 0.0)))
-        prediction = prior.predict(k * PERIOD_NS, pose, covariance, wheels)
-        before, pose = pose, prediction.mean
-        covariance = np.diag((prediction.covariance[0, 0], 1e-6, 1e-8))
-        prior.accept(k * PERIOD_NS, pose, covariance, pose - before, covariance, False, False, False)
-        assert abs(pose[0] - truth[k]) < 3.0 * math.sqrt(covariance[0, 0])
-        poses.append(float(pose[0]))
-    if not stands:
-        assert poses[:18] == pytest.approx(truth[:18], abs=0.06)
-    assert poses[19:] == pytest.approx(truth[19:], abs=0.02)

@@ -300,11 +300,7 @@ class LidarOdometry:
         if self._wheels is not None:
             ends = self._wheels.pose_at(scan.stamp_ns), self._wheels.pose_at(scan.stamp_ns + int(sweep_s * 1e9))
             if ends[0] is not None and ends[1] is not None:
-                counted = between(ends[0], ends[1]) / sweep_s
-                off = (counted - twist) * sweep_s
-                # Wheels that jump, or catch up after a freeze, would tear the scan apart.
-                if math.hypot(off[0], off[1]) < self.config.odometry.prior.doubt_m:
-                    twist = counted
+                twist = between(ends[0], ends[1]) / sweep_s
         return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)
 
 

@@ -1,12 +1,9 @@
 """Where the next scan is expected: by the wheels, and by the velocity that the scans measured last.
 
 The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
-Wheels that stopped at once while the scans moved (frozen), that run away from them (a jump), or that lead to no fit
-while the velocity says something else (a slip), are doubted: for that scan the prior widens by the disagreement, and
-both predictions are tried. The next prior counts from that scan.
-
-Wheels that stop without braking are frozen: the robot goes on by its last velocity. Once they move again, their whole
-way since the freeze began counts: it is right if they catch up, and if the robot stood.
+Wheels that stopped at once while the scans moved (frozen), or that run away from them (a jump), are doubted: for that
+scan the prior widens by the disagreement, and both predictions are tried. The next prior counts from that scan. So it
+does where wheels lead to no fit, and the velocity does (a slip).
 """
 
 import math
@@ -18,9 +15,6 @@ from ngo_estimator.geometry.planar_motion import Array, compose, wrap
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
 from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
-
-_CAUGHT_UP_SHARE = 0.1
-"""Share of the way through a freeze by which constant velocity and wheels that caught up may differ."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +56,7 @@ class Prediction:
     """The prior of a scan's pose in the odometry's frame: ``mean`` ``(3,)`` with ``covariance`` and ``information``
     ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``by_wheels`` says that wheels made it, and
     ``measured`` that they are not doubted. Where these moved, ``step_covariance`` ``(3, 3)`` is that of their motion
-    since the last scan, along the odometry's axes. Wheels that stand exactly still may be ``frozen``; this lasts until
-    they have caught up."""
+    since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen."""
 
     mean: Array
     covariance: Array
@@ -72,20 +65,6 @@ class Prediction:
     by_wheels: bool = False
     measured: bool = False
     step_covariance: Array | None = None
-    frozen: bool = False
-
-
-@dataclass(eq=False)
-class _Freeze:
-    """Pose ``(3,)``, wheels ``(3,)`` and covariance ``(3, 3)`` of the last scan before wheels froze.
-
-    ``ends`` says that they moved again at the last scan.
-    """
-
-    pose: Array
-    wheels: Array
-    covariance: Array
-    ends: bool = False
 
 
 class MotionPrior:
@@ -104,8 +83,6 @@ class MotionPrior:
         self._anchor_covariance = np.zeros((3, 3))
         self._doubted = False
         self._moved_ns = 0  # when the wheels moved last
-        self._speeds = (0.0, 0.0)  # of the wheels between the last scans between which they moved (m/s)
-        self._freeze: _Freeze | None = None
 
     def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
         """The first scan is a key scan at this pose."""
@@ -125,20 +102,13 @@ class MotionPrior:
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
             return self._without_wheels(last, constant, elapsed)
-        self._expected = None
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
+        self._expected = None
+        starts = [compose(last, step)]
         off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
         turn_doubt = math.radians(self.config.doubt_deg) + self.config.acceleration_rad_s2 * elapsed**2
         jumped = off > self.config.doubt_m + self.config.doubt_m_s2 * elapsed**2 or off_rad > turn_doubt
-        frozen = self._is_frozen(stamp_ns, step, constant)
-        if frozen and self._stopped_at_once(constant, elapsed):
-            self._freeze = _Freeze(last, self._last_wheels, covariance)
-        if self._freeze is not None:
-            return self._through(self._freeze, last, covariance, step, constant, frozen, wheels)
-        if step.any():
-            self._speeds = self._speeds[1], math.hypot(step[0], step[1]) / elapsed
-        starts = [compose(last, step)]
-        doubted = jumped or frozen
+        doubted = jumped or self._is_frozen(stamp_ns, step, constant)
         if doubted:
             starts.append(compose(last, constant))
         if doubted or self._doubted or self._anchor_wheels is None:
@@ -156,7 +126,6 @@ class MotionPrior:
             tuple(starts),
             by_wheels=True,
             measured=not doubted,
-            frozen=frozen,
             step_covariance=np.diag(step_deviations**2) if not doubted and step.any() else None,
         )
 
@@ -183,44 +152,6 @@ class MotionPrior:
     def doubt(self) -> None:
         """The wheels' way to the newest scan is wrong: the next prior counts from that scan."""
         self._doubted = True
-
-    def _stopped_at_once(self, constant: Array, elapsed: float) -> bool:
-        """Whether the wheels stand since the last scan without having braked. Scans fall between their poses, so that
-        the last motion before may be a part."""
-        way = math.hypot(constant[0], constant[1])
-        return self._moved_ns == self._stamp_ns and max(self._speeds) * elapsed > 0.5 * way > 0.5 * self.config.frozen_m
-
-    def _through(
-        self,
-        freeze: _Freeze,
-        last: Array,
-        covariance: Array,
-        step: Array,
-        constant: Array,
-        frozen: bool,
-        wheels: WheelOdometry,
-    ) -> Prediction:
-        """The prior by constant velocity while wheels are frozen, and by the wheels' whole way once they caught up."""
-        assert self._now_wheels is not None and self._last_wheels is not None
-        bridged = compose(last, constant)
-        whole, deviations = wheels.motion(freeze.wheels, self._now_wheels)
-        mean = compose(freeze.pose, whole)
-        off, off_rad = math.hypot(mean[0] - bridged[0], mean[1] - bridged[1]), abs(wrap(mean[2] - bridged[2]))
-        agrees = off < self.config.doubt_m + _CAUGHT_UP_SHARE * math.hypot(whole[0], whole[1])
-        if frozen or (step.any() and not agrees and not freeze.ends):
-            # The first scan may fall between two of their poses, in the midst of catching up.
-            freeze.ends = not frozen
-            mean, starts = bridged, (bridged, last)
-            off, off_rad = math.hypot(step[0] - constant[0], step[1] - constant[1]), abs(wrap(step[2] - constant[2]))
-            _, deviations = wheels.motion(self._last_wheels, self._last_wheels)
-            self._anchor, self._anchor_wheels, self._anchor_covariance = last, self._last_wheels, covariance
-        else:
-            starts = (mean, bridged)
-            self._anchor, self._anchor_wheels, self._anchor_covariance = freeze.pose, freeze.wheels, freeze.covariance
-            self._freeze = None
-        self._doubted = True
-        total = np.diag((deviations + np.array((off, off, off_rad))) ** 2) + self._anchor_covariance
-        return Prediction(mean, total, np.linalg.inv(total).astype(np.float64), starts, by_wheels=True, frozen=True)
 
     def _is_frozen(self, stamp_ns: int, step: Array, constant: Array) -> bool:
         """Whether wheels that stand exactly still may have stopped counting."""

@@ -192,8 +192,7 @@ class ScanOdometry:
         poor = deviation_m > config.poor_m or deviation[2] > math.radians(config.poor_deg)
         prior = (prediction.mean, prediction.information)
         starts = list(prediction.starts)
-        # Of frozen wheels the prior is wide: what noisy normals claim to know along a corridor would decide the motion.
-        open_share = 0.0 if prediction.by_wheels and not prediction.frozen else config.open_share
+        open_share = 0.0 if prediction.by_wheels else config.open_share
         on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
         if poor:
             window = (
