@@ -63,12 +63,12 @@ class RecordedOutput:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._frames = {"odom": odom_frame, "map": map_frame}
+        self._store = get_typestore(Stores.ROS2_JAZZY)
         self._messages = StepMessages(base_frame, odom_frame, map_frame, self._serialise)
         self._covariance = np.zeros((3, 3))
         self._source, self._map = source, ScanMap()
         self.left_out = ""
         """Why scans are not in the map, where any were left out."""
-        self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = RecordingWriter(folder / "trajectories.mcap", flush_s=None, library="ngo_estimator")
         for topic, type_name in TYPES.items():
             self._writer.add_topic(topic, type_name)
