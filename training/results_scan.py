@@ -44,7 +44,6 @@ _BUILDINGS = (building2d, building_drives)
 _MAZES = (maze2d, episodes, scans, simulated_drives)
 _READ = (mounting, recording, scan_stream, topics, lidar_logs)
 _MOST_SCANS = 20_000  # of a building: some robots stand for hours
-_SHOWN = ("buildings", "ablation", "length_m", "mazes", "frames")
 _PAIRED = ("ate_m", "within_three_deviations", "negative_log_likelihood")
 _SLIPS_PER_KM = 300.0  # of the table of slip; the buildings have up to 60
 _ABLATED = ("buildings", "aliased")

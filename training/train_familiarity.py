@@ -251,7 +251,12 @@ def with_config(familiarity: Familiarity, config: FamiliarityConfig) -> Familiar
 def fit_disagreement(
     networks: Networks, familiarity: Familiarity, world: str, drives: list[SensedDrive]
 ) -> tuple[float, dict[str, float]]:
-    """The smallest factor with which drives with each fault are honest, and the shares of their poses within."""
+    """The smallest factor with which drives with each fault are honest, and the shares of their poses within.
+
+    Without drives nothing is known of any factor: it stays as it is, and there are no shares.
+    """
+    if not drives:
+        return familiarity.config.disagreement, {}
     told = familiarity.config.is_told
     runs_of: dict[str, list[tuple[np.ndarray, list[LocalEstimate], list[LocalEstimate]]]] = {
         kind: [] for kind in FAULTS if told or kind not in _NEEDS_TOLD
@@ -268,9 +273,9 @@ def fit_disagreement(
     shares: dict[str, float] = {}
     for factor in FACTORS:
         shares = {
-            kind: float(np.mean([_share(*run, factor) for run in found])) for kind, found in runs_of.items() if found
+            kind: float(np.mean([_share(*run, factor) for run in found])) for kind, found in runs_of.items()
         }
-        if min(shares.values(), default=1.0) >= _WANTED:
+        if min(shares.values()) >= _WANTED:
             return factor, shares
     return FACTORS[-1], shares
 

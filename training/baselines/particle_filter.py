@@ -17,7 +17,6 @@ from scipy.ndimage import distance_transform_edt
 from ngo_estimator.geometry.planar_motion import compose
 
 _RESOLUTION_M = 0.05
-_FREE_STEP = 0.5  # of a cell, along rays
 _LEAST_HITS = 2
 _BIN_M, _BIN_RAD = 0.5, math.radians(10.0)  # of the particles' histogram, as AMCL's
 _KLD_ERROR, _KLD_QUANTILE = 0.05, 2.3263  # the quantile of 99 %

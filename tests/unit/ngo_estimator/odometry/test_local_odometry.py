@@ -11,6 +11,7 @@ from ngo_estimator.checkpoint import PlaceNetworks, load_local, write_untrained
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
 from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.geometry import se2
+from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig, look_size
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import SmootherConfig
 from ngo_estimator.odometry.frame_pairing import PairedFrame
@@ -358,3 +359,44 @@ def test_frames_at_once_are_as_one_by_one_with_gaps_refused_frames_and_restarts(
                 np.testing.assert_allclose(value, theirs, rtol=1e-4, atol=1e-6, err_msg=name)
             else:
                 assert value == theirs, name
+
+
+def test_frames_at_once_that_fail_are_not_taken_and_may_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def core() -> LocalOdometry:
+        torch.manual_seed(0)
+        memory = SmootherConfig(8, (0.1, 0.02, 0.05), dilations=(1, 2), width=8, causal=True)
+        config = local_config("maze2d", actions=3, memory=memory, feature_size=8, relative_std=(0.1, 0.02, 0.05))
+        network, place = LocalPoseNetwork(config), PlaceNetworks(place_config("maze2d", code_size=16))
+        assert network.memory is not None
+        torch.nn.init.normal_(network.memory.head.weight)  # as one that has learned
+        familiarity = Familiarity(FamiliarityConfig(look_size(place.encoder), 8, actions=3, twist=False))
+        return LocalOdometry(network, place, "maze2d", familiarity)
+
+    # The source restarts at the sixth frame: the frames before it succeed, those behind it fail.
+    played = [
+        PairedFrame(k * PERIOD_NS, image, at % 3)
+        for at, (k, image) in enumerate(zip([0, 1, 2, 3, 4, -100, -99, -98], frames(8), strict=True))
+    ]
+    untouched, broken = core(), core()
+    expected = untouched.update_all(played[:3])
+    ours = broken.update_all(played[:3])
+    assert broken._watch is not None
+    judged, calls = broken._watch._judged, []
+
+    def judge_or_fail(*row: object) -> object:
+        calls.append(row)
+        if len(calls) == 4:
+            raise RuntimeError("out of memory")
+        return judged(*row)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(broken._watch, "_judged", judge_or_fail)
+        with pytest.raises(RuntimeError, match="out of memory"):
+            broken.update_all(played[3:])
+    assert broken.restarts == 0
+    for frame in played[3:]:
+        expected += untouched.update_all([frame])
+        ours += broken.update_all([frame])
+    assert broken.restarts == 1
+    for a, b in zip(ours, expected, strict=True):
+        assert (a is b is None) or (isinstance(a, LocalEstimate) and isinstance(b, LocalEstimate) and same(a, b))

@@ -13,7 +13,6 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.scan_points import key_scan
 from ngo_estimator.optimizer.scan_loop_candidates import (
     WindowConfig,
-    covariance_windows,
     distance_windows,
     graph_distances,
 )
@@ -191,15 +190,11 @@ def test_the_graphs_distance_goes_over_loops() -> None:
     )
 
 
-def test_windows_grow_with_distance_and_with_covariance_up_to_their_limit() -> None:
+def test_windows_grow_with_distance_up_to_their_limit() -> None:
     config = WindowConfig(least_m=0.3, share=0.04, most_m=8.0, least_deg=8.0, deg_per_m=0.25, most_deg=45.0)
     windows = distance_windows(config, np.array((0.0, 100.0, 1000.0)))
     np.testing.assert_allclose(windows[:, 0], (0.3, 4.3, 8.0))
     np.testing.assert_allclose(np.degrees(windows[:, 2]), (8.0, 33.0, 45.0))
-    covariances = np.stack([np.diag(variances) for variances in ((1e-6, 1e-6, 1e-6), (0.04, 1.0, 0.04), (99, 99, 9))])
-    windows = covariance_windows(config, covariances)
-    np.testing.assert_allclose(windows[:, :2], ((0.3, 0.3), (3.0, 3.0), (8.0, 8.0)))
-    np.testing.assert_allclose(windows[:, 2], (math.radians(8.0), 0.6, math.radians(45.0)))
 
 
 def test_wrong_shapes_are_refused() -> None:

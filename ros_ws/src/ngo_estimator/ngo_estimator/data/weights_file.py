@@ -81,6 +81,7 @@ def _without_retired(kind: str, values: Any) -> Any:
         section = kept
         for key in sections:
             section = section.get(key) if isinstance(section, dict) else None
-        if isinstance(section, dict) and (value := section.pop(setting, meant)) is not meant:
+        value = section.pop(setting, meant) if isinstance(section, dict) else meant
+        if type(value) is not type(meant) or value != meant:  # false is no 0
             raise ValueError(f"{name} is {value!r}, which this version no longer has; expected {meant!r}, or none")
     return kept

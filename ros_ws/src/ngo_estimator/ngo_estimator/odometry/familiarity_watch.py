@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +75,15 @@ class FamiliarityWatch:
         self._together = np.zeros(3)
         self._apart: deque[np.ndarray] = deque(maxlen=self._config.memory)
         self._actions = [NO_ACTION] * HISTORY
+
+    def restorer(self) -> Callable[[], None]:
+        """Puts back what is known now of the observations so far."""
+        kept = self._mean.copy(), self._together.copy(), self._apart.copy(), self._actions
+
+        def restore() -> None:
+            self._mean, self._together, self._apart, self._actions = kept
+
+        return restore
 
     def judge(
         self,

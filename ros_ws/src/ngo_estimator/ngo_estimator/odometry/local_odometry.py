@@ -1,7 +1,7 @@
 """Local odometry: frames in, relative poses out (no ROS here)."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,7 +138,32 @@ class LocalOdometry:
 
         Returns:
             For each frame what ``update`` returns or raises.
+
+        Raises:
+            Exception: whatever a network raised; none of the frames was taken then.
         """
+        restore = self._restorer()
+        try:
+            return self._update_all(frames)
+        except Exception:
+            restore()
+            raise
+
+    def _restorer(self) -> Callable[[], None]:
+        """Puts the state back to what it is now."""
+        kept = self._last, self._origin_stamp_ns, self._origin_code, self._odom, self._steps.copy(), self.restarts
+        restore_watch = None if self._watch is None else self._watch.restorer()
+
+        def restore() -> None:
+            (
+                self._last, self._origin_stamp_ns, self._origin_code, self._odom, self._steps, self.restarts
+            ) = kept  # fmt: skip
+            if restore_watch is not None:
+                restore_watch()
+
+        return restore
+
+    def _update_all(self, frames: Sequence[PairedFrame]) -> list[LocalEstimate | RejectedFrame | None]:
         results: list[LocalEstimate | RejectedFrame | None] = []
         left = deque(frames)
         while left:

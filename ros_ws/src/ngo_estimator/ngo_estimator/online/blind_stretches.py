@@ -68,7 +68,8 @@ def _untied(variance: np.ndarray, loops: np.ndarray) -> np.ndarray:
 
 
 def _shrunk(correction: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    correction[:, 2] = np.remainder(correction[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    """Differences of poses ``(n, 3)``, shrunk by the rule for motions of a variance ``(n, 3)``."""
+    correction = se2.wrapped(torch.from_numpy(correction)).numpy()
     squared = np.square(correction) / np.maximum(variance, _LEAST_VARIANCE)
     share = np.clip(1.0 - 1.0 / np.maximum(squared.sum(axis=1), 1.0), 0.0, 1.0)
     shrunk: np.ndarray = correction * share[:, None]

@@ -67,14 +67,6 @@ def distance_windows(config: WindowConfig, distances: np.ndarray) -> np.ndarray:
     return np.stack((metres, metres, np.radians(degrees)), axis=-1)
 
 
-def covariance_windows(config: WindowConfig, covariances: np.ndarray) -> np.ndarray:
-    """Half widths ``(keys, 3)`` of the search (m, m, rad) for covariances ``(keys, 3, 3)`` of the relative poses."""
-    spread = config.deviations * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    metres = np.clip(spread[:, :2].max(1), config.least_m, config.most_m)
-    radians = np.clip(spread[:, 2], math.radians(config.least_deg), math.radians(config.most_deg))
-    return np.stack((metres, metres, radians), axis=-1)
-
-
 def nearest_places(
     views: np.ndarray, poses: np.ndarray, windows: np.ndarray, places: Sequence[int], *, reach_m: float, apart: int,
     most: int,
