@@ -3,12 +3,15 @@
 Lost, doubled, late and unusable images are in `test_estimator_nodes.py`; here are those who publish them.
 """
 
+import itertools
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -25,7 +28,7 @@ from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.nodes.image_input import ImageInput
 from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
-from ngo_estimator.odometry.frame_pairing import PairedFrame
+from ngo_estimator.odometry.frame_pairing import FramePairing, PairedFrame
 
 from .estimator_graph import RUN_NS, STEP_NS, Graph, image_message, scan
 from .processes import Diagnostics, NodeProcess, Probe
@@ -111,6 +114,60 @@ def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Grap
     assert corrected[5] > 20.0 > corrected[4]
     graph.diagnostics.wait_for_problem("/local_node", "294 frames missing between images")
     graph.diagnostics.wait_for_problem("/ngo_node", "lost: the standard deviation of the position is")
+
+
+class Wire:
+    """An input whose messages wait until they are taken; ``then`` comes to pass while they are."""
+
+    def __init__(self, take: Callable[[int], None], then: Callable[[], None] = lambda: None) -> None:
+        self.waiting: list[int] = []
+        self._take, self._then = take, then
+
+    def take_waiting(self, most: int) -> None:
+        self._then()
+        taken, self.waiting = self.waiting[:most], self.waiting[most:]
+        for step in taken:
+            self._take(step)
+
+
+def test_an_action_that_comes_while_images_are_taken_is_not_lost() -> None:
+    """The action was published before its image, and is read before any later image calls it lost."""
+    second, pairing = 10**9, FramePairing(needs_action=True, timeout_ns=10**9, capacity=8)
+    node, seen = object.__new__(ImageInput), []
+
+    def publish_two_images() -> None:
+        actions.waiting += [0, 299]
+        images.waiting += [1, 300]
+
+    actions = Wire(lambda step: pairing.add_action(step * second, 0))
+    images = Wire(lambda step: pairing.add_frame(step * second, np.zeros(1)), publish_two_images)
+    core = SimpleNamespace(
+        restarts=0, update_all=lambda pairs: seen.extend(pair.stamp_ns // second for pair in pairs) or []
+    )
+    vars(node).update(
+        _pairing=pairing,
+        _core=core,
+        _sensor="image",
+        _status=MagicMock(),
+        _taking=False,
+        _most_at_once=0,
+        _sensor_and_side=(images, [actions]),
+    )
+    pairing.add_frame(0, np.zeros(1))
+    node._update()
+    assert seen == [0, 1, 300] and pairing.dropped == 0
+
+
+def test_gaps_in_a_burst_cost_no_frame(graph: Graph) -> None:
+    """Each frame is far beyond the timeout of the one before, so an action that is read after both seems lost."""
+    graph.start_run()
+    steps = list(range(0, 60_000, 300))
+    for step in steps:
+        if step > 0:
+            graph.action(step - 1)
+        graph.frame(step)
+    graph.wait_for_step(steps[-1])
+    assert graph.steps() == list(itertools.pairwise(steps))
 
 
 def test_reset_of_local_node_is_a_new_origin(graph: Graph) -> None:

@@ -59,7 +59,7 @@ class ImageInput:
             self._core.uses_twist,
             int(settings.twist_tolerance_s * 1e9),
         )
-        self._inputs: list[Input] = []
+        self._sensor_and_side: tuple[Input, list[Input]] | None = None
         self._taking = False
         self._most_at_once = 0
         self._missed = self._newly_missed = 0
@@ -84,7 +84,7 @@ class ImageInput:
             side.append(listening.to(DiscreteAction, settings.action_topic, self._on_action, qos))
         if self._core.uses_twist:
             side.append(listening.to(_TWISTS[settings.twist_type], settings.twist_topic, self._on_twist, qos))
-        self._inputs = [*side, sensor]  # an image that comes before its action would wait for another turn
+        self._sensor_and_side = sensor, side
 
     def _on_sensor(self, message: Any) -> None:
         stamp_ns = messages.to_ns(message.header.stamp)
@@ -117,12 +117,15 @@ class ImageInput:
 
         A node that fell behind finds several that wait, and catches up: together they cost much less.
         """
-        if self._taking:
+        if self._taking or self._sensor_and_side is None:
             return
+        sensor, side = self._sensor_and_side
         self._taking = True
         try:
-            for entry in self._inputs:
-                entry.take_waiting(AT_ONCE - 1)
+            sensor.take_waiting(AT_ONCE - 1)
+            # After the images, and all of them: what led to an image was published before it, and else seems lost.
+            for entry in side:
+                entry.take_waiting(_DEPTH)
         finally:
             self._taking = False
         dropped, restarts = self._pairing.dropped, self._core.restarts
