@@ -181,7 +181,7 @@ def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     publisher = other.node.create_publisher(RelativePose, "relative_pose", best_effort)
     try:
-        message = optimizer.wait_for_problem("/careless_odometry", "'/relative_pose'", "RELIABILITY")
+        message = optimizer.wait_for_problem("/careless_odometry", "'/relative_pose'", "best effort publisher")
         assert "nothing comes from" in message, message
         optimizer.process.wait_for_log("WARN.*nothing comes from /careless_odometry on '/relative_pose'")
     finally:

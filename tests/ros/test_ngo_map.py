@@ -1,5 +1,6 @@
 """ngo_map as a real process: fed over DDS with relative poses and trajectories, and in the graph of the 2D world."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from ngo_msgs.msg import RelativePose, Trajectory
 from ngo_msgs.srv import LoadState, SaveState
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from benchmarks.process_use import cpu_s
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose
@@ -25,7 +27,7 @@ from ngo_sim.maze2d import Maze2D
 from tests.unit.ngo_estimator.mapping.test_map_files import read_by_nav2
 from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan
 
-from .processes import NodeProcess, Probe
+from .processes import Diagnostics, NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -280,6 +282,24 @@ def test_a_bad_start_ends_with_one_line(parameters: dict[str, Any], complaint: s
     with NodeProcess("ngo_estimator", "ngo_map", parameters) as process:
         assert process.wait() == 2
         assert len(process.lines) == 1 and complaint in process.log
+
+
+def test_a_trajectory_that_waits_to_be_read_keeps_the_node_asleep() -> None:
+    with running(map_update_interval=3600.0, diagnostics_period_s=0.2) as mapper:
+        diagnostics = Diagnostics(mapper.probe)
+        mapper.drive(1, 30, poses(30))
+        diagnostics.wait_for_value("/ngo_map", "received", lambda steps: steps == "29")
+        heard, began_s, used_s = len(diagnostics.arrays("/ngo_map")), time.monotonic(), cpu_s(mapper.process.pid)
+        mapper.probe.spin_until(lambda: len(diagnostics.arrays("/ngo_map")) >= heard + 20, "more diagnostics")
+        assert cpu_s(mapper.process.pid) - used_s < 0.5 * (time.monotonic() - began_s)
+
+
+def test_a_trajectory_of_another_qos_is_named() -> None:
+    with running(diagnostics_period_s=0.2) as mapper, Probe("careless_optimizer") as other:
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        other.node.create_publisher(Trajectory, "ngo/trajectory", best_effort)
+        named = "nothing comes from /careless_optimizer on '/ngo/trajectory': QoS does not fit, best effort publisher"
+        mapper.process.wait_for_log(f"WARN.*{named}")
 
 
 def test_the_map_of_a_maze_shows_its_walls() -> None:

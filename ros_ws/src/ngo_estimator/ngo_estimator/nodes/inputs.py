@@ -4,10 +4,9 @@ from collections.abc import Callable, Hashable
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible, qos_policy_name_from_kind
-from rclpy.subscription import Subscription
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ngo_common.nodes.qos import overridable
@@ -24,18 +23,22 @@ class OtherPublisher(ValueError):
 
 
 class OnDemand(CallbackGroup):
-    """Keeps the executor from waking for messages: they wait for ``Input.take_waiting``."""
+    """Keeps the executor from waking for messages: they wait for ``Input.take_waiting``.
+
+    The executor must not wait for events of the subscription either: to rmw_fastrtps a message that waits is one, and
+    the executor would turn without end.
+    """
 
     def can_execute(self, entity: Any) -> bool:
-        """Only events of the subscription, and no messages."""
-        return not isinstance(entity, Subscription)
+        """Nothing."""
+        return False
 
     def beginning_execution(self, entity: Any) -> bool:
-        """As ``can_execute``."""
-        return self.can_execute(entity)
+        """Not what was not allowed."""
+        return False
 
     def ending_execution(self, entity: Any) -> None:
-        """Events do not exclude each other."""
+        """Nothing was begun."""
 
 
 class Input:
@@ -63,7 +66,6 @@ class Input:
         self._guard = SourceGuard(timeout_s)
         self._kind = f"message on {topic}"
         self._others = ""  # who published beside the one that is held on to, since the last call of problems()
-        self._misfit_policy = ""
         self._misfit_said = ""
         self._subscription = node.create_subscription(
             message_type,
@@ -71,7 +73,8 @@ class Input:
             self._on_message,
             qos,
             callback_group=group,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos),
+            # ``problems`` says which publishers do not fit. Each event would cost in every turn of the executor.
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=overridable(),
         )
 
@@ -92,13 +95,11 @@ class Input:
         """One line for each problem with the publishers since the last call."""
         found = [self._others] if self._others else []
         self._others = ""
-        misfits = self._misfits() if self._misfit_policy else []
-        if misfits and _UNKNOWN not in misfits:
-            names = " and ".join(misfits)
-            found.append(
-                f"nothing comes from {names} on '{self._subscription.topic_name}': "
-                f"the QoS policy {self._misfit_policy} does not fit"
-            )
+        misfits = self._misfits()
+        if misfits and not any(name == _UNKNOWN for name, _ in misfits):
+            names, reasons = (" and ".join(dict.fromkeys(texts)) for texts in zip(*misfits, strict=True))
+            topic = self._subscription.topic_name
+            found.append(f"nothing comes from {names} on '{topic}': QoS does not fit, {reasons}")
             if found[-1] != self._misfit_said:
                 self._misfit_said = found[-1]
                 self._node.get_logger().warning(self._misfit_said)
@@ -115,21 +116,22 @@ class Input:
             self._others = f"{names} publish on '{self._subscription.topic_name}': only the first that was heard counts"
         self._status.dropped(self._kind, OtherPublisher(self._others), warn=_UNKNOWN not in self._others)
 
-    def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
-        self._misfit_policy = qos_policy_name_from_kind(event.last_policy_kind)
-        self._misfit_said = ""
-
     def _publishers(self) -> list[TopicEndpointInfo]:
         return list(self._node.get_publishers_info_by_topic(self._subscription.topic_name))
 
-    def _misfits(self) -> list[str]:
-        """Names of the publishers whose QoS does not fit."""
-        own = self._subscription.qos_profile
-        return sorted(
-            _name(info)
+    def _misfits(self) -> list[tuple[str, str]]:
+        """Names of the publishers whose QoS does not fit, and why."""
+        checked = [
+            (_name(info), *qos_check_compatible(info.qos_profile, self._subscription.qos_profile))
             for info in self._publishers()
-            if qos_check_compatible(info.qos_profile, own)[0] == QoSCompatibility.ERROR
-        )
+        ]
+        return sorted((name, _plain(reason)) for name, fits, reason in checked if fits == QoSCompatibility.ERROR)
+
+
+def _plain(reason: str) -> str:
+    """ "ERROR: Best effort publisher and reliable subscription;" without what is no news."""
+    errors = [part.removeprefix("ERROR: ") for part in reason.split(";") if part.startswith("ERROR: ")]
+    return ", ".join(error[:1].lower() + error[1:] for error in errors)
 
 
 def _name(publisher: TopicEndpointInfo) -> str:
