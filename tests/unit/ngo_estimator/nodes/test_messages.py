@@ -8,7 +8,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped, Ve
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose, Trajectory
 from rclpy.serialization import deserialize_message, serialize_message
-from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.odometry.local_odometry import LocalEstimate
@@ -103,21 +102,6 @@ def test_a_trajectory_keeps_every_number() -> None:
     np.testing.assert_array_equal(message.stamps_ns, expected.stamps_ns)
     np.testing.assert_array_equal(np.column_stack((message.x, message.y, message.yaw)), expected.poses_xyyaw)
     np.testing.assert_array_equal(message.moved, expected.moved_m)
-
-
-def test_loops_are_lines_between_their_poses() -> None:
-    expected = update(loops=2)
-    message: MarkerArray = over_the_wire(messages.loop_markers(expected, "map"))
-    (marker,) = message.markers
-    assert (marker.type, marker.action, marker.header.frame_id) == (Marker.LINE_LIST, Marker.ADD, "map")
-    ends = [[point.x, point.y] for point in marker.points]
-    np.testing.assert_array_equal(ends, expected.poses_xyyaw[[0, 4, 1, 3], :2])
-    assert [color.a for color in marker.colors] == [0.25, 0.25, 1.0, 1.0]
-
-
-def test_without_loops_the_lines_are_deleted() -> None:
-    (marker,) = messages.loop_markers(update(loops=0), "map").markers
-    assert marker.action == Marker.DELETE
 
 
 def given_pose(**changes: Any) -> PoseWithCovarianceStamped:

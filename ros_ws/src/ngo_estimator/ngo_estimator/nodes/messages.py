@@ -18,9 +18,8 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import KeyScan, RelativePose, Trajectory
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
-from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_common.settings import LARGEST_POSE_M
 from ngo_estimator.geometry.planar_covariance import to_planar, to_spatial
@@ -31,7 +30,6 @@ if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import th
     from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
-_LOOP_WIDTH_M = 0.03
 _LARGEST_UNLIKENESS = 1e6  # of what float32 holds
 
 
@@ -216,19 +214,3 @@ def _singles(values: np.ndarray) -> "array[float]":
 
 def _doubles(values: np.ndarray) -> "array[float]":
     return array("d", values.astype(np.float64).tobytes())
-
-
-def loop_markers(trajectory: "WholeTrajectory", frame: str) -> MarkerArray:
-    """One line for each loop edge, opaque as its weight; without edges, markers that delete those shown."""
-    header = Header(stamp=to_time(int(trajectory.stamps_ns[-1])), frame_id=frame)
-    marker = Marker(header=header, ns="loops", type=Marker.LINE_LIST, action=Marker.ADD)
-    if len(trajectory.loops) == 0:
-        marker.action = Marker.DELETE
-        return MarkerArray(markers=[marker])
-    marker.pose.orientation.w = 1.0
-    marker.scale.x = _LOOP_WIDTH_M
-    ends = trajectory.poses_xyyaw[trajectory.loops.reshape(-1), :2].tolist()
-    marker.points = [Point(x=x, y=y) for x, y in ends]
-    opacities = np.repeat(np.clip(trajectory.loop_weights, 0.0, 1.0), 2).tolist()
-    marker.colors = [ColorRGBA(r=0.1, g=0.5, b=0.9, a=opacity) for opacity in opacities]
-    return MarkerArray(markers=[marker])

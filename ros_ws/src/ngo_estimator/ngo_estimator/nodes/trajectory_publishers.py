@@ -14,7 +14,8 @@ from rclpy.timer import Timer
 from visualization_msgs.msg import MarkerArray
 
 from ngo_common.nodes.qos import overridable
-from ngo_estimator.nodes.messages import loop_markers, trajectory_message
+from ngo_estimator.nodes.loop_message import LoopMarkerWriter
+from ngo_estimator.nodes.messages import trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.online.publication_pace import PublicationPace
@@ -42,7 +43,7 @@ class TrajectoryPublishers:
         self._node = node
         self._snapshot = snapshot
         self._frame_id = settings.framed(settings.map_frame)
-        self._writer = PathWriter(self._frame_id)
+        self._writer, self._loop_writer = PathWriter(self._frame_id), LoopMarkerWriter(self._frame_id)
         self._path = self._create(Path, settings.path_topic)
         self._trajectory = self._create(Trajectory, settings.trajectory_topic)
         self._loops = self._create(MarkerArray, settings.loops_topic)
@@ -103,7 +104,7 @@ class TrajectoryPublishers:
             elif publisher is self._trajectory:
                 publisher.publish(trajectory_message(trajectory, self._frame_id))
             else:
-                publisher.publish(loop_markers(trajectory, self._frame_id))
+                publisher.publish(self._loop_writer.write(trajectory))
 
     def _end_timer(self) -> None:
         if self._timer is not None:

@@ -55,6 +55,10 @@ _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
 
 
+_Work = tuple[str, Callable[[int], None]]
+"""A part of taking in a block: what it is called where it fails, and what does it for the block of a number."""
+
+
 @dataclass
 class _Running:
     """An optimisation in progress, of which so many results were ``taken``."""
@@ -157,7 +161,7 @@ class MetaGraph:
         self.loop_frames = np.zeros((0, 2), np.int64)
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        self._work: list[Callable[[int], None]] = []  # what is left of taking in the newest block
+        self._work: list[_Work] = []  # what is left of taking in the newest block
         self._begun = False
         self._running: _Running | None = None
         self._network_every, self._anneal_every = network_every, anneal_every
@@ -254,24 +258,28 @@ class MetaGraph:
         self._blind.append(self._blind_variance(block))
         self._work = self._all_work()
 
-    def _all_work(self) -> list[Callable[[int], None]]:
+    def _all_work(self) -> list[_Work]:
         """What is to be done for a new block before it is optimised."""
-        looks_for_overlaps = self._optimizer.config.loops and self._optimizer.config.search.overlaps > 0
-        overlaps = [self._find_again], [self._find_shared]
-        again, shared = overlaps if looks_for_overlaps else ([], [])
-        return [self._aggregate, *again, self._find_places, *shared]
+        aggregate: _Work = ("taking in a meta-pose", self._aggregate)
+        if not self._optimizer.config.loops:
+            return [aggregate]
+        parts: list[Callable[[int], None]] = [self._find_places]
+        if self._optimizer.config.search.overlaps > 0:
+            parts = [self._find_again, *parts, self._find_shared]
+        return [aggregate, *(("the search for loops", part) for part in parts)]
 
     @property
     def work(self) -> int:
         """The parts of an update: taking in a block, preparing its optimisation, and each iteration of that."""
         return len(self._all_work()) + 1 + self._optimizer.config.iterations
 
-    def _do(self, part: Callable[[int], None]) -> None:
+    def _do(self, work: _Work) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""
+        name, part = work
         try:
             part(self.blocks - 1)
         except Exception as error:  # numerics of a library, or a fault of ours
-            self.fault = _said(error, "the search for loops" if "find" in part.__name__ else "taking in a meta-pose")
+            self.fault = _said(error, name)
 
     @torch.inference_mode()
     def _settle(self) -> None:
