@@ -285,20 +285,21 @@ def test_a_bad_start_ends_with_one_line(parameters: dict[str, Any], complaint: s
 
 
 def test_a_trajectory_that_waits_to_be_read_keeps_the_node_asleep() -> None:
-    with running(map_update_interval=3600.0, diagnostics_period_s=0.2) as mapper:
+    with running("/asleep", map_update_interval=3600.0, diagnostics_period_s=0.2) as mapper:
         diagnostics = Diagnostics(mapper.probe)
         mapper.drive(1, 30, poses(30))
-        diagnostics.wait_for_value("/ngo_map", "received", lambda steps: steps == "29")
-        heard, began_s, used_s = len(diagnostics.arrays("/ngo_map")), time.monotonic(), cpu_s(mapper.process.pid)
-        mapper.probe.spin_until(lambda: len(diagnostics.arrays("/ngo_map")) >= heard + 20, "more diagnostics")
+        diagnostics.wait_for_value("/asleep/ngo_map", "received", lambda steps: steps == "29")
+        heard, began_s, used_s = len(diagnostics.arrays("/asleep/ngo_map")), time.monotonic(), cpu_s(mapper.process.pid)
+        mapper.probe.spin_until(lambda: len(diagnostics.arrays("/asleep/ngo_map")) >= heard + 20, "more diagnostics")
         assert cpu_s(mapper.process.pid) - used_s < 0.5 * (time.monotonic() - began_s)
 
 
 def test_a_trajectory_of_another_qos_is_named() -> None:
-    with running(diagnostics_period_s=0.2) as mapper, Probe("careless_optimizer") as other:
+    with running("/alone", diagnostics_period_s=0.2) as mapper, Probe("careless_optimizer") as other:
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        other.node.create_publisher(Trajectory, "ngo/trajectory", best_effort)
-        named = "nothing comes from /careless_optimizer on '/ngo/trajectory': QoS does not fit, best effort publisher"
+        other.node.create_publisher(Trajectory, "/alone/ngo/trajectory", best_effort)
+        misfit = "QoS does not fit, best effort publisher and reliable subscription"
+        named = f"nothing comes from /careless_optimizer on '/alone/ngo/trajectory': {misfit}"
         mapper.process.wait_for_log(f"WARN.*{named}")
 
 
