@@ -1,9 +1,11 @@
 """From a node class to a process: signals, exit codes, ``--help``, and one line where a start fails."""
 
 import gc
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 import rclpy
@@ -19,6 +21,7 @@ from ngo_common.settings import BadParameter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _WAIT_S = 0.1  # for a message, before the next look for a signal
+_FAST_DDS_FILE = "FASTRTPS_DEFAULT_PROFILES_FILE"  # Fast DDS's name for a file of settings
 
 NodeType = TypeVar("NodeType", bound=Node)
 
@@ -69,6 +72,8 @@ def run_node(
         if _asks_for_help(args):
             print(usage)
             return 0
+        # A file that the user names stays. Other middleware does not know the name.
+        os.environ.setdefault(_FAST_DDS_FILE, str(Path(__file__).with_name("fast_dds.xml")))
         with _argument_errors():
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         try:

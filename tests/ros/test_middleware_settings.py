@@ -1,0 +1,49 @@
+"""Nodes bring settings for Fast DDS, which must be able to read them, and keep those that a user names."""
+
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from ngo_common.nodes import process
+
+from .processes import NodeProcess
+
+pytestmark = pytest.mark.processes
+FILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+
+
+NODE_THAT_REFUSES = f"""
+import os
+from ngo_common.nodes import process
+def refuse():
+    raise process.StartError("this node does not start")
+assert process.run_node("node", refuse, "", args=["node"]) == 2
+print(os.environ["{FILE}"])
+"""
+
+
+@pytest.mark.parametrize("named", [None, "/of/the/user.xml"])
+def test_a_user_names_other_settings(named: str | None) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != FILE} | ({FILE: named} if named else {})
+    # A process of its own: one that runs a node keeps the node's handlers of signals.
+    run = subprocess.run(
+        [sys.executable, "-c", NODE_THAT_REFUSES], env=environment, capture_output=True, text=True, check=True
+    )
+    used = Path(run.stdout.strip())
+    assert used == Path(named) if named else used.is_file()
+
+
+def test_a_lost_message_is_sent_again_soon() -> None:
+    used = Path(process.__file__).with_name("fast_dds.xml")
+    space = {"": ElementTree.parse(used).getroot().tag.partition("}")[0].strip("{")}
+    period = ElementTree.parse(used).find(".//publisher[@is_default_profile='true']/times/heartbeatPeriod", space)
+    assert period is not None
+    seconds, nanoseconds = (int(period.findtext(name, "", space)) for name in ("sec", "nanosec"))
+    assert 0.01 <= seconds + 1e-9 * nanoseconds <= 0.1
+    with NodeProcess("ngo_sim", "maze2d", {"rate": 10.0}) as node:
+        node.wait_for_log("ready: ")
+        assert "XMLPARSER" not in node.log
