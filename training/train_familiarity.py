@@ -132,6 +132,8 @@ def main(arguments: Arguments) -> Familiarity:
     save_checkpoint(folder / f"{FAMILIARITY}.safetensors", familiarity, FAMILIARITY, name, details)
     limits = {kind: round(limit, 3) for kind, limit in zip(DISTANCES, familiarity.config.limits, strict=True)}
     print(f"{name}: limits {limits}, factor {disagreement}, within three deviations {shares}")
+    if missed := dishonest(shares):
+        print(f"{name}: deviations stay too small with {missed}: the largest factor, {FACTORS[-1]}, is not enough")
     return familiarity
 
 
@@ -276,6 +278,11 @@ def fit_disagreement(
         if min(shares.values()) >= _WANTED:
             return factor, shares
     return FACTORS[-1], shares
+
+
+def dishonest(shares: dict[str, float]) -> str:
+    """The faults with which too few poses are within three deviations, and their shares; empty where there are none."""
+    return ", ".join(f"{kind} ({share:.1%})" for kind, share in shares.items() if share < _WANTED)
 
 
 def _share(truth: np.ndarray, without: list[LocalEstimate], with_one: list[LocalEstimate], factor: float) -> float:

@@ -45,6 +45,7 @@ TRUE_M, TRUE_RAD = 0.6, 0.175
 
 _FIRST_SEED = 190
 """Of the optimizer's: the memory learned from those before."""
+_MOST_DRIVES = 110
 _SCALE_WEIGHT = 0.3
 _WEIGHT_DECAY = 0.1
 """With less, and with more steps, what it said of validation maps became worse."""
@@ -67,6 +68,12 @@ class Arguments:
     """Seed of the initial weights."""
     weights: Path = runs.WEIGHTS
     """Folder with doom/*.safetensors, which gets the optimizer."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.drives <= _MOST_DRIVES:
+            raise ValueError(
+                f"drives is {self.drives}; expected 1 to {_MOST_DRIVES}, since train_ranges learns from those behind"
+            )
 
 
 class Judged(NamedTuple):

@@ -7,7 +7,7 @@ from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig, l
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from tests.unit.ngo_estimator.samples import local_config, place_config
 from training.data.features import Networks
-from training.train_familiarity import Seen, fit, fit_disagreement
+from training.train_familiarity import Seen, dishonest, fit, fit_disagreement
 
 
 def _drive(config: FamiliarityConfig, steps: int = 400) -> Seen:
@@ -37,3 +37,8 @@ def test_without_a_drive_that_is_long_enough_the_factor_stays_as_it_is() -> None
     networks = Networks(LocalPoseNetwork(local_config("maze2d", actions=3)), PlaceNetworks(place_config("maze2d")))
     config = FamiliarityConfig(look_size(networks.place.encoder), networks.local.config.feature_size, 3, twist=False)
     assert fit_disagreement(networks, Familiarity(config), "maze2d", []) == (config.disagreement, {})
+
+
+def test_faults_that_stay_outside_of_their_deviations_are_named() -> None:
+    assert dishonest({"noise": 0.98, "black": 0.9}) == "black (90.0%)"
+    assert dishonest({"noise": 0.97}) == dishonest({}) == ""

@@ -1,9 +1,10 @@
 """What the judge of loops learns."""
 
+import pytest
 import torch
 
 from ngo_estimator.optimizer.loop_judge import EVIDENCE
-from training.train_loop_judge import Judged, learn
+from training.train_loop_judge import Arguments, Judged, learn
 
 
 def test_it_learns_which_loops_are_true_and_how_far_off_these_are() -> None:
@@ -15,3 +16,8 @@ def test_it_learns_which_loops_are_true_and_how_far_off_these_are() -> None:
     logit, factor = learn(loops, 200, 1e-2)(evidence)
     assert ((logit > 0.0) == true).double().mean() > 0.95
     assert factor[true & noisy, 0].mean() > factor[true & ~noisy, 0].mean() + 1.0
+
+
+def test_it_learns_from_no_drive_that_ranges_are_learned_from() -> None:
+    with pytest.raises(ValueError, match="drives is 111; expected 1 to 110"):
+        Arguments(drives=111)
