@@ -263,15 +263,15 @@ class MetaGraph:
         aggregate: _Work = ("taking in a meta-pose", self._aggregate)
         if not self._optimizer.config.loops:
             return [aggregate]
-        parts: list[Callable[[int], None]] = [self._find_places]
+        parts: list[Callable[[int], None]] = [self._look_for_places, self._measure_places]
         if self._optimizer.config.search.overlaps > 0:
             parts = [self._find_again, *parts, self._find_shared]
         return [aggregate, *(("the search for loops", part) for part in parts)]
 
     @property
     def work(self) -> int:
-        """The parts of an update: taking in a block, preparing its optimisation, and each iteration of that."""
-        return len(self._all_work()) + 1 + self._optimizer.config.iterations
+        """The parts of an update: taking in a block, and each iteration of its optimisation."""
+        return len(self._all_work()) + self._optimizer.config.iterations
 
     def _do(self, work: _Work) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""
@@ -298,10 +298,15 @@ class MetaGraph:
         if self._loops is not None and self._fresh and block - _AGAIN >= self._first:
             self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
 
-    def _find_places(self, block: int) -> None:
-        """Look for loops of the newest block."""
+    def _look_for_places(self, block: int) -> None:
+        """Look for frames like those of the newest block."""
         if self._loops is not None:
-            self._limit_drift(self._loops.find(block, self._first, self._keys))
+            self._loops.look(block, self._first, self._keys)
+
+    def _measure_places(self, block: int) -> None:
+        """Measure the loops to these frames."""
+        if self._loops is not None:
+            self._limit_drift(self._loops.measure())
 
     def _find_shared(self, block: int) -> None:
         """Look for overlaps of the newest block."""
@@ -487,7 +492,7 @@ class MetaGraph:
         self._begun, self._begun_s = True, 0.0
 
     @torch.inference_mode()
-    def _prepare(self) -> None:
+    def _prepared(self) -> _Running:
         self._make_room()
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
@@ -510,7 +515,7 @@ class MetaGraph:
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         runs_network = self._optimizer.config.network and corrections is None
-        self._running = _Running(iterations, keys, first, numbers, runs_network, solution is None)
+        return _Running(iterations, keys, first, numbers, runs_network, solution is None)
 
     def _verified(self, loops: Loops, active: np.ndarray) -> Loops:
         """The loops between the ``active`` nodes; none across a blind stretch where place codes alone tell them.
@@ -556,10 +561,9 @@ class MetaGraph:
         return self._network_is_due or self.blocks - self._annealed >= min(self._anneal_every, 1 + seen // 8)
 
     def _iterate(self) -> None:
-        """Prepare an optimisation, or run its next iteration."""
+        """Run the next iteration of an optimisation; the first one prepares it."""
         if self._running is None:
-            self._prepare()
-            return
+            self._running = self._prepared()
         self._running.result = next(self._running.iterations)
         self._running.taken += 1
 
@@ -569,7 +573,7 @@ class MetaGraph:
         if self._running is not None and self._running.result is not None:
             return self._running.result.left
         iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
-        return len(self._work) + (self._running is None) + iterations
+        return len(self._work) + iterations
 
     @torch.inference_mode()
     def advance(self, parts: int) -> bool:
@@ -719,7 +723,7 @@ class MetaGraph:
         changed.
         """
         running, code = self._running, self._origin_code
-        iterated = 0 if running is None else 1 + running.taken
+        iterated = 0 if running is None else running.taken
         known = self._corrections
         arrays = {
             "odometry": self.odometry.values,
@@ -799,12 +803,14 @@ class MetaGraph:
         work, left = self._all_work(), taken_integer(arrays, "parts_left")
         iterated = taken_integer(arrays, "iterated")
         require(left <= len(work), f"{left} parts of an update are left")
-        require(iterated <= self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
+        require(iterated < self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
         self._work = work[len(work) - left :]
         self._begun = bool(taken(arrays, "begun", np.bool_))
         require(self._begun or not iterated, "an optimisation has not begun, and iterated")
         require(not (left and iterated), "an optimisation has iterated before its time")
         with torch.inference_mode():
+            if self._work and self._work[0][1] == self._measure_places:
+                self._look_for_places(self.blocks - 1)
             for _ in range(iterated):
                 self._iterate()
 
