@@ -272,9 +272,7 @@ def fit_disagreement(
             found.append((seen_from_first(drive.poses_xyyaw)[1:], without, with_one))
     shares: dict[str, float] = {}
     for factor in FACTORS:
-        shares = {
-            kind: float(np.mean([_share(*run, factor) for run in found])) for kind, found in runs_of.items()
-        }
+        shares = {kind: float(np.mean([_share(*run, factor) for run in found])) for kind, found in runs_of.items()}
         if min(shares.values()) >= _WANTED:
             return factor, shares
     return FACTORS[-1], shares

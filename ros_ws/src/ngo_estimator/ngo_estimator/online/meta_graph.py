@@ -6,6 +6,7 @@ Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 t
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -91,6 +92,11 @@ class _Corrections:
         """Of all iterations of one optimisation."""
         arrays = (torch.cat(parts).numpy() for parts in zip(*given, strict=True))
         return cls(first, *arrays)
+
+    @cached_property
+    def at_once(self) -> "_Corrections":
+        """All adjustments at once, and the last stiffness: what is left of them in a solution."""
+        return _Corrections(self.first, self.adjustment.sum(axis=0, keepdims=True), self.stiffness[-1:])
 
     def for_blocks(self, first: int, last: int) -> list[Correction]:
         """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
@@ -497,9 +503,10 @@ class MetaGraph:
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
-        corrections = self._remembered()
+        known = None if self._network_is_due else self._corrections
+        runs_network = self._optimizer.config.network and known is None
         features = None
-        if self._optimizer.config.network and corrections is None:
+        if runs_network:
             features = torch.from_numpy(self._features.slice(first)).unsqueeze(0)
         steps = MetaSteps(
             torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, self.blocks - first
@@ -513,8 +520,10 @@ class MetaGraph:
             # Across blind stretches the poses are not those of the solution.
             if not self._annealing_is_due and not self._blind.values[first:].any():
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
+        corrections = None
+        if known is not None:
+            corrections = (known if solution is None else known.at_once).for_blocks(first, self.blocks)
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
-        runs_network = self._optimizer.config.network and corrections is None
         return _Running(iterations, keys, first, numbers, runs_network, solution is None)
 
     def _verified(self, loops: Loops, active: np.ndarray) -> Loops:
@@ -533,11 +542,6 @@ class MetaGraph:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
         nodes = self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))]
         return torch.from_numpy(all_between(nodes[:-1], nodes[1:])).unsqueeze(0)
-
-    def _remembered(self) -> list[Correction] | None:
-        """What the network gave lately; None where it is time to run it, or where there is none."""
-        known = self._corrections
-        return None if known is None or self._network_is_due else known.for_blocks(self._first, self.blocks)
 
     @property
     def _network_is_due(self) -> bool:
@@ -628,10 +632,10 @@ class MetaGraph:
         keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
-            information = result.loop_information[0].double()
-            self.loop_std = information.clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
+            information = result.loop_information[0].double().numpy()
+            self.loop_std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
             self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(running.numbers, self.loop_weights, information.numpy())
+            self._loops.weigh(running.numbers, self.loop_weights, information)
         poses = chained(result.meta_relative[-1][0].double().numpy())[1:]
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
         self._before = self._nodes.values[self._active]

@@ -301,12 +301,11 @@ class OnlineLoops:
 
     def limit_drift(self, found: KeptLoops, most_drift: np.ndarray) -> None:
         """Set how far the loops that were found last may be off at most: variances ``(n, 3)``."""
-        newest = self._kept.where(np.arange(len(self._kept) - len(found), len(self._kept)))
-        if not (np.array_equal(newest.start, found.start) and np.array_equal(newest.end, found.end)):
+        newest = slice(len(self._kept) - len(found), None)
+        joined = (self._kept.start[newest], found.start), (self._kept.end[newest], found.end)
+        if not all(np.array_equal(kept, of_found) for kept, of_found in joined):
             raise ValueError("other loops were found since; expected the loops that were found last")
-        limits = self._kept.loops.most_drift
-        assert limits is not None
-        limits[0, len(self._kept) - len(found) :] = torch.from_numpy(most_drift)
+        self._kept.most_drift[newest] = most_drift
 
     def key_frame(self, node: int, relative: np.ndarray, variance: np.ndarray) -> KeyFrame:
         """The key frame that ``node`` becomes when it leaves the window."""
@@ -380,7 +379,7 @@ class OnlineLoops:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
         kept = self._kept
         nodes = kept.start, kept.frame, kept.end
-        return _edges(self._odometry.values, *nodes, kept.measured.numpy(), numbers, self._block)
+        return _edges(self._odometry.values, *nodes, kept.measured, numbers, self._block)
 
 
 @njit(cache=True)

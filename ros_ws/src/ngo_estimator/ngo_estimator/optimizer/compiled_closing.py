@@ -31,10 +31,12 @@ _LEAST_WEIGHT = 1e-4
 
 def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | None = None) -> Loops:
     """As ``odometry_test.without_contradictions``; only the loops of these indices, by default all, are tested."""
-    relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
     valid = loops.valid.clone()
     which = np.arange(valid.shape[1]) if which is None else which
-    _test(relative, std, loops.nodes[0].numpy(), loops.measured[0].double().numpy(), which, valid[0].numpy())
+    if len(which):
+        relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
+        ends_and_measured = (of[0].numpy() for of in (loops.start, loops.end, loops.measured))
+        _test(relative, std, *ends_and_measured, which, valid[0].numpy())
     return replace(loops, valid=valid)
 
 
@@ -59,7 +61,7 @@ class _Equations:
         self._judged = np.flatnonzero(~known[used])
         self.all_weights, self.all_information = np.maximum(weights, 0.0), np.maximum(information, 0.0)
         """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
-        self.weights, self._information = self.all_weights[used], self.all_information[used]
+        self.weights, self._information = self.all_weights.take(used), self.all_information.take(used, axis=0)
         limits = loops.measured.new_full((1, count, 3), torch.inf) if loops.most_drift is None else loops.most_drift
         fields = (loops.similarity, loops.logit, loops.log_scale, loops.spread, loops.log_length)
         record = tuple(field[0].numpy() for field in (loops.start, loops.end, loops.measured, limits, *fields))
@@ -192,14 +194,15 @@ def _of(layer: nn.Linear) -> tuple[Array, Array]:
 
 
 @njit(cache=True, error_model="numpy")
-def _test(relative: Array, std: Array, nodes: Array, measured: Array, which: Array, valid: Array) -> None:
+def _test(relative: Array, std: Array, start: Array, end: Array, measured: Array, which: Array, valid: Array) -> None:
     """Take their validity from loops, of those of the indices ``which``, that contradict the odometry."""
     poses = chained(relative)
     prefix = _drifts(poses, np.maximum(std, LEAST_STD))
     residual, expected = np.empty(3), np.empty(3)
     for k in which:
-        _residual(poses, nodes[k], measured[k], residual)
-        _expected(poses, prefix, nodes[k], expected)
+        nodes = start[k], end[k] + 1
+        _residual(poses, nodes, measured[k], residual)
+        _expected(poses, prefix, nodes, expected)
         squared = 0.0
         for c in range(3):
             squared += residual[c] ** 2 / max(expected[c], LEAST_VARIANCE)
@@ -226,7 +229,7 @@ def _drifts(poses: Array, step_std: Array) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def _expected(poses: Array, prefix: Array, nodes: Array, expected: Array) -> None:
+def _expected(poses: Array, prefix: Array, nodes: Array | tuple[int, int], expected: Array) -> None:
     """What ``odometry_variances`` expect of a loop ``(3,)``, of the sums of ``_drifts``."""
     a, b = nodes
     x, y = poses[b, 0], poses[b, 1]
@@ -239,7 +242,7 @@ def _expected(poses: Array, prefix: Array, nodes: Array, expected: Array) -> Non
 
 
 @njit(cache=True, error_model="numpy")
-def _residual(poses: Array, nodes: Array, measured: Array, residual: Array) -> None:
+def _residual(poses: Array, nodes: Array | tuple[int, int], measured: Array, residual: Array) -> None:
     """As ``loop_residuals``, of one loop ``(3,)``."""
     a, b = nodes
     cos, sin = math.cos(poses[a, 2]), math.sin(poses[a, 2])
