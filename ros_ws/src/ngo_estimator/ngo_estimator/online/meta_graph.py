@@ -57,12 +57,12 @@ _LEAST_INFORMATION = 1e-12
 
 
 _Work = tuple[str, Callable[[int], None]]
-"""A part of taking in a block: what it is called where it fails, and what does it for the block of a number."""
+"""A piece of taking in a block: what it is called where it fails, and what does it for the block of a number."""
 
 
 @dataclass
 class _Running:
-    """An optimisation in progress, of which so many results were ``taken``."""
+    """An optimisation in progress, of which so many ``parts`` were done."""
 
     iterations: Iterator[OptimizedMetaPoses]
     keys: np.ndarray
@@ -70,7 +70,7 @@ class _Running:
     numbers: np.ndarray
     runs_network: bool
     anneals: bool
-    taken: int = 0
+    parts: int = 0
     result: OptimizedMetaPoses | None = None
 
     @property
@@ -167,7 +167,7 @@ class MetaGraph:
         self.loop_frames = np.zeros((0, 2), np.int64)
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        self._work: list[_Work] = []  # what is left of taking in the newest block
+        self._work: list[tuple[_Work, ...]] = []  # parts that are left of taking in the newest block
         self._begun = False
         self._running: _Running | None = None
         self._network_every, self._anneal_every = network_every, anneal_every
@@ -264,28 +264,31 @@ class MetaGraph:
         self._blind.append(self._blind_variance(block))
         self._work = self._all_work()
 
-    def _all_work(self) -> list[_Work]:
-        """What is to be done for a new block before it is optimised."""
+    def _all_work(self) -> list[tuple[_Work, ...]]:
+        """What is to be done for a new block before it is optimised, in parts of about the same length."""
         aggregate: _Work = ("taking in a meta-pose", self._aggregate)
         if not self._optimizer.config.loops:
-            return [aggregate]
-        parts: list[Callable[[int], None]] = [self._look_for_places, self._measure_places]
-        if self._optimizer.config.search.overlaps > 0:
-            parts = [self._find_again, *parts, self._find_shared]
-        return [aggregate, *(("the search for loops", part) for part in parts)]
+            return [(aggregate,)]
+        look, measure, again, shared = (
+            ("the search for loops", search)
+            for search in (self._look_for_places, self._measure_places, self._find_again, self._find_shared)
+        )
+        parts: list[tuple[_Work, ...]] = [(look,), (measure, aggregate)]
+        return [(again,), *parts, (shared,)] if self._optimizer.config.search.overlaps > 0 else parts
 
     @property
     def work(self) -> int:
-        """The parts of an update: taking in a block, and each iteration of its optimisation."""
-        return len(self._all_work()) + self._optimizer.config.iterations
+        """The parts of an update: taking in a block, preparing its optimisation, and each iteration of that."""
+        config = self._optimizer.config
+        return (self._registrations > 0) + len(self._all_work()) + config.network + config.iterations
 
-    def _do(self, work: _Work) -> None:
+    def _do(self, part: tuple[_Work, ...]) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""
-        name, part = work
-        try:
-            part(self.blocks - 1)
-        except Exception as error:  # numerics of a library, or a fault of ours
-            self.fault = _said(error, name)
+        for name, work in part:
+            try:
+                work(self.blocks - 1)
+            except Exception as error:  # numerics of a library, or a fault of ours
+                self.fault = _said(error, name)
 
     @torch.inference_mode()
     def _settle(self) -> None:
@@ -402,7 +405,7 @@ class MetaGraph:
         steps = self._optimizer.aggregate(*inputs)
         if steps.features is not None:
             self._features.replace(changed, steps.features[0, changed - start :].numpy())
-        fixed = self._near_unfamiliar(start)
+        fixed = self._near_unfamiliar(start, block + 1)
         self._fixed.replace(changed, fixed[changed - start :])
         if self._optimizer.config.smoother is not None:
             in_blocks = poses_in_blocks(inputs[0], self._block)
@@ -412,9 +415,10 @@ class MetaGraph:
             for buffer, smoothed, raw in zip(kept, (steps.relative, steps.std), own, strict=True):
                 buffer.replace(changed, torch.where(stays, raw[0], smoothed[0])[changed - start :].numpy())
 
-    def _near_unfamiliar(self, start: int) -> np.ndarray:
-        """Which blocks from number ``start`` on lie so near to an unfamiliar frame that networks would see it."""
-        unfamiliar = np.atleast_1d(~self._familiar.slice(start * self._block).reshape(-1, self._block).all(axis=1))
+    def _near_unfamiliar(self, start: int, end: int) -> np.ndarray:
+        """Which blocks ``start`` to ``end`` (not included) are so near to an unfamiliar frame that networks see it."""
+        familiar = self._familiar.slice(start * self._block, end * self._block)
+        unfamiliar = np.atleast_1d(~familiar.reshape(-1, self._block).all(axis=1))
         reach = np.arange(-self._context, self._context + 1)
         near = (np.flatnonzero(unfamiliar)[:, None] + reach).ravel()
         found = np.zeros(len(unfamiliar), np.bool_)
@@ -565,11 +569,12 @@ class MetaGraph:
         return self._network_is_due or self.blocks - self._annealed >= min(self._anneal_every, 1 + seen // 8)
 
     def _iterate(self) -> None:
-        """Run the next iteration of an optimisation; the first one prepares it."""
-        if self._running is None:
-            self._running = self._prepared()
-        self._running.result = next(self._running.iterations)
-        self._running.taken += 1
+        """Prepare an optimisation, or run its next iteration; without the network the first one goes with it."""
+        if (running := self._running) is None:
+            running = self._running = self._prepared()
+        if running.parts or not running.runs_network:
+            running.result = next(running.iterations)
+        running.parts += 1
 
     @property
     def _parts_left(self) -> int:
@@ -577,7 +582,7 @@ class MetaGraph:
         if self._running is not None and self._running.result is not None:
             return self._running.result.left
         iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
-        return len(self._work) + iterations
+        return len(self._work) + (self._running is None and not self._is_light) + iterations
 
     @torch.inference_mode()
     def advance(self, parts: int) -> bool:
@@ -590,6 +595,8 @@ class MetaGraph:
             raise RuntimeError("no optimisation has begun")
         began = time.perf_counter()
         steps_left = self._block - (len(self.odometry) - 1) % self._block
+        if self._registrations and steps_left == self._block:
+            parts -= 1  # the step that completed the block has registered it
         now = most = max(parts, -(-self._parts_left // steps_left))
         if self._is_light:  # then the last steps do several parts, as all before iterations are the heavier ones
             now = max(parts, self._parts_left - most * (steps_left - 1))
@@ -623,7 +630,7 @@ class MetaGraph:
         self._settle()
         if not self._begun:
             return False
-        while not self.advance(1):
+        while not self.advance(self.work):
             pass
         return True
 
@@ -727,7 +734,7 @@ class MetaGraph:
         changed.
         """
         running, code = self._running, self._origin_code
-        iterated = 0 if running is None else running.taken
+        iterated = 0 if running is None else running.parts
         known = self._corrections
         arrays = {
             "odometry": self.odometry.values,
@@ -807,13 +814,13 @@ class MetaGraph:
         work, left = self._all_work(), taken_integer(arrays, "parts_left")
         iterated = taken_integer(arrays, "iterated")
         require(left <= len(work), f"{left} parts of an update are left")
-        require(iterated < self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
+        require(iterated <= self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
         self._work = work[len(work) - left :]
         self._begun = bool(taken(arrays, "begun", np.bool_))
         require(self._begun or not iterated, "an optimisation has not begun, and iterated")
         require(not (left and iterated), "an optimisation has iterated before its time")
         with torch.inference_mode():
-            if self._work and self._work[0][1] == self._measure_places:
+            if self._work and self._work[0][0][1] == self._measure_places:
                 self._look_for_places(self.blocks - 1)
             for _ in range(iterated):
                 self._iterate()

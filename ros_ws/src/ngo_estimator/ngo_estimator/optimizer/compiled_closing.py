@@ -59,9 +59,8 @@ class _Equations:
             known, weights, information = solution.known, solution.weights, solution.information
         self._used = used = np.flatnonzero(np.where(known, weights >= _LEAST_WEIGHT, loops.valid[0].numpy()))
         self._judged = np.flatnonzero(~known[used])
-        self.all_weights, self.all_information = np.maximum(weights, 0.0), np.maximum(information, 0.0)
-        """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
-        self.weights, self._information = self.all_weights.take(used), self.all_information.take(used, axis=0)
+        self._before = np.maximum(weights, 0.0), np.maximum(information, 0.0)
+        self.weights, self._information = (of_all.take(used, axis=0) for of_all in self._before)
         limits = loops.measured.new_full((1, count, 3), torch.inf) if loops.most_drift is None else loops.most_drift
         fields = (loops.similarity, loops.logit, loops.log_scale, loops.spread, loops.log_length)
         record = tuple(field[0].numpy() for field in (loops.start, loops.end, loops.measured, limits, *fields))
@@ -77,7 +76,12 @@ class _Equations:
             relative, step_std, self.nodes, self._measured, self._most_drift, self._constants, self._judged,
             RobustLoopGate.ANNEALING**iteration, self._components, self._layers, self.weights, self._information,
         )  # fmt: skip
-        self.all_weights[self._used], self.all_information[self._used] = self.weights, self._information
+
+    def of_all(self) -> tuple[Array, Array]:
+        """Weights ``(n,)`` and information ``(n, 3)`` of all loops, those included that have no share."""
+        weights, information = (of_all.copy() for of_all in self._before)
+        weights[self._used], information[self._used] = self.weights, self._information
+        return weights, information
 
     def solve(self, deviation: Array, step_std: Array) -> tuple[Array, FactorisedInformation]:
         """What the steps deviate ``(n, 3)`` after a Gauss-Newton step from the poses of the last ``judge``."""
@@ -174,9 +178,7 @@ def resumed(
 
 
 def _closed(loops: Loops, of: _Equations, equations: FactorisedInformation, kind: torch.dtype) -> ClosedLoops:
-    weights, information = (
-        torch.from_numpy(values.copy()).unsqueeze(0).to(kind) for values in (of.all_weights, of.all_information)
-    )
+    weights, information = (torch.from_numpy(values).unsqueeze(0).to(kind) for values in of.of_all())
     return ClosedLoops(loops, weights, information, equations)
 
 
