@@ -171,6 +171,7 @@ class MetaGraph:
         self._begun = False
         self._running: _Running | None = None
         self._network_every, self._anneal_every = network_every, anneal_every
+        self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
         self._corrections: _Corrections | None = None
         self._begun_s = 0.0
@@ -521,8 +522,7 @@ class MetaGraph:
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
             loops = self._verified(loops, np.concatenate((keys, np.arange(first, self.blocks + 1))))
-            # Across blind stretches the poses are not those of the solution.
-            if not self._annealing_is_due and not self._blind.values[first:].any():
+            if not self._annealing_is_due:
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
         corrections = None
         if known is not None:
@@ -565,6 +565,9 @@ class MetaGraph:
     @property
     def _annealing_is_due(self) -> bool:
         """Whether all loops are to be judged anew, from the odometry on."""
+        # Across blind stretches the poses are not those of the solution, even where the window has left them behind.
+        if self._shrunk or self._blind.values[self._first :].any():
+            return True
         seen = self._annealed - self._first
         return self._network_is_due or self.blocks - self._annealed >= min(self._anneal_every, 1 + seen // 8)
 
@@ -659,6 +662,7 @@ class MetaGraph:
 
     def _shrink(self, poses: np.ndarray) -> np.ndarray:
         """Shrink corrections of the active nodes ``(n, 3)`` across blind stretches; how far the last one moved."""
+        self._shrunk = False
         if not self._blind.values.any():
             return np.zeros(3)
         active, log = self._active, self._log().odometry.values
@@ -666,7 +670,9 @@ class MetaGraph:
         ties = self._loops.ties() if self._loops is not None else (np.zeros((0, 2), np.int64), np.zeros(0))
         variance = summed_variances(self._blind.values, active)
         joined = np.searchsorted(active, ties[0])
-        shrunk = shrunk_corrections(np.vstack((np.zeros(3), poses)), odometry, variance, joined, ties[1])
+        solution = np.vstack((np.zeros(3), poses))
+        shrunk = shrunk_corrections(solution, odometry, variance, joined, ties[1])
+        self._shrunk = shrunk is not solution
         moved: np.ndarray = shrunk[-1] - poses[-1]
         poses[:] = shrunk[1:]
         return moved
@@ -745,6 +751,7 @@ class MetaGraph:
             "blind": self._blind.values,
             "recalled": np.array(self._recalled),
             "annealed": np.array(self._annealed),
+            "shrunk": np.array(self._shrunk),
             "kept": self._kept,
             "gone": self._gone,
             "active": self._active,
@@ -778,6 +785,7 @@ class MetaGraph:
         self._nodes.restore(arrays, "nodes")
         self._blind.restore(arrays, "blind")
         self._recalled, self._annealed = (taken_integer(arrays, name) for name in ("recalled", "annealed"))
+        self._shrunk = bool(taken(arrays, "shrunk", np.bool_))
         for name, rows in self._buffers().items():
             rows.restore(part(arrays, name))
         self._pose, self._covariance = (
