@@ -6,7 +6,6 @@ Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 t
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -92,11 +91,6 @@ class _Corrections:
         """Of all iterations of one optimisation."""
         arrays = (torch.cat(parts).numpy() for parts in zip(*given, strict=True))
         return cls(first, *arrays)
-
-    @cached_property
-    def at_once(self) -> "_Corrections":
-        """All adjustments at once, and the last stiffness: what is left of them in a solution."""
-        return _Corrections(self.first, self.adjustment.sum(axis=0, keepdims=True), self.stiffness[-1:])
 
     def for_blocks(self, first: int, last: int) -> list[Correction]:
         """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
@@ -274,7 +268,9 @@ class MetaGraph:
             ("the search for loops", search)
             for search in (self._look_for_places, self._measure_places, self._find_again, self._find_shared)
         )
-        parts: list[tuple[_Work, ...]] = [(look,), (measure, aggregate)]
+        parts: list[tuple[_Work, ...]] = [(aggregate,), (look, measure)]
+        if self._registrations:  # then nothing is smoothed, which takes longer than features
+            parts = [(look,), (measure, aggregate)]
         return [(again,), *parts, (shared,)] if self._optimizer.config.search.overlaps > 0 else parts
 
     @property
@@ -524,9 +520,7 @@ class MetaGraph:
             loops = self._verified(loops, np.concatenate((keys, np.arange(first, self.blocks + 1))))
             if not self._annealing_is_due:
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
-        corrections = None
-        if known is not None:
-            corrections = (known if solution is None else known.at_once).for_blocks(first, self.blocks)
+        corrections = None if known is None else known.for_blocks(first, self.blocks)
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
         return _Running(iterations, keys, first, numbers, runs_network, solution is None)
 
@@ -544,7 +538,7 @@ class MetaGraph:
 
     def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
-        nodes = self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))]
+        nodes = self._nodes.values.take(np.concatenate((keys, np.arange(first, self.blocks + 1))), axis=0)
         return torch.from_numpy(all_between(nodes[:-1], nodes[1:])).unsqueeze(0)
 
     @property
@@ -648,7 +642,7 @@ class MetaGraph:
             self._loops.weigh(running.numbers, self.loop_weights, information)
         poses = chained(result.meta_relative[-1][0].double().numpy())[1:]
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
-        self._before = self._nodes.values[self._active]
+        self._before = self._nodes.values.take(self._active, axis=0)
         moved = self._shrink(poses)
         self._nodes.values[self._active[1:]] = poses
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())

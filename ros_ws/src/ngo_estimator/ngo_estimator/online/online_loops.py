@@ -363,7 +363,7 @@ class OnlineLoops:
 
     def weighed(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What ``weigh`` was given last, of these loops; a weight is negative where it was not given any."""
-        return self._kept.weight[numbers], self._kept.information[numbers]
+        return self._kept.weight.take(numbers), self._kept.information.take(numbers, axis=0)
 
     def ties(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that each loop joins ``(n, 2)``, the earlier one first, and its last weight ``(n,)``."""

@@ -110,6 +110,15 @@ class CompiledClosing(LoopClosing):
         self._unit = correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
         self._equations = _Equations(gate, self._std, loops)
+        self._solved: FactorisedInformation | None = None
+        self._kind = steps.relative.dtype
+
+    @property
+    def closed(self) -> ClosedLoops:
+        """As ``LoopClosing.closed``, made where it is asked for."""
+        if self._solved is None:
+            return super().closed
+        return _closed(self._loops, self._equations, self._solved, self._kind)
 
     def look(self, state: GraphState, iteration: int) -> None:
         """As ``LoopClosing.look``."""
@@ -132,7 +141,7 @@ class CompiledClosing(LoopClosing):
         """As ``LoopClosing.close``."""
         step_std = _softened(self._steps, stiffness, self._odometry_noise)
         deviation, equations = self._equations.solve(state.deviation[0].double().numpy(), step_std)
-        self._closed = _closed(self._loops, self._equations, equations, state.deviation.dtype)
+        self._solved, self._kind = equations, state.deviation.dtype
         return replace(
             state,
             deviation=torch.from_numpy(deviation).unsqueeze(0),

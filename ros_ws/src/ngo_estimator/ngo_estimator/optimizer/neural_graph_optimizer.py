@@ -219,14 +219,13 @@ class NeuralGraphOptimizer(AttentionNetwork):
         corrections: Sequence[Correction] | None = None,
         solution: Solution | None = None,
     ) -> Iterator[OptimizedMetaPoses]:
-        """Run the M iterations one by one, and yield the result of ``optimize`` after each.
+        """Run the M iterations one by one, and yield the result after each; only the last one has its loops.
 
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
                 running it.
             solution: of an optimisation that took these corrections, to go on from. There is one result then, for a
                 single trajectory on the CPU without gradients. The belief in loops stays; only new ones are judged.
-                One correction will do then: all adjustments at once, and the last stiffness.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -261,7 +260,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
             state = closing.close(state, stiffness)
             results.append(state.relative.to(steps.relative.dtype))
             left = self.config.iterations - 1 - iteration
-            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made, left)
+            yield OptimizedMetaPoses(list(results), state.step_std, None if left else closing.closed, made, left)
 
     def _resumed(
         self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
@@ -269,8 +268,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
         from ngo_estimator.optimizer import compiled_closing  # see _loop_closing
 
         adjusted, stiffness = steps.relative.clone(), corrections[-1].stiffness
-        for adjustment, _ in corrections:
-            adjusted[:, steps.key_frames :] += adjustment
+        adjusted[:, steps.key_frames :] += sum(adjustment for adjustment, _ in corrections)
         if steps.fixed is not None:
             adjusted, stiffness = _without_fixed(steps.relative, adjusted, stiffness, steps.fixed)
         # Where others must agree with a new loop, all of them are looked at.
