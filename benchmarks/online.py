@@ -6,7 +6,8 @@
 What is measured runs on one core with one thread: the nodes as real processes that are fed over DDS from another core,
 the core and its peers in a process of their own. The last line is one JSON object, whose ms are by the clock; exit code
 1 where a bar is missed. "cpu" is processor time, which other processes disturb less. The longest of hundreds of frames
-is judged by it: by the clock, that is the frame in which the system did something else.
+is judged by it: by the clock, that is the frame in which the system did something else. So is an optimisation, beside
+the faster setting of iSAM2.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from rich.table import Table
 from benchmarks.core_speed import core_speed, local_core_ms
 from benchmarks.drives import CACHE
 from benchmarks.node_latency import RATE_HZ, Latencies, first_path_s, local_node, ngo_node
+from benchmarks.peers import INCREMENTAL
 from benchmarks.pinned import in_process, running_on, two_cores
 from demo.graph import GraphError
 from demo.session import Session, SessionConfig
@@ -35,7 +37,7 @@ BARS = {
     "image_to_path_p99_ms": 1000.0 / RATE_HZ,
     "image_to_path_p99_to_median": 2.5,
     "ratio_to_gtsam_lm": 1.0,
-    "ratio_to_isam2": 2.0,
+    "cpu_ratio_to_isam2_best": 2.0,
     "everything_to_gtsam_lm": 0.35,
     "cpu_longest_to_median": 3.0,
     "ngo_node_resident_mb": 350.0,
@@ -94,6 +96,7 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         cores[0], core_speed, world, arguments.seed, arguments.window, arguments.live, arguments.repeats, arguments.out
     )
     core_ms, core_cpu_ms = core.pop("core_ms"), core.pop("core_cpu_ms")
+    best = min((core[name] for name in INCREMENTAL), key=lambda times: float(times["cpu_ms"]))
     say.print(f"{world}: local_node")
     local_ms = in_process(cores[0], local_core_ms, world, arguments.seed, _LOCAL_BEFORE + arguments.live)
     local = local_node(world, arguments.seed, _LOCAL_BEFORE, arguments.live, cores, logs)
@@ -109,6 +112,8 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         "cpu_ratio_to_isam2": core["optimize"]["cpu_ms"] / core["isam2"]["cpu_ms"],
         "ratio_to_isam2_default": core["optimize"]["ms"] / core["isam2_default"]["ms"],
         "cpu_ratio_to_isam2_default": core["optimize"]["cpu_ms"] / core["isam2_default"]["cpu_ms"],
+        "ratio_to_isam2_best": core["optimize"]["ms"] / best["ms"],
+        "cpu_ratio_to_isam2_best": core["optimize"]["cpu_ms"] / best["cpu_ms"],
         "everything_to_gtsam_lm": core["update"]["ms"] / core["gtsam_lm"]["ms"],
         "cpu_everything_to_gtsam_lm": core["update"]["cpu_ms"] / core["gtsam_lm"]["cpu_ms"],
         "longest_to_median": float(np.max(core_ms) / np.median(core_ms)),
@@ -190,6 +195,7 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
         ("ratio_to_gtsam_lm", "one optimisation / LM"),
         ("ratio_to_isam2", "one optimisation / iSAM2"),
         ("ratio_to_isam2_default", "the same, relinearised at each tenth"),
+        ("ratio_to_isam2_best", "the same, the faster of both"),
         ("everything_to_gtsam_lm", "everything / LM"),
         ("longest_to_median", "the core's longest frame / its median"),
     ):

@@ -5,8 +5,9 @@ its results. ``tests.golden.make_drives`` makes the stored files anew.
 """
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,6 +104,33 @@ def test_a_stored_drive_tells_other_weights(changed: str) -> None:
     trajectory, _ = corrected(steps, OnlineTrajectory(optimizer, place.pair_head))
     distance_m, angle_rad = largest_difference(trajectory.poses_xyyaw, drive.poses)
     assert distance_m > 2.0 * TOLERANCE_M or angle_rad > 2.0 * TOLERANCE_RAD
+
+
+# Of the eight frames of a meta-pose, counted from 0.
+@pytest.mark.parametrize(("world", "frame"), [("maze2d", 3), ("maze3d", 4)])
+def test_an_update_that_goes_on_from_the_last_solution_is_done_half_a_meta_pose_later(
+    world: str, frame: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, steps = golden(world)
+    core = OnlineTrajectory.load(WEIGHTS / world, world=world, iterations_per_step=1)
+    graph, done, resumed, others = core._graph, [0], set(), set()
+    do, iterate, apply = graph._do, graph._iterate, graph._apply
+
+    def counted(work: Callable[..., None]) -> Callable[..., None]:
+        return lambda *given: (work(*given), done.append(done.pop() + 1))[0]
+
+    def applied(running: Any, *given: Any) -> np.ndarray:
+        (others if running.anneals else resumed).add((graph._log().steps) % 8)
+        return apply(running, *given)
+
+    monkeypatch.setattr(graph, "_do", counted(do))
+    monkeypatch.setattr(graph, "_iterate", counted(iterate))
+    monkeypatch.setattr(graph, "_apply", applied)
+    for step in steps:
+        done[0] = 0
+        assert not core.update(step).fault
+        assert done[0] <= (1 if world == "maze2d" else 2)  # 3D has ten parts where the network runs
+    assert resumed == {frame} and others == {7}
 
 
 # A share of the deviation of the newest pose: 7 um of 5 mm, and 6 mm of 0.17 m, were measured.

@@ -77,7 +77,8 @@ def test_huge_variances_and_unusual_codes_break_nothing(
     ("owner", "name", "complaint"),
     [
         (meta_graph, "registered_steps", "the registration of steps failed, LinAlgError: singular"),
-        (OnlineLoops, "find", "the search for loops failed, LinAlgError: singular"),
+        (OnlineLoops, "look", "the search for loops failed, LinAlgError: singular"),
+        (OnlineLoops, "measure", "the search for loops failed, LinAlgError: singular"),
         (OnlineLoops, "find_overlaps", "the search for loops failed, LinAlgError: singular"),
         (OnlineLoops, "loops", "an optimisation failed, LinAlgError: singular"),
         (NeuralGraphOptimizer, "iterate", "an optimisation failed, LinAlgError: singular"),

@@ -135,7 +135,7 @@ def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
 
 
 def test_each_step_does_one_part_of_an_update_where_that_is_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    spread = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=1)
+    spread = OnlineTrajectory(robust_graph(6), SeesPoses(), 160, 16, iterations_per_step=1)
     graph, parts = spread._graph, [0]
     do, iterate = graph._do, graph._iterate
     monkeypatch.setattr(graph, "_do", lambda part: (do(part), parts.append(parts.pop() + 1)))

@@ -225,8 +225,8 @@ def test_other_settings_weights_and_formats_are_refused(
     other = OnlineTrajectory(small_optimizer("loops"), small_pair_head(), 32, 2)
     assert refusal(folder, other).startswith(f'{path}: was saved with weights_sha256 "')
     assert refusal(folder, scans()).startswith(f"{path}: was saved with graph null; here it is ")
-    monkeypatch.setattr(saved_state, "FORMAT", 6)
-    assert refusal(folder, core) == f"{path}: is of format 5; expected 6"
+    monkeypatch.setattr(saved_state, "FORMAT", 7)
+    assert refusal(folder, core) == f"{path}: is of format 6; expected 7"
 
 
 def test_the_scans_of_a_map_are_no_session_and_neither_replaces_the_other(tmp_path: Path) -> None:

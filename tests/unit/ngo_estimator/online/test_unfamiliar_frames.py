@@ -2,14 +2,16 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.geometry.planar_motion import between
+from ngo_estimator.geometry.planar_motion import all_between, between, chained
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive, corrected, estimates
@@ -69,6 +71,33 @@ def test_behind_a_blind_stretch_a_small_correction_gives_way_to_the_odometry(wor
     moved = np.linalg.norm((trajectory.poses_xyyaw - trajectory.odometry_xyyaw)[: half - 16, :2], axis=1)
     assert moved.max() > 1e-3  # what was known before stays corrected
     assert update.covariance[0, 0] > 4.0
+
+
+def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_left_the_blind_stretch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torch.set_num_threads(1)
+    steps = estimates(GoldenDrive.load("maze3d"), LocalOdometry.load(WEIGHTS / "maze3d"))
+    unknown = np.diag([4.0, 4.0, 0.04])
+    blind = [replace(s, unlikeness=2.0, covariance=unknown) if 80 <= k < 88 else s for k, s in enumerate(steps)]
+    core = OnlineTrajectory.load(WEIGHTS / "maze3d", 96, "maze3d", 16, 1)
+    graph, iterate = core._graph, core._optimizer.iterate
+    solved, differences, behind = [np.zeros((1, 3))], [], []
+
+    def remembered(*given: Any) -> Iterator[Any]:
+        if (solution := given[-1]) is not None:
+            relative = all_between(solved[0][:-1], solved[0][1:])
+            differences.append(np.abs(solution.relative[0, : len(relative)].numpy() - relative).max())
+        for result in iterate(*given):
+            solved[0] = chained(result.meta_relative[-1][0].double().numpy())
+            yield result
+
+    monkeypatch.setattr(core._optimizer, "iterate", remembered)
+    for step in blind:
+        assert not core.update(step).fault
+        behind.append(graph._first > 11 and graph._shrunk)
+    assert any(behind) and differences
+    assert max(differences) < 1e-4
 
 
 def test_place_codes_alone_close_no_loop_across_a_blind_stretch(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from ngo_estimator.optimizer.pair_measurement import PairMeasurement
 UNWEIGHED = -1.0
 """Weight of a loop that no optimisation has seen."""
 
-_FIELDS: dict[str, tuple[type, tuple[int, ...]]] = {
+_COLUMNS: dict[str, tuple[type, tuple[int, ...]]] = {
     "start": (np.int64, ()),
     "end": (np.int64, ()),
     "frame": (np.int64, ()),
@@ -25,8 +25,10 @@ _FIELDS: dict[str, tuple[type, tuple[int, ...]]] = {
     "spread": (np.float64, (2,)),
     "logit": (np.float64, ()),
     "similarity": (np.float64, ()),
-    "valid": (np.bool_, ()),
     "most_drift": (np.float64, (3,)),
+    "overlap": (np.bool_, ()),
+    "weight": (np.float64, ()),
+    "information": (np.float64, (3,)),
 }
 """Of the record, by type and shape of a loop's row."""
 
@@ -38,23 +40,31 @@ _BELIEVED = 0.1
 class KeptLoops:
     """``n`` loops between nodes that count the blocks from the beginning of the trajectory.
 
-    ``loops`` are a batch of one, in float64, without ``embeddings``; its ``most_drift`` is infinite if the odometry
-    tells enough. ``weight`` ``(n,)`` is the optimizer's last weight, ``UNWEIGHED`` before it had one, and
-    ``information`` ``(n, 3)`` what it gave the loop; ``overlap`` ``(n,)`` says whether the loop was found by poses, not
-    by its place.
+    ``start`` and ``end`` ``(n,)`` are the earlier and the later node, ``frame`` ``(n,)`` the earlier frame, as the
+    number of steps before it. ``measured`` ``(n, 3)`` is the later node seen from the earlier one; ``log_scale``
+    ``(n, 2)``, ``spread`` ``(n, 2)``, ``logit`` ``(n,)`` and ``similarity`` ``(n,)`` are as of ``Loops``.
+    ``most_drift`` ``(n, 3)`` is infinite if the odometry tells enough; ``overlap`` ``(n,)`` says whether the loop was
+    found by poses, not by its place. ``weight`` ``(n,)`` is the optimizer's last weight, ``UNWEIGHED`` before it had
+    one, and ``information`` ``(n, 3)`` what it gave the loop.
     """
 
-    loops: Loops
-    weight: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    frame: np.ndarray
+    measured: np.ndarray
+    log_scale: np.ndarray
+    spread: np.ndarray
+    logit: np.ndarray
+    similarity: np.ndarray
+    most_drift: np.ndarray
     overlap: np.ndarray
+    weight: np.ndarray
     information: np.ndarray
 
     @classmethod
     def none(cls) -> KeptLoops:
         """No loops."""
-        nothing = np.zeros(0, np.int64)
-        measurement = PairMeasurement(torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0, 2))
-        return cls.found(nothing, 0, nothing, measurement, np.zeros(0), np.zeros(0), overlap=False)
+        return cls(*(np.zeros((0, *shape), dtype) for dtype, shape in _COLUMNS.values()))
 
     @classmethod
     def found(
@@ -69,65 +79,45 @@ class KeptLoops:
     ) -> KeptLoops:
         """Loops from the nodes ``start`` ``(n,)`` to one node ``end``, just found."""
         count = len(start)
-        loops = Loops(
-            start=_batch(start),
-            end=torch.full((1, count), end - 1),
-            frame=_batch(frame),
-            measured=measurement.measured.double().unsqueeze(0),
-            log_scale=measurement.log_scale.double().unsqueeze(0),
-            spread=measurement.spread.double().unsqueeze(0),
-            logit=_batch(logit),
-            similarity=_batch(similarity),
-            valid=torch.ones(1, count, dtype=torch.bool),
-            embeddings=torch.zeros(1, 0, 0),
-            most_drift=torch.full((1, count, 3), torch.inf, dtype=torch.float64),
+        return cls(
+            start=start,
+            end=np.full(count, end),
+            frame=frame,
+            measured=measurement.measured.double().numpy(),
+            log_scale=measurement.log_scale.double().numpy(),
+            spread=measurement.spread.double().numpy(),
+            logit=logit,
+            similarity=similarity,
+            most_drift=np.full((count, 3), np.inf),
+            overlap=np.full(count, overlap),
+            weight=np.full(count, UNWEIGHED),
+            information=np.full((count, 3), UNWEIGHED),
         )
-        return cls(loops, np.full(count, UNWEIGHED), np.full(count, overlap), np.full((count, 3), UNWEIGHED))
 
     def __len__(self) -> int:
         return len(self.weight)
 
-    @property
-    def start(self) -> np.ndarray:
-        """The earlier node of each loop ``(n,)``."""
-        return self.loops.start[0].numpy()
-
-    @property
-    def end(self) -> np.ndarray:
-        """The later node of each loop ``(n,)``."""
-        return self.loops.end[0].numpy() + 1
-
-    @property
-    def frame(self) -> np.ndarray:
-        """The earlier frame of each loop ``(n,)``, as the number of steps before it."""
-        return self.loops.frame[0].numpy()
-
-    @property
-    def measured(self) -> Tensor:
-        """The later node seen from the earlier one ``(n, 3)``, float64."""
-        return self.loops.measured[0]
-
     def where(self, which: np.ndarray) -> KeptLoops:
         """The loops of a boolean mask or of indices."""
-        loops = self.loops.where(torch.from_numpy(which))
-        return KeptLoops(loops, self.weight[which], self.overlap[which], self.information[which])
+        index = np.flatnonzero(which) if which.dtype == np.bool_ else which
+        return KeptLoops(*(column.take(index, axis=0) for column in self._columns()))
 
     def and_also(self, others: KeptLoops) -> KeptLoops:
         """These and, behind them, the others."""
-        both = [
-            (self.weight, others.weight), (self.overlap, others.overlap), (self.information, others.information)
-        ]  # fmt: skip
-        return KeptLoops(self.loops.and_also(others.loops), *(np.concatenate(pair) for pair in both))
+        return KeptLoops(*map(np.concatenate, zip(self._columns(), others._columns(), strict=True)))
+
+    def _columns(self) -> list[np.ndarray]:
+        return [getattr(self, column.name) for column in fields(self)]
 
     def best(self, numbers: np.ndarray, most: int) -> np.ndarray:
         """At most ``most`` of these loops, in their order: the likeliest, and of equal ones those measured best."""
         if len(numbers) <= most:
             return numbers
-        logit = self.loops.logit[0].numpy()[numbers]
+        logit = self.logit[numbers]
         least = np.partition(logit, -most)[-most]
         chosen, equal = logit > least, np.flatnonzero(logit == least)
         if len(equal) > 1:
-            equal = equal[np.argsort(self.loops.log_scale[0, :, 1].numpy()[numbers[equal]], kind="stable")]
+            equal = equal[np.argsort(self.log_scale[numbers[equal], 1], kind="stable")]
         chosen[equal[: most - np.count_nonzero(chosen)]] = True
         best: np.ndarray = numbers[chosen]
         return best
@@ -138,26 +128,22 @@ class KeptLoops:
         if not behind.any():
             return self
         # While nothing is optimised, the pair head's own belief decides.
-        believed = np.where(self.weight == UNWEIGHED, self.loops.logit[0].numpy() > 0.0, self.weight >= _BELIEVED)
+        believed = np.where(self.weight == UNWEIGHED, self.logit > 0.0, self.weight >= _BELIEVED)
         kept = self.best(np.flatnonzero(behind & believed), most)
         return self.where(np.concatenate((kept, np.flatnonzero(~behind))))
 
     def state(self) -> Arrays:
         """All of it, for ``from_state``."""
-        record = {name: getattr(self.loops, name)[0].numpy() for name in _FIELDS}
-        return {**record, "weight": self.weight, "overlap": self.overlap, "information": self.information}
+        return dict(zip(_COLUMNS, self._columns(), strict=True))
 
     @classmethod
     def from_state(cls, arrays: Arrays) -> KeptLoops:
         """The loops of a ``state()``; raises ``StateError``."""
-        weight = taken(arrays, "weight", np.float64, -1)
-        overlap, count = taken(arrays, "overlap", np.bool_, len(weight)), len(weight)
-        information = taken(arrays, "information", np.float64, count, 3)
-        record = {name: taken(arrays, name, dtype, count, *shape) for name, (dtype, shape) in _FIELDS.items()}
-        forward = (record["start"] >= 0) & (record["start"] <= record["end"]) & (record["frame"] >= -1)
+        count = len(taken(arrays, "weight", np.float64, -1))
+        kept = cls(*(taken(arrays, name, dtype, count, *shape) for name, (dtype, shape) in _COLUMNS.items()))
+        forward = (kept.start >= 0) & (kept.start < kept.end) & (kept.frame >= -1)
         require(bool(forward.all()), "a loop does not lead from an earlier node to a later one")
-        tensors = {name: torch.from_numpy(values).unsqueeze(0) for name, values in record.items()}
-        return cls(Loops(**tensors, embeddings=torch.zeros(1, 0, 0)), weight, overlap, information)  # type: ignore[arg-type]
+        return kept
 
     def for_optimizer(self, keys: np.ndarray, first: int, embeddings: np.ndarray) -> Loops:
         """The record in float32, numbered as the optimizer counts: key frames, and the nodes of the window behind them.
@@ -167,24 +153,27 @@ class KeptLoops:
             embeddings: of the frames at the ends of the window's blocks ``(blocks, embedding_size)``.
         """
 
-        def index(nodes: np.ndarray) -> Tensor:
-            return _batch(np.where(nodes >= first, len(keys) + nodes - first, np.searchsorted(keys, nodes)))
+        def index(nodes: np.ndarray) -> np.ndarray:
+            behind = nodes + (len(keys) - first)
+            return np.where(nodes >= first, behind, np.searchsorted(keys, nodes)) if len(keys) else behind
 
-        loops = self.loops
-        assert loops.most_drift is not None
-        return replace(
-            loops,
-            start=index(self.start),
-            end=index(self.end) - 1,
-            measured=loops.measured.float(),
-            log_scale=loops.log_scale.float(),
-            spread=loops.spread.float(),
-            logit=loops.logit.float().clamp(min=-20.0),
-            similarity=loops.similarity.float(),
+        def single(values: np.ndarray) -> Tensor:
+            return _batch(values.astype(np.float32))
+
+        return Loops(
+            start=_batch(index(self.start)),
+            end=_batch(index(self.end) - 1),
+            frame=_batch(self.frame),
+            measured=single(self.measured),
+            log_scale=single(self.log_scale),
+            spread=single(self.spread),
+            logit=single(np.maximum(self.logit, -20.0)),
+            similarity=single(self.similarity),
+            valid=torch.ones(1, len(self), dtype=torch.bool),
             embeddings=_batch(embeddings),
             by_poses=_batch(self.overlap),
             length=_batch(self.end - self.start),
-            most_drift=loops.most_drift.float(),
+            most_drift=single(self.most_drift),
         )
 
     def reattached(
@@ -201,7 +190,7 @@ class KeptLoops:
         staying = np.flatnonzero(stay)
         target = staying[np.searchsorted(staying, np.arange(len(nodes)), side="right") - 1]
         drift = np.concatenate((np.zeros((1, 3)), np.cumsum(variance, axis=0)))
-        measured, log_scale = self.measured.numpy().copy(), self.loops.log_scale[0].numpy().copy()
+        measured, log_scale = self.measured.copy(), self.log_scale.copy()
         frame, ends = self.frame.copy(), {"start": self.start.copy(), "end": self.end.copy()}
         for name, old in ends.items():
             index = np.searchsorted(nodes, old)
@@ -223,19 +212,14 @@ class KeptLoops:
             log_scale[gone] = 0.5 * np.log(np.exp(2.0 * log_scale[gone]) + scales)
             old[gone] = nodes[there]
         moved_loops = replace(
-            self.loops,
-            start=_batch(ends["start"]),
-            end=_batch(ends["end"] - 1),
-            frame=_batch(frame),
-            measured=_batch(measured),
-            log_scale=_batch(log_scale),
+            self, start=ends["start"], end=ends["end"], frame=frame, measured=measured, log_scale=log_scale
         )
         distinct = ends["start"] < ends["end"]
         # Of several loops between the same two key frames the likeliest one says nearly all.
-        order = np.lexsort((-self.loops.logit[0].numpy(), ends["end"], ends["start"]))
+        order = np.lexsort((-self.logit, ends["end"], ends["start"]))
         again = (np.diff(ends["start"][order]) == 0) & (np.diff(ends["end"][order]) == 0)
         distinct[order[1:][again & (ends["end"][order[1:]] <= nodes[-1])]] = False
-        return replace(self, loops=moved_loops).where(distinct)
+        return moved_loops.where(distinct)
 
 
 def _batch(values: np.ndarray) -> Tensor:

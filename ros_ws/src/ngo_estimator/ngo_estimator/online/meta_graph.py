@@ -56,12 +56,12 @@ _LEAST_INFORMATION = 1e-12
 
 
 _Work = tuple[str, Callable[[int], None]]
-"""A part of taking in a block: what it is called where it fails, and what does it for the block of a number."""
+"""A piece of taking in a block: what it is called where it fails, and what does it for the block of a number."""
 
 
 @dataclass
 class _Running:
-    """An optimisation in progress, of which so many results were ``taken``."""
+    """An optimisation in progress, of which so many ``parts`` were done."""
 
     iterations: Iterator[OptimizedMetaPoses]
     keys: np.ndarray
@@ -69,7 +69,7 @@ class _Running:
     numbers: np.ndarray
     runs_network: bool
     anneals: bool
-    taken: int = 0
+    parts: int = 0
     result: OptimizedMetaPoses | None = None
 
     @property
@@ -161,10 +161,11 @@ class MetaGraph:
         self.loop_frames = np.zeros((0, 2), np.int64)
         """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
         self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        self._work: list[_Work] = []  # what is left of taking in the newest block
+        self._work: list[tuple[_Work, ...]] = []  # parts that are left of taking in the newest block
         self._begun = False
         self._running: _Running | None = None
         self._network_every, self._anneal_every = network_every, anneal_every
+        self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
         self._corrections: _Corrections | None = None
         self._begun_s = 0.0
@@ -258,28 +259,33 @@ class MetaGraph:
         self._blind.append(self._blind_variance(block))
         self._work = self._all_work()
 
-    def _all_work(self) -> list[_Work]:
-        """What is to be done for a new block before it is optimised."""
+    def _all_work(self) -> list[tuple[_Work, ...]]:
+        """What is to be done for a new block before it is optimised, in parts of about the same length."""
         aggregate: _Work = ("taking in a meta-pose", self._aggregate)
         if not self._optimizer.config.loops:
-            return [aggregate]
-        parts: list[Callable[[int], None]] = [self._find_places]
-        if self._optimizer.config.search.overlaps > 0:
-            parts = [self._find_again, *parts, self._find_shared]
-        return [aggregate, *(("the search for loops", part) for part in parts)]
+            return [(aggregate,)]
+        look, measure, again, shared = (
+            ("the search for loops", search)
+            for search in (self._look_for_places, self._measure_places, self._find_again, self._find_shared)
+        )
+        parts: list[tuple[_Work, ...]] = [(aggregate,), (look, measure)]
+        if self._registrations:  # then nothing is smoothed, which takes longer than features
+            parts = [(look,), (measure, aggregate)]
+        return [(again,), *parts, (shared,)] if self._optimizer.config.search.overlaps > 0 else parts
 
     @property
     def work(self) -> int:
         """The parts of an update: taking in a block, preparing its optimisation, and each iteration of that."""
-        return len(self._all_work()) + 1 + self._optimizer.config.iterations
+        config = self._optimizer.config
+        return (self._registrations > 0) + len(self._all_work()) + config.network + config.iterations
 
-    def _do(self, work: _Work) -> None:
+    def _do(self, part: tuple[_Work, ...]) -> None:
         """Do a part; what fails may cost loops or features, and nothing else."""
-        name, part = work
-        try:
-            part(self.blocks - 1)
-        except Exception as error:  # numerics of a library, or a fault of ours
-            self.fault = _said(error, name)
+        for name, work in part:
+            try:
+                work(self.blocks - 1)
+            except Exception as error:  # numerics of a library, or a fault of ours
+                self.fault = _said(error, name)
 
     @torch.inference_mode()
     def _settle(self) -> None:
@@ -298,10 +304,15 @@ class MetaGraph:
         if self._loops is not None and self._fresh and block - _AGAIN >= self._first:
             self._loops.find_overlaps(block - _AGAIN, self._first, self._nodes.values)
 
-    def _find_places(self, block: int) -> None:
-        """Look for loops of the newest block."""
+    def _look_for_places(self, block: int) -> None:
+        """Look for frames like those of the newest block."""
         if self._loops is not None:
-            self._limit_drift(self._loops.find(block, self._first, self._keys))
+            self._loops.look(block, self._first, self._keys)
+
+    def _measure_places(self, block: int) -> None:
+        """Measure the loops to these frames."""
+        if self._loops is not None:
+            self._limit_drift(self._loops.measure())
 
     def _find_shared(self, block: int) -> None:
         """Look for overlaps of the newest block."""
@@ -391,7 +402,7 @@ class MetaGraph:
         steps = self._optimizer.aggregate(*inputs)
         if steps.features is not None:
             self._features.replace(changed, steps.features[0, changed - start :].numpy())
-        fixed = self._near_unfamiliar(start)
+        fixed = self._near_unfamiliar(start, block + 1)
         self._fixed.replace(changed, fixed[changed - start :])
         if self._optimizer.config.smoother is not None:
             in_blocks = poses_in_blocks(inputs[0], self._block)
@@ -401,9 +412,10 @@ class MetaGraph:
             for buffer, smoothed, raw in zip(kept, (steps.relative, steps.std), own, strict=True):
                 buffer.replace(changed, torch.where(stays, raw[0], smoothed[0])[changed - start :].numpy())
 
-    def _near_unfamiliar(self, start: int) -> np.ndarray:
-        """Which blocks from number ``start`` on lie so near to an unfamiliar frame that networks would see it."""
-        unfamiliar = np.atleast_1d(~self._familiar.slice(start * self._block).reshape(-1, self._block).all(axis=1))
+    def _near_unfamiliar(self, start: int, end: int) -> np.ndarray:
+        """Which blocks ``start`` to ``end`` (not included) are so near to an unfamiliar frame that networks see it."""
+        familiar = self._familiar.slice(start * self._block, end * self._block)
+        unfamiliar = np.atleast_1d(~familiar.reshape(-1, self._block).all(axis=1))
         reach = np.arange(-self._context, self._context + 1)
         near = (np.flatnonzero(unfamiliar)[:, None] + reach).ravel()
         found = np.zeros(len(unfamiliar), np.bool_)
@@ -487,14 +499,15 @@ class MetaGraph:
         self._begun, self._begun_s = True, 0.0
 
     @torch.inference_mode()
-    def _prepare(self) -> None:
+    def _prepared(self) -> _Running:
         self._make_room()
         keys, first = self._keys.nodes, self._first
         relative = np.concatenate((self._keys.relative, self._steps.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(self._keys.variance), self._std.slice(first))).astype(np.float32)
-        corrections = self._remembered()
+        known = None if self._network_is_due else self._corrections
+        runs_network = self._optimizer.config.network and known is None
         features = None
-        if self._optimizer.config.network and corrections is None:
+        if runs_network:
             features = torch.from_numpy(self._features.slice(first)).unsqueeze(0)
         steps = MetaSteps(
             torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, self.blocks - first
@@ -505,12 +518,11 @@ class MetaGraph:
         if self._loops is not None:
             loops, numbers = self._loops.loops(keys, first, self.blocks)
             loops = self._verified(loops, np.concatenate((keys, np.arange(first, self.blocks + 1))))
-            # Across blind stretches the poses are not those of the solution.
-            if not self._annealing_is_due and not self._blind.values[first:].any():
+            if not self._annealing_is_due:
                 solution = Solution(self._relative_nodes(keys, first), *self._loops.weighed(numbers))
+        corrections = None if known is None else known.for_blocks(first, self.blocks)
         iterations = self._optimizer.iterate(steps, loops, corrections, solution)
-        runs_network = self._optimizer.config.network and corrections is None
-        self._running = _Running(iterations, keys, first, numbers, runs_network, solution is None)
+        return _Running(iterations, keys, first, numbers, runs_network, solution is None)
 
     def _verified(self, loops: Loops, active: np.ndarray) -> Loops:
         """The loops between the ``active`` nodes; none across a blind stretch where place codes alone tell them.
@@ -526,13 +538,8 @@ class MetaGraph:
 
     def _relative_nodes(self, keys: np.ndarray, first: int) -> torch.Tensor:
         """Relative poses ``(1, n, 3)`` of the key frames and the window's nodes as they are."""
-        nodes = self._nodes.values[np.concatenate((keys, np.arange(first, self.blocks + 1)))]
+        nodes = self._nodes.values.take(np.concatenate((keys, np.arange(first, self.blocks + 1))), axis=0)
         return torch.from_numpy(all_between(nodes[:-1], nodes[1:])).unsqueeze(0)
-
-    def _remembered(self) -> list[Correction] | None:
-        """What the network gave lately; None where it is time to run it, or where there is none."""
-        known = self._corrections
-        return None if known is None or self._network_is_due else known.for_blocks(self._first, self.blocks)
 
     @property
     def _network_is_due(self) -> bool:
@@ -552,16 +559,19 @@ class MetaGraph:
     @property
     def _annealing_is_due(self) -> bool:
         """Whether all loops are to be judged anew, from the odometry on."""
+        # Across blind stretches the poses are not those of the solution, even where the window has left them behind.
+        if self._shrunk or self._blind.values[self._first :].any():
+            return True
         seen = self._annealed - self._first
         return self._network_is_due or self.blocks - self._annealed >= min(self._anneal_every, 1 + seen // 8)
 
     def _iterate(self) -> None:
-        """Prepare an optimisation, or run its next iteration."""
-        if self._running is None:
-            self._prepare()
-            return
-        self._running.result = next(self._running.iterations)
-        self._running.taken += 1
+        """Prepare an optimisation, or run its next iteration; without the network the first one goes with it."""
+        if (running := self._running) is None:
+            running = self._running = self._prepared()
+        if running.parts or not running.runs_network:
+            running.result = next(running.iterations)
+        running.parts += 1
 
     @property
     def _parts_left(self) -> int:
@@ -569,7 +579,7 @@ class MetaGraph:
         if self._running is not None and self._running.result is not None:
             return self._running.result.left
         iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
-        return len(self._work) + (self._running is None) + iterations
+        return len(self._work) + (self._running is None and not self._is_light) + iterations
 
     @torch.inference_mode()
     def advance(self, parts: int) -> bool:
@@ -582,6 +592,8 @@ class MetaGraph:
             raise RuntimeError("no optimisation has begun")
         began = time.perf_counter()
         steps_left = self._block - (len(self.odometry) - 1) % self._block
+        if self._registrations and steps_left == self._block:
+            parts -= 1  # the step that completed the block has registered it
         now = most = max(parts, -(-self._parts_left // steps_left))
         if self._is_light:  # then the last steps do several parts, as all before iterations are the heavier ones
             now = max(parts, self._parts_left - most * (steps_left - 1))
@@ -615,7 +627,7 @@ class MetaGraph:
         self._settle()
         if not self._begun:
             return False
-        while not self.advance(1):
+        while not self.advance(self.work):
             pass
         return True
 
@@ -624,13 +636,13 @@ class MetaGraph:
         keys, first = running.keys, running.first
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
-            information = result.loop_information[0].double()
-            self.loop_std = information.clamp(min=_LEAST_INFORMATION).rsqrt().numpy()
+            information = result.loop_information[0].double().numpy()
+            self.loop_std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
             self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(running.numbers, self.loop_weights, information.numpy())
+            self._loops.weigh(running.numbers, self.loop_weights, information)
         poses = chained(result.meta_relative[-1][0].double().numpy())[1:]
         self._active = np.concatenate((keys, np.arange(first, self.blocks + 1)))
-        self._before = self._nodes.values[self._active]
+        self._before = self._nodes.values.take(self._active, axis=0)
         moved = self._shrink(poses)
         self._nodes.values[self._active[1:]] = poses
         self._optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
@@ -644,6 +656,7 @@ class MetaGraph:
 
     def _shrink(self, poses: np.ndarray) -> np.ndarray:
         """Shrink corrections of the active nodes ``(n, 3)`` across blind stretches; how far the last one moved."""
+        self._shrunk = False
         if not self._blind.values.any():
             return np.zeros(3)
         active, log = self._active, self._log().odometry.values
@@ -651,7 +664,9 @@ class MetaGraph:
         ties = self._loops.ties() if self._loops is not None else (np.zeros((0, 2), np.int64), np.zeros(0))
         variance = summed_variances(self._blind.values, active)
         joined = np.searchsorted(active, ties[0])
-        shrunk = shrunk_corrections(np.vstack((np.zeros(3), poses)), odometry, variance, joined, ties[1])
+        solution = np.vstack((np.zeros(3), poses))
+        shrunk = shrunk_corrections(solution, odometry, variance, joined, ties[1])
+        self._shrunk = shrunk is not solution
         moved: np.ndarray = shrunk[-1] - poses[-1]
         poses[:] = shrunk[1:]
         return moved
@@ -719,7 +734,7 @@ class MetaGraph:
         changed.
         """
         running, code = self._running, self._origin_code
-        iterated = 0 if running is None else 1 + running.taken
+        iterated = 0 if running is None else running.parts
         known = self._corrections
         arrays = {
             "odometry": self.odometry.values,
@@ -730,6 +745,7 @@ class MetaGraph:
             "blind": self._blind.values,
             "recalled": np.array(self._recalled),
             "annealed": np.array(self._annealed),
+            "shrunk": np.array(self._shrunk),
             "kept": self._kept,
             "gone": self._gone,
             "active": self._active,
@@ -763,6 +779,7 @@ class MetaGraph:
         self._nodes.restore(arrays, "nodes")
         self._blind.restore(arrays, "blind")
         self._recalled, self._annealed = (taken_integer(arrays, name) for name in ("recalled", "annealed"))
+        self._shrunk = bool(taken(arrays, "shrunk", np.bool_))
         for name, rows in self._buffers().items():
             rows.restore(part(arrays, name))
         self._pose, self._covariance = (
@@ -805,6 +822,8 @@ class MetaGraph:
         require(self._begun or not iterated, "an optimisation has not begun, and iterated")
         require(not (left and iterated), "an optimisation has iterated before its time")
         with torch.inference_mode():
+            if self._work and self._work[0][0][1] == self._measure_places:
+                self._look_for_places(self.blocks - 1)
             for _ in range(iterated):
                 self._iterate()
 

@@ -23,7 +23,7 @@ from ngo_estimator.online.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, may_show_one_place
 from ngo_estimator.optimizer.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
-from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
+from ngo_estimator.optimizer.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, registered
 from ngo_estimator.optimizer.place_ambiguity import looks_like_everything, places_by_odometry
 
 MARGIN = 4
@@ -53,6 +53,21 @@ class _EarlierFrame:
     poses: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Candidates:
+    """Earlier ``frames`` that look like the one before ``node``, the views of these pairs, and what the pair head says.
+
+    ``measured`` ``(views, n, 3)``, ``log_scale`` ``(views, n, 2)`` and ``logit`` ``(views, n)`` are the pair head's.
+    """
+
+    frames: list[_EarlierFrame]
+    node: int
+    views: PairViews
+    measured: Tensor
+    log_scale: Tensor
+    logit: Tensor
+
+
 class OnlineLoops:
     """Finds and keeps the loops of a trajectory.
 
@@ -68,6 +83,7 @@ class OnlineLoops:
         self._codes = SlidingRows((pair_head.config.code_length,), np.float32, keep)
         self._embeddings = SlidingRows((pair_head.config.embedding_size,), np.float32, keep)
         self._kept = KeptLoops.none()
+        self._candidates: _Candidates | None = None
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -95,12 +111,12 @@ class OnlineLoops:
     def append(self, place_code: np.ndarray) -> None:
         """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
         self._codes.append(place_code)
-        # ``find`` embeds all frames of a block at once.
+        # ``look`` embeds all frames of a block at once.
         self._embeddings.append(np.zeros(self._pair_head.config.embedding_size, np.float32))
 
     def _embed(self, first: int) -> None:
-        """Embed the codes after the steps from number ``first`` on."""
-        codes = self._codes.slice(first)
+        """Embed the codes after the steps of the block that begins with number ``first``."""
+        codes = self._codes.slice(first, first + self._block)
         embeddings = self._pair_head.embed(torch.from_numpy(codes)).numpy()
         embeddings[~codes.any(axis=1)] = 0.0  # like nothing, not even like other such codes
         self._embeddings.replace(first, embeddings)
@@ -110,27 +126,34 @@ class OnlineLoops:
         return self._codes.slice(first)
 
     @torch.inference_mode()
-    def find(self, block: int, first: int, keys: KeyFrames) -> KeptLoops:
-        """Loops that end behind the newest block, whose number is ``block``; those from key frames last.
+    def look(self, block: int, first: int, keys: KeyFrames) -> None:
+        """Look for earlier frames like the last one of the newest block, whose number is ``block``, for ``measure``.
 
         There are none where it looks like everything (``place_ambiguity``).
 
         Args:
             first: number of the first block in the window.
         """
+        self._candidates = None
+        offsets = VIEWS[: self._search.views]
+        if frames := self._frames_alike(block, first, keys, offsets):
+            views = self._views(frames, block + 1, offsets)
+            self._candidates = _Candidates(frames, block + 1, views, *self._pair_head(views.a, views.b))
+
+    def _frames_alike(self, block: int, first: int, keys: KeyFrames, offsets: _Offsets) -> list[_EarlierFrame]:
+        """The candidates of ``look``; key frames last."""
         end, last = block + 1, block * self._block + self._block - 1
         self._embed(block * self._block)
         embedding = self._embeddings.slice(last)[0]
         if not embedding.any():
-            return KeptLoops.none()
-        offsets = VIEWS[: self._search.views]
+            return []
         in_window = np.arange(first, end - self._search.min_separation)
         frames = []
         if len(in_window):
             seen = self._embeddings.slice(first * self._block, (in_window[-1] + 1) * self._block)
             similarity = (seen @ embedding).reshape(-1, self._block)
             if self._looks_like_everything(similarity.reshape(-1), first * self._block):
-                return KeptLoops.none()
+                return []
             similarity = self._possible(similarity, in_window, last)
             for index, step, value in self._most_similar(similarity, in_window, self._search.per_pose):
                 node = int(in_window[index])
@@ -139,7 +162,27 @@ class OnlineLoops:
             similarity = self._possible(keys.embeddings @ embedding, keys.nodes, last)
             for index, step, value in self._most_similar(similarity, keys.nodes, _KEY_FRAMES_PER_POSE):
                 frames.append(self._of_key_frame(keys.frame(index), step, value, offsets))
-        found = self._measured(frames, end, offsets) if frames else KeptLoops.none()
+        return frames
+
+    @torch.inference_mode()
+    def measure(self) -> KeptLoops:
+        """Loops to the frames that ``look`` found last, measured by their places; those from key frames last."""
+        candidates, self._candidates = self._candidates, None
+        if candidates is None:
+            return KeptLoops.none()
+        frames = candidates.frames
+        told = candidates.measured, candidates.log_scale
+        measurement = registered(self._pair_head, candidates.views, *told, self._search.registrations)
+        of_frame = torch.from_numpy(np.stack([frame.pose for frame in frames])).float()
+        found = KeptLoops.found(
+            np.array([frame.node for frame in frames]),
+            candidates.node,
+            np.array([frame.frame for frame in frames]),
+            measurement._replace(measured=se2.compose(of_frame, measurement.measured)),
+            candidates.logit[0].double().numpy(),
+            np.array([frame.similarity for frame in frames]),
+            overlap=False,
+        )
         self._kept = self._kept.and_also(found)
         return found
 
@@ -194,21 +237,6 @@ class OnlineLoops:
         from_frame = np.stack([_seen_from(frame.pose, frame.poses) for frame in frames], axis=1)
         to_end = torch.from_numpy(_seen_from(odometry[at + 1], odometry[last + 1])).float().unsqueeze(1)
         return PairViews(codes, later, torch.from_numpy(from_frame).float(), to_end.expand(-1, len(frames), -1))
-
-    def _measured(self, frames: list[_EarlierFrame], node: int, offsets: _Offsets) -> KeptLoops:
-        """Loops between these frames and the one before ``node``, measured by their places."""
-        views = self._views(frames, node, offsets)
-        measurement, logit = measure_pairs(self._pair_head, views, self._search.registrations)
-        of_frame = torch.from_numpy(np.stack([frame.pose for frame in frames])).float()
-        return KeptLoops.found(
-            np.array([frame.node for frame in frames]),
-            node,
-            np.array([frame.frame for frame in frames]),
-            measurement._replace(measured=se2.compose(of_frame, measurement.measured)),
-            logit.double().numpy(),
-            np.array([frame.similarity for frame in frames]),
-            overlap=False,
-        )
 
     @torch.inference_mode()
     def find_overlaps(self, block: int, first: int, nodes: np.ndarray, keys: KeyFrames | None = None) -> KeptLoops:
@@ -273,12 +301,11 @@ class OnlineLoops:
 
     def limit_drift(self, found: KeptLoops, most_drift: np.ndarray) -> None:
         """Set how far the loops that were found last may be off at most: variances ``(n, 3)``."""
-        newest = self._kept.where(np.arange(len(self._kept) - len(found), len(self._kept)))
-        if not (np.array_equal(newest.start, found.start) and np.array_equal(newest.end, found.end)):
+        newest = slice(len(self._kept) - len(found), None)
+        joined = (self._kept.start[newest], found.start), (self._kept.end[newest], found.end)
+        if not all(np.array_equal(kept, of_found) for kept, of_found in joined):
             raise ValueError("other loops were found since; expected the loops that were found last")
-        limits = self._kept.loops.most_drift
-        assert limits is not None
-        limits[0, len(self._kept) - len(found) :] = torch.from_numpy(most_drift)
+        self._kept.most_drift[newest] = most_drift
 
     def key_frame(self, node: int, relative: np.ndarray, variance: np.ndarray) -> KeyFrame:
         """The key frame that ``node`` becomes when it leaves the window."""
@@ -336,7 +363,7 @@ class OnlineLoops:
 
     def weighed(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What ``weigh`` was given last, of these loops; a weight is negative where it was not given any."""
-        return self._kept.weight[numbers], self._kept.information[numbers]
+        return self._kept.weight.take(numbers), self._kept.information.take(numbers, axis=0)
 
     def ties(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that each loop joins ``(n, 2)``, the earlier one first, and its last weight ``(n,)``."""
@@ -352,7 +379,7 @@ class OnlineLoops:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
         kept = self._kept
         nodes = kept.start, kept.frame, kept.end
-        return _edges(self._odometry.values, *nodes, kept.measured.numpy(), numbers, self._block)
+        return _edges(self._odometry.values, *nodes, kept.measured, numbers, self._block)
 
 
 @njit(cache=True)

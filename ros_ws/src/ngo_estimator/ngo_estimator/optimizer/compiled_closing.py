@@ -31,10 +31,12 @@ _LEAST_WEIGHT = 1e-4
 
 def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | None = None) -> Loops:
     """As ``odometry_test.without_contradictions``; only the loops of these indices, by default all, are tested."""
-    relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
     valid = loops.valid.clone()
     which = np.arange(valid.shape[1]) if which is None else which
-    _test(relative, std, loops.nodes[0].numpy(), loops.measured[0].double().numpy(), which, valid[0].numpy())
+    if len(which):
+        relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
+        ends_and_measured = (of[0].numpy() for of in (loops.start, loops.end, loops.measured))
+        _test(relative, std, *ends_and_measured, which, valid[0].numpy())
     return replace(loops, valid=valid)
 
 
@@ -57,9 +59,8 @@ class _Equations:
             known, weights, information = solution.known, solution.weights, solution.information
         self._used = used = np.flatnonzero(np.where(known, weights >= _LEAST_WEIGHT, loops.valid[0].numpy()))
         self._judged = np.flatnonzero(~known[used])
-        self.all_weights, self.all_information = np.maximum(weights, 0.0), np.maximum(information, 0.0)
-        """Of all loops ``(n,)`` and ``(n, 3)``, those included that would fill the equations and change nothing."""
-        self.weights, self._information = self.all_weights[used], self.all_information[used]
+        self._before = np.maximum(weights, 0.0), np.maximum(information, 0.0)
+        self.weights, self._information = (of_all.take(used, axis=0) for of_all in self._before)
         limits = loops.measured.new_full((1, count, 3), torch.inf) if loops.most_drift is None else loops.most_drift
         fields = (loops.similarity, loops.logit, loops.log_scale, loops.spread, loops.log_length)
         record = tuple(field[0].numpy() for field in (loops.start, loops.end, loops.measured, limits, *fields))
@@ -75,7 +76,12 @@ class _Equations:
             relative, step_std, self.nodes, self._measured, self._most_drift, self._constants, self._judged,
             RobustLoopGate.ANNEALING**iteration, self._components, self._layers, self.weights, self._information,
         )  # fmt: skip
-        self.all_weights[self._used], self.all_information[self._used] = self.weights, self._information
+
+    def of_all(self) -> tuple[Array, Array]:
+        """Weights ``(n,)`` and information ``(n, 3)`` of all loops, those included that have no share."""
+        weights, information = (of_all.copy() for of_all in self._before)
+        weights[self._used], information[self._used] = self.weights, self._information
+        return weights, information
 
     def solve(self, deviation: Array, step_std: Array) -> tuple[Array, FactorisedInformation]:
         """What the steps deviate ``(n, 3)`` after a Gauss-Newton step from the poses of the last ``judge``."""
@@ -104,6 +110,15 @@ class CompiledClosing(LoopClosing):
         self._unit = correction_std.double().numpy()
         self._std = steps.std[0].double().numpy()
         self._equations = _Equations(gate, self._std, loops)
+        self._solved: FactorisedInformation | None = None
+        self._kind = steps.relative.dtype
+
+    @property
+    def closed(self) -> ClosedLoops:
+        """As ``LoopClosing.closed``, made where it is asked for."""
+        if self._solved is None:
+            return super().closed
+        return _closed(self._loops, self._equations, self._solved, self._kind)
 
     def look(self, state: GraphState, iteration: int) -> None:
         """As ``LoopClosing.look``."""
@@ -126,7 +141,7 @@ class CompiledClosing(LoopClosing):
         """As ``LoopClosing.close``."""
         step_std = _softened(self._steps, stiffness, self._odometry_noise)
         deviation, equations = self._equations.solve(state.deviation[0].double().numpy(), step_std)
-        self._closed = _closed(self._loops, self._equations, equations, state.deviation.dtype)
+        self._solved, self._kind = equations, state.deviation.dtype
         return replace(
             state,
             deviation=torch.from_numpy(deviation).unsqueeze(0),
@@ -172,9 +187,7 @@ def resumed(
 
 
 def _closed(loops: Loops, of: _Equations, equations: FactorisedInformation, kind: torch.dtype) -> ClosedLoops:
-    weights, information = (
-        torch.from_numpy(values.copy()).unsqueeze(0).to(kind) for values in (of.all_weights, of.all_information)
-    )
+    weights, information = (torch.from_numpy(values).unsqueeze(0).to(kind) for values in of.of_all())
     return ClosedLoops(loops, weights, information, equations)
 
 
@@ -192,14 +205,15 @@ def _of(layer: nn.Linear) -> tuple[Array, Array]:
 
 
 @njit(cache=True, error_model="numpy")
-def _test(relative: Array, std: Array, nodes: Array, measured: Array, which: Array, valid: Array) -> None:
+def _test(relative: Array, std: Array, start: Array, end: Array, measured: Array, which: Array, valid: Array) -> None:
     """Take their validity from loops, of those of the indices ``which``, that contradict the odometry."""
     poses = chained(relative)
     prefix = _drifts(poses, np.maximum(std, LEAST_STD))
     residual, expected = np.empty(3), np.empty(3)
     for k in which:
-        _residual(poses, nodes[k], measured[k], residual)
-        _expected(poses, prefix, nodes[k], expected)
+        nodes = start[k], end[k] + 1
+        _residual(poses, nodes, measured[k], residual)
+        _expected(poses, prefix, nodes, expected)
         squared = 0.0
         for c in range(3):
             squared += residual[c] ** 2 / max(expected[c], LEAST_VARIANCE)
@@ -226,7 +240,7 @@ def _drifts(poses: Array, step_std: Array) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def _expected(poses: Array, prefix: Array, nodes: Array, expected: Array) -> None:
+def _expected(poses: Array, prefix: Array, nodes: Array | tuple[int, int], expected: Array) -> None:
     """What ``odometry_variances`` expect of a loop ``(3,)``, of the sums of ``_drifts``."""
     a, b = nodes
     x, y = poses[b, 0], poses[b, 1]
@@ -239,7 +253,7 @@ def _expected(poses: Array, prefix: Array, nodes: Array, expected: Array) -> Non
 
 
 @njit(cache=True, error_model="numpy")
-def _residual(poses: Array, nodes: Array, measured: Array, residual: Array) -> None:
+def _residual(poses: Array, nodes: Array | tuple[int, int], measured: Array, residual: Array) -> None:
     """As ``loop_residuals``, of one loop ``(3,)``."""
     a, b = nodes
     cos, sin = math.cos(poses[a, 2]), math.sin(poses[a, 2])

@@ -119,8 +119,9 @@ class OptimizedMetaPoses:
     """The optimizer's result for a batch of meta-steps.
 
     ``meta_relative``: one ``(batch, poses, 3)`` for each iteration, first to last. ``step_std`` ``(batch, poses, 3)``:
-    the deviations with which the odometry is believed. ``closed``: the loops of the last iteration, None for an
-    optimizer without loops. ``corrections``: what the network gave in each iteration. ``left``: iterations to come.
+    the deviations with which the odometry is believed. ``closed``: the loops of the last iteration, None before it and
+    for an optimizer without loops. ``corrections``: what the network gave in each iteration. ``left``: iterations to
+    come.
     """
 
     meta_relative: list[Tensor]

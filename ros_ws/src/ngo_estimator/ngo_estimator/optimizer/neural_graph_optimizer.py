@@ -219,7 +219,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
         corrections: Sequence[Correction] | None = None,
         solution: Solution | None = None,
     ) -> Iterator[OptimizedMetaPoses]:
-        """Run the M iterations one by one, and yield the result of ``optimize`` after each.
+        """Run the M iterations one by one, and yield the result after each; only the last one has its loops.
 
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
@@ -251,31 +251,32 @@ class NeuralGraphOptimizer(AttentionNetwork):
         for iteration in range(self.config.iterations):
             closing.look(state, iteration)
             before = state.adjusted
-            optimised, stiffness = phases.optimise(state, closing.channels)
-            state, stiffness = _without_fixed(state, optimised, stiffness, steps)
+            state, stiffness = phases.optimise(state, closing.channels)
+            if steps.fixed is not None:
+                adjusted, stiffness = _without_fixed(before, state.adjusted, stiffness, steps.fixed)
+                state = replace(state, adjusted=adjusted)
             if self.config.network:
                 made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
             state = closing.close(state, stiffness)
             results.append(state.relative.to(steps.relative.dtype))
             left = self.config.iterations - 1 - iteration
-            yield OptimizedMetaPoses(list(results), state.step_std, closing.closed, made, left)
+            yield OptimizedMetaPoses(list(results), state.step_std, None if left else closing.closed, made, left)
 
     def _resumed(
         self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
     ) -> Iterator[OptimizedMetaPoses]:
         from ngo_estimator.optimizer import compiled_closing  # see _loop_closing
 
-        before = GraphState.initial(steps)
-        adjusted = before.adjusted.clone()
-        for adjustment, _ in corrections:
-            adjusted[:, steps.key_frames :] += adjustment
-        state, stiffness = _without_fixed(before, replace(before, adjusted=adjusted), corrections[-1].stiffness, steps)
+        adjusted, stiffness = steps.relative.clone(), corrections[-1].stiffness
+        adjusted[:, steps.key_frames :] += sum(adjustment for adjustment, _ in corrections)
+        if steps.fixed is not None:
+            adjusted, stiffness = _without_fixed(steps.relative, adjusted, stiffness, steps.fixed)
         # Where others must agree with a new loop, all of them are looked at.
         which = None if self.config.search.least_belief else np.flatnonzero(~solution.known)
         believed = self._judged(compiled_closing.without_contradictions(loops, steps, which), steps)
         last = self.config.iterations - 1
         return compiled_closing.resumed(
-            self.loop_gate, steps, believed, state.adjusted, stiffness, self.odometry_noise, solution, last
+            self.loop_gate, steps, believed, adjusted, stiffness, self.odometry_noise, solution, last
         )
 
     def _phases(
@@ -312,16 +313,11 @@ class NeuralGraphOptimizer(AttentionNetwork):
         return self.loop_judge.judged(loops, steps, least) if least else loops
 
 
-def _without_fixed(
-    before: GraphState, after: GraphState, stiffness: Tensor, steps: MetaSteps
-) -> tuple[GraphState, Tensor]:
-    """The state and stiffness after the phases, without adjustments of the blocks that are ``fixed``."""
-    if steps.fixed is None:
-        return after, stiffness
-    fixed = steps.fixed.unsqueeze(-1)
-    whole = nn.functional.pad(fixed, (0, 0, steps.key_frames, 0))
-    adjusted = torch.where(whole, before.adjusted, after.adjusted)
-    return replace(after, adjusted=adjusted), torch.where(fixed, torch.zeros_like(stiffness), stiffness)
+def _without_fixed(before: Tensor, after: Tensor, stiffness: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
+    """Relative poses and stiffness after the phases, without adjustments of the blocks that are ``fixed``."""
+    which = fixed.unsqueeze(-1)
+    whole = nn.functional.pad(which, (0, 0, before.shape[1] - fixed.shape[1], 0))
+    return torch.where(whole, before, after), torch.where(which, torch.zeros_like(stiffness), stiffness)
 
 
 class _NoNetwork:

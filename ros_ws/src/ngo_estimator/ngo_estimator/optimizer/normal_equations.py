@@ -25,10 +25,10 @@ class GraphStructure:
 
     def __init__(self, nodes: Array, count: int, chain: bool = False) -> None:
         self.count = count
-        nodes = _with_chain(nodes, count) if chain else nodes
-        self.blocks = BlockStructure(nodes[nodes.min(axis=1) > 0] - 1, count - 1)
+        rows, pairs = _joined(nodes, count if chain else 1)
+        self.blocks = BlockStructure(pairs, count - 1)
         """Those of the information matrix, whose row ``k`` is node ``k + 1``."""
-        self.ranks, self.place = placed(nodes - 1, self.blocks.rank, self.blocks.starts, self.blocks.rows)
+        self.ranks, self.place = placed(rows, self.blocks.rank, self.blocks.starts, self.blocks.rows)
         """Places of the factors' nodes in the order of elimination ``(factors, 2)``; -1 for node 0. Index of the block
         that joins a factor's nodes ``(factors,)``; -1 where one of them is node 0."""
 
@@ -107,13 +107,22 @@ class NormalEquations(FactorisedInformation):
 
 
 @njit(cache=True)
-def _with_chain(nodes: Array, count: int) -> Array:
-    """Nodes ``(n, 2)`` with those of factors between neighbours before them."""
-    both = np.empty((count - 1 + len(nodes), 2), np.int64)
-    for k in range(count - 1):
-        both[k] = k, k + 1
-    both[count - 1 :] = nodes
-    return both
+def _joined(nodes: Array, chain: int) -> tuple[Array, Array]:
+    """Rows of the nodes ``(n, 2)`` of all factors, -1 for node 0, and those of two rows.
+
+    Factors between the first ``chain`` nodes, neighbour to neighbour, come before the others.
+    """
+    rows = np.empty((chain - 1 + len(nodes), 2), np.int64)
+    for k in range(chain - 1):
+        rows[k] = k - 1, k
+    for k in range(len(nodes)):
+        rows[chain - 1 + k] = nodes[k, 0] - 1, nodes[k, 1] - 1
+    pairs, count = np.empty_like(rows), 0
+    for k in range(len(rows)):
+        if rows[k, 0] >= 0 and rows[k, 1] >= 0:
+            pairs[count] = rows[k]
+            count += 1
+    return rows, pairs[:count]
 
 
 @njit(cache=True)
