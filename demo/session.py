@@ -94,8 +94,8 @@ class SessionConfig:
                 "rate": float(self.rate),
                 "wait_for_subscribers": 2 + self.views,
                 "wait_for_flow_control": True,
-                # Enough for local_node to take several at once.
-                "max_in_flight": 8,
+                # Enough for local_node to take eight at once while ngo_node takes those before them.
+                "max_in_flight": 16,
             },
         )
 

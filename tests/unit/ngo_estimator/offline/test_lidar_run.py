@@ -8,7 +8,7 @@ from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.offline.lidar_run import LidarRun
-from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan

@@ -24,15 +24,33 @@ def test_registration_and_the_search_for_loops_are_compiled() -> None:
         assert function.signatures, function
 
 
-def test_the_odometry_of_a_lidar_does_without_torch() -> None:
-    program = f"""
-import sys
-from pathlib import Path
+ODOMETRY = """
 from ngo_estimator.nodes.lidar_input import LidarOdometry, warm_up_odometry
-LidarOdometry.load(Path({str(WEIGHTS / "scan")!r}), "scan")
+LidarOdometry.load(WEIGHTS, "scan")
 warm_up_odometry()
-assert "torch" not in sys.modules
 """
+TRAJECTORY = """
+from ngo_estimator.offline.warm_up_scans import warm_up_scans
+from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.online.session import Session
+warm_up_scans()
+ScanTrajectory.load(WEIGHTS, "scan")
+"""
+RECORDING = """
+from ngo_estimator.nodes import recorded_output, run_recording
+from ngo_estimator.offline.lidar_run import LidarRun
+"""
+
+
+def test_a_run_over_a_recording_does_without_matplotlib() -> None:
+    program = f"import sys\n{RECORDING}\nassert 'matplotlib' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("estimators", [ODOMETRY, TRAJECTORY, RECORDING])
+def test_the_estimators_of_a_lidar_do_without_torch(estimators: str) -> None:
+    begin = f"import sys; from pathlib import Path; WEIGHTS = Path({str(WEIGHTS / 'scan')!r})"
+    program = f"{begin}\n{estimators}\nassert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 

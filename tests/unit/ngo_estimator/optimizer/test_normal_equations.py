@@ -4,22 +4,27 @@ import numpy as np
 import pytest
 import torch
 
-from ngo_estimator.optimizer.gauss_newton import Factors, gauss_newton_step, node_covariance
+from ngo_estimator.optimizer.gauss_newton import Factors, gauss_newton_step, node_covariance, normal_blocks
 from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
 from tests.unit.ngo_estimator.optimizer.test_gauss_newton import BLOCKS, random_graph, with_whole_information
 from tests.unit.ngo_estimator.samples import optimized, small_optimizer, trajectory_inputs
 
 
-def equations(factors: list[Factors]) -> NormalEquations:
-    nodes = torch.cat([f.nodes[0] for f in factors]).numpy()
-    return NormalEquations(factors, GraphStructure(nodes, BLOCKS + 1))
+def equations(factors: list[Factors], structure: GraphStructure | None = None) -> NormalEquations:
+    nodes, hessian, gradient = (part[0].numpy() for part in normal_blocks(factors))
+    return NormalEquations(hessian, gradient, structure or GraphStructure(nodes, BLOCKS + 1))
+
+
+def assert_same_step(sparse: NormalEquations, factors: list[Factors], rtol: float = 1e-9) -> None:
+    dense = gauss_newton_step(factors, BLOCKS + 1)[0].numpy()
+    np.testing.assert_allclose(sparse.solution(), dense, rtol=rtol, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_steps_and_covariances_are_the_dense_ones(seed: int) -> None:
     _, factors = random_graph(seed)
     sparse = equations(factors)
-    assert torch.allclose(sparse.solution(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
+    assert_same_step(sparse, factors)
     for node in (1, 5, BLOCKS):
         expected = node_covariance(factors, BLOCKS + 1, node)[0].numpy()
         np.testing.assert_allclose(sparse.covariance([node]), expected, rtol=1e-8, atol=1e-14)
@@ -30,7 +35,7 @@ def test_whole_information_is_solved_as_by_the_dense_solver(seed: int) -> None:
     _, factors = random_graph(seed)
     factors = with_whole_information(factors)
     sparse = equations(factors)
-    assert torch.allclose(sparse.solution(), gauss_newton_step(factors, BLOCKS + 1), rtol=1e-9, atol=1e-12)
+    assert_same_step(sparse, factors)
     expected = node_covariance(factors, BLOCKS + 1, BLOCKS)[0].numpy()
     np.testing.assert_allclose(sparse.covariance([BLOCKS]), expected, rtol=1e-8, atol=1e-14)
 
@@ -54,8 +59,7 @@ def test_one_structure_serves_all_steps_of_an_optimisation() -> None:
             factors[0],
             Factors(factors[1].nodes, factors[1].jacobian, factors[1].residual, gain * factors[1].information),
         ]
-        step = NormalEquations(weaker, structure).solution()
-        assert torch.allclose(step, gauss_newton_step(weaker, BLOCKS + 1), rtol=1e-8, atol=1e-12)
+        assert_same_step(equations(weaker, structure), weaker, rtol=1e-8)
 
 
 @pytest.mark.parametrize("form", ["loops", "gauss_newton"])

@@ -116,13 +116,16 @@ def test_the_linearisation_is_that_of_the_residuals() -> None:
     one = RelativePoses.of_covariances(
         np.array([[0, 1]]), generator.normal(0.0, 1.0, (1, 3)), (root @ root.T + np.eye(3))[None]
     )
-    jacobian = one.factors(poses).jacobian[0, 0].numpy()
+    slopes = np.empty((3, 6))
     for k in range(6):
         moved = [poses.copy(), poses.copy()]
         for sign, each in zip((1.0, -1.0), moved, strict=True):
             each.reshape(-1)[k] += sign * 1e-6
-        slope = -(one.residuals(moved[0]) - one.residuals(moved[1]))[0] / 2e-6
-        np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-6)
+        slopes[:, k] = -(one.residuals(moved[0]) - one.residuals(moved[1]))[0] / 2e-6
+    weight, residual = 0.7, one.residuals(poses)[0]
+    hessian, gradient = one.equations(poses, np.array([weight]))
+    np.testing.assert_allclose(hessian[0], weight * slopes.T @ slopes, atol=1e-5)
+    np.testing.assert_allclose(gradient[0], weight * slopes.T @ residual, atol=1e-5)
 
 
 def test_a_covariance_must_be_positive_definite() -> None:

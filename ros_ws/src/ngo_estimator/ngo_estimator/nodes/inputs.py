@@ -59,9 +59,14 @@ class Input:
         identity: Callable[[Any], Hashable],
         timeout_s: float,
         group: CallbackGroup | None = None,
+        at_once: int = 1,
     ) -> None:
-        """Have ``callback`` called with each message; ``identity`` gives the source that a message names."""
+        """Have ``callback`` called with each message; ``identity`` gives the source that a message names.
+
+        A node that fell behind takes up to ``at_once`` messages in one turn of the executor.
+        """
         self._node, self._status = node, status
+        self._behind = at_once - 1
         self._callback, self._identity = callback, identity
         self._guard = SourceGuard(timeout_s)
         self._kind = f"message on {topic}"
@@ -81,7 +86,7 @@ class Input:
     def take_waiting(self, most: int) -> None:
         """Take up to ``most`` of the messages that wait, without another turn of the executor for each."""
         for message, info in waiting_messages(self._subscription, most):
-            self._on_message(message, info)
+            self._take(message, info)
 
     def close(self) -> None:
         """End the subscription."""
@@ -106,6 +111,11 @@ class Input:
         return found
 
     def _on_message(self, message: Any, info: dict[str, Any]) -> None:
+        """Take a message, and those that wait behind it."""
+        self._take(message, info)
+        self.take_waiting(self._behind)
+
+    def _take(self, message: Any, info: dict[str, Any]) -> None:
         publishers, identity = self._subscription.get_publisher_count(), self._identity(message)
         received_ns, sequence = info["received_timestamp"], info.get("publication_sequence_number")
         if self._guard.admits(publishers, identity, sequence, received_ns):

@@ -27,11 +27,17 @@ class Listening:
         callback: Callable[[Any], None],
         qos: QoSProfile,
         group: CallbackGroup | None = None,
+        at_once: int = 1,
     ) -> Input:
-        """Take the messages of one publisher; their frames, where they have any, tell publishers apart."""
+        """Take the messages of one publisher; their frames, where they have any, tell publishers apart.
+
+        A node that fell behind takes up to ``at_once`` messages in one turn of the executor.
+        """
 
         take = self._safe(topic, callback)
-        made = Input(self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s, group)
+        made = Input(
+            self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s, group, at_once
+        )
         self._inputs.append(made)
         return made
 

@@ -91,25 +91,15 @@ class NgoMap(Node):
         self._publisher = MapPublisher(self, settings.map_topic, settings.framed(settings.map_frame))
         self._listening = Listening(self, self._status, settings.source_timeout_s)
         steps = QoSProfile(depth=settings.relative_pose_depth)
-        self._steps = self._listening.to(RelativePose, settings.relative_pose_topic, self._on_relative_poses, steps)
-        self._taking = False
+        self._listening.to(
+            RelativePose, settings.relative_pose_topic, self._on_relative_pose, steps, at_once=_AT_ONCE
+        )
         # The newest trajectory says all that those before it said.
         # It is taken when the map follows it, and not at each of its changes.
         newest = QoSProfile(depth=1)
         self._newest = self._listening.to(
             Trajectory, settings.trajectory_topic, self._on_trajectory, newest, OnDemand()
         )
-
-    def _on_relative_poses(self, message: RelativePose) -> None:
-        """Take a message, and those that wait behind it."""
-        self._on_relative_pose(message)
-        if self._taking:
-            return
-        self._taking = True
-        try:
-            self._steps.take_waiting(_AT_ONCE - 1)
-        finally:
-            self._taking = False
 
     def _on_relative_pose(self, message: RelativePose) -> None:
         try:

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 NAME = "ngo_node"
 _DEPTH = 100
 _SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
+_AT_ONCE = 8  # relative poses that are taken where the node fell behind
 _PENDING_S = 1.0
 _SEARCH_LINE_S = 10.0
 _STARTS = 80  # relative poses until compiled functions are loaded
@@ -138,6 +139,7 @@ class NgoNode(ManagedNode):
                 self._on_relative_pose,
                 lambda message: messages.to_ns(message.origin_stamp),
                 settings.source_timeout_s,
+                at_once=_AT_ONCE,
             )
             listening.callback(steps.close)
             initial = self.create_subscription(

@@ -38,7 +38,8 @@ from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_topics
 if TYPE_CHECKING:
     from ngo_estimator.odometry.local_odometry import LocalOdometry
     from ngo_estimator.offline.lidar_run import LidarRun
-    from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, RecordingRun
+    from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
+    from ngo_estimator.offline.recording_run import RecordingRun
 
     Started = tuple[str, RecordingTopics, RecordingRun | LidarRun, Iterator[RecordedStep | RecordedRun]]
 
@@ -178,7 +179,7 @@ def _write(
 ) -> list[dict[str, Any]]:
     """Run over all frames; for each trajectory the folder of its results and how many poses it has."""
     from ngo_estimator.nodes.recorded_output import PART, RecordedOutput
-    from ngo_estimator.offline.recording_run import RecordedStep
+    from ngo_estimator.offline.recorded import RecordedStep
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     found: list[dict[str, Any]] = []
@@ -249,7 +250,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     from ngo_estimator.geometry.scan_points import Mounting
     from ngo_estimator.odometry.lidar_odometry import LidarOdometry
     from ngo_estimator.offline.lidar_run import LidarRun
-    from ngo_estimator.offline.recording_run import Truth
+    from ngo_estimator.offline.recorded import Truth
     from ngo_estimator.online.scan_trajectory import ScanTrajectory
     from ngo_recordings.frames import frames as frames_of
     from ngo_recordings.lidar_description import describe_lidar

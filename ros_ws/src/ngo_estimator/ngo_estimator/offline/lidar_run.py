@@ -7,7 +7,7 @@ from typing import Any
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
-from ngo_estimator.offline.recording_run import RecordedRun, RecordedStep, Truth
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds

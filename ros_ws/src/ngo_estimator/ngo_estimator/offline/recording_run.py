@@ -1,50 +1,27 @@
 """Both estimators over the frames of a recording, as the live nodes compute without their middleware (no ROS here)."""
 
-from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ngo_estimator.data.observations import observation
-from ngo_estimator.data.relative_step import RESTART_AFTER_NS, UNFAMILIAR, RelativeStep
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, UNFAMILIAR
 from ngo_estimator.odometry.familiarity_watch import NOT_FITTED
 from ngo_estimator.odometry.frame_pairing import FramePairing, PairedFrame
 from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
-from ngo_estimator.trajectory.files import SpatialPoses, seconds
+from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.frames import Frame
 
 _REASONS: dict[type[ValueError], str] = {
     DuplicateFrame: "the stamp came twice",
     LateFrame: "older than the frame before",
 }
-
-
-@dataclass(frozen=True)
-class RecordedStep:
-    """What came out of one frame: its motion since the frame before, and the trajectory after it."""
-
-    local: RelativeStep
-    update: TrajectoryUpdate
-
-
-@dataclass(frozen=True)
-class RecordedRun:
-    """A whole trajectory, and the truth about its frames, where there is any.
-
-    ``truth_residual`` ``(frames, 3)`` is what the projection to the plane leaves out of the truth (z m, roll rad, pitch
-    rad). ``walls`` ``(n, 2)``: points of a lidar's scans at corrected poses.
-    """
-
-    trajectory: Trajectory
-    truth: SpatialPoses | None
-    truth_residual: np.ndarray
-    walls: np.ndarray | None = None
 
 
 class RecordingRun:
@@ -179,7 +156,7 @@ class RecordingRun:
         self.rejected[reason] += 1
         self.examples.setdefault(reason, example)
 
-    def _finished(self, truth: "Truth") -> Iterator[RecordedStep | RecordedRun]:
+    def _finished(self, truth: Truth) -> Iterator[RecordedStep | RecordedRun]:
         """The last steps of the trajectory that ends here, and the whole of it, if there is one."""
         yield from self._steps()
         self._online.finish()
@@ -188,28 +165,3 @@ class RecordingRun:
         self._online.reset()
         if trajectory is not None:
             yield RecordedRun(trajectory, *truth.poses())
-
-
-class Truth:
-    """The true poses of the frames of one trajectory, a few bytes each."""
-
-    def __init__(self) -> None:
-        self._stamps_ns = array("q")
-        self._values = array("d")
-
-    def add(self, frame: Frame) -> None:
-        """Take the true pose of a frame, where it is known."""
-        if frame.pose_xyyaw is not None:
-            residual = np.zeros(3) if frame.pose_residual is None else frame.pose_residual
-            self._stamps_ns.append(frame.stamp_ns)
-            self._values.extend((*frame.pose_xyyaw, *residual))
-
-    def __len__(self) -> int:
-        return len(self._stamps_ns)
-
-    def poses(self) -> tuple[SpatialPoses | None, np.ndarray]:
-        """All of them, and what their projection to the plane leaves out ``(frames, 3)``."""
-        values = np.array(self._values).reshape(-1, 6)
-        if len(values) == 0:
-            return None, values[:, 3:]
-        return SpatialPoses.from_planar(np.array(self._stamps_ns), values[:, :3]), values[:, 3:]

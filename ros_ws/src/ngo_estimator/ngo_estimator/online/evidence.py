@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_arrays import compose
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.online.sightings import Sightings
 
@@ -78,7 +77,7 @@ class HypothesisWindow:
 
     def move(self, relative: np.ndarray, covariance: np.ndarray) -> None:
         """Carry the sightings over a step ``(3,)`` with its covariance ``(3, 3)``."""
-        self._since = composed(self._since, relative)
+        self._since = compose(self._since, relative)
         self._covariance = propagate(self._covariance, self._since, relative, covariance)
         self._way_m = self._way_m + np.hypot(relative[0], relative[1])
 
@@ -96,7 +95,7 @@ class HypothesisWindow:
         columns = zip(*((s.poses, s.covariance, s.belief) for s in self._sightings), strict=True)
         poses, covariance, belief = (np.concatenate(column) for column in columns)
         since = self._since[look]
-        poses = composed(poses, since)
+        poses = compose(poses, since)
         return Hypotheses(poses, propagate(covariance, poses, since, self._covariance[look]), belief, look)
 
 
@@ -154,12 +153,6 @@ def fused(
     result = pose + mean
     result[2] = _wrapped(result[2])
     return result, np.linalg.inv(total)
-
-
-def composed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """``se2.compose`` of arrays."""
-    result: np.ndarray = se2.compose(torch.from_numpy(a), torch.from_numpy(np.asarray(b, np.float64))).numpy()
-    return result
 
 
 def _variances(covariance: np.ndarray) -> np.ndarray:

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry.planar_arrays import compose
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.online.evidence import (
     Hypotheses,
     HypothesisWindow,
     Mode,
     agreeing,
-    composed,
     fused,
     strongest_modes,
     support,
@@ -129,12 +129,12 @@ class Localiser:
 
     def _move(self, relative: np.ndarray, covariance: np.ndarray) -> None:
         """Carry everything over a step."""
-        self._odometry = composed(self._odometry, relative)
+        self._odometry = compose(self._odometry, relative)
         self._way_m += float(np.hypot(relative[0], relative[1]))
         self._turn_rad += abs(float(relative[2]))
         self._window.move(relative, covariance)
         if self._track is not None:
-            pose = composed(self._track[0], relative)
+            pose = compose(self._track[0], relative)
             self._track = pose, propagate(self._track[1], pose, relative, covariance)
 
     def _look(self) -> None:

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_arrays import compose, inverse
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.online.localisation import Localisation, Localiser
 from ngo_estimator.online.step_log import StepLog
@@ -58,6 +57,5 @@ class MapLocalisation:
         found = self._localiser.update(step, taken.relative.astype(np.float64), bounded(taken.covariance))
         map_from_odom = None
         if found.pose_xyyaw is not None:
-            odom = torch.from_numpy(step.tf_odom_xyyaw)
-            map_from_odom = se2.compose(torch.from_numpy(found.pose_xyyaw), se2.inverse(odom)).numpy()
+            map_from_odom = compose(found.pose_xyyaw, inverse(step.tf_odom_xyyaw))
         return LocalisedStep(found, map_from_odom, taken.restarted, taken.gap)

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from ngo_estimator.data.state_arrays import Arrays, taken
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_arrays import compose, inverse
 from ngo_estimator.geometry.planar_motion import turned_covariance
 
 
@@ -32,8 +31,7 @@ class MapOrigin:
         cls, start_from_base_xyyaw: np.ndarray, map_from_base_xyyaw: np.ndarray, covariance: np.ndarray | None = None
     ) -> "MapOrigin":
         """A pose of the trajectory, ``start_from_base_xyyaw``, is ``map_from_base_xyyaw`` in ``map``."""
-        given, own = torch.tensor(map_from_base_xyyaw), torch.tensor(start_from_base_xyyaw)
-        map_from_start = se2.compose(given, se2.inverse(own)).numpy()
+        map_from_start = compose(map_from_base_xyyaw, inverse(start_from_base_xyyaw))
         return cls(map_from_start, map_from_base_xyyaw, np.zeros((3, 3)) if covariance is None else covariance)
 
     def state(self) -> Arrays:
@@ -50,14 +48,12 @@ class MapOrigin:
         """Poses ``(..., 3)`` of the trajectory, in ``map``."""
         if not self.map_from_start_xyyaw.any():
             return poses_xyyaw
-        origin = torch.from_numpy(self.map_from_start_xyyaw)
-        return np.asarray(se2.compose(origin, torch.tensor(poses_xyyaw)).numpy())
+        return compose(self.map_from_start_xyyaw, poses_xyyaw)
 
     def own(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A pose ``(3,)`` in ``map``, and its covariance ``(3, 3)`` along its axes, as the trajectory has both."""
-        origin = torch.from_numpy(self.map_from_start_xyyaw)
-        own = se2.compose(se2.inverse(origin), torch.tensor(pose_xyyaw)).numpy()
-        return own, turned_covariance(-float(origin[2]), covariance)
+        own = compose(inverse(self.map_from_start_xyyaw), pose_xyyaw)
+        return own, turned_covariance(-float(self.map_from_start_xyyaw[2]), covariance)
 
     def covariance_of(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Covariance ``(3, 3)`` in ``map`` of a pose ``(3,)`` in ``map``, with that in the trajectory's own frame.

@@ -9,12 +9,11 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry import planar_arrays
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded, propagate
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
@@ -363,25 +362,21 @@ class ScanGraph:
         nodes = (self._nodes.values if nodes is None else nodes).copy()
         if before:  # nodes that came since follow the last of those
             last = len(self._before) - 1
-            moved = torch.from_numpy(nodes[last:].copy())
+            since = planar_arrays.between(nodes[last], nodes[last:])
             nodes[: last + 1] = self._before
-            since = se2.between(moved[:1], moved)
-            nodes[last:] = se2.compose(torch.from_numpy(self._before[-1:]), since).numpy()
-        odometry, at = torch.from_numpy(self.odometry.values), self._frames.values
-        starts, ends = torch.from_numpy(nodes), odometry[torch.from_numpy(at)]
-        segment = torch.from_numpy(np.searchsorted(at, np.arange(len(odometry)), side="right") - 1)
-        within = se2.between(ends[segment], odometry)
-        bent = torch.zeros_like(starts)
-        bent[:-1] = se2.between(starts[:-1], starts[1:]) - se2.between(ends[:-1], ends[1:])
-        bent[:, 2] = se2.wrap(bent[:, 2])
-        first = torch.from_numpy(at)[segment]
-        length = torch.ones(len(nodes), dtype=torch.float64)
-        length[:-1] = torch.from_numpy(np.diff(at).astype(np.float64))
-        share = (torch.arange(len(odometry), dtype=torch.float64) - first) / length[segment]
+            nodes[last:] = planar_arrays.compose(self._before[-1], since)
+        odometry, at = self.odometry.values, self._frames.values
+        starts, ends = nodes, odometry[at]
+        frames = np.arange(len(odometry))
+        segment = np.searchsorted(at, frames, side="right") - 1
+        within = planar_arrays.between(ends[segment], odometry)
+        bent = np.zeros_like(starts)
+        bent[:-1] = planar_arrays.between(starts[:-1], starts[1:]) - planar_arrays.between(ends[:-1], ends[1:])
+        bent[:, 2] = planar_arrays.wrap(bent[:, 2])
+        share = (frames - at[segment]) / np.append(np.diff(at), 1)[segment]
         ends_at = np.append(at[1:], -1)  # the motion that nobody saw is the one that is corrected
-        share[torch.from_numpy(np.isin(ends_at, self._joins.values))[segment]] = 0.0
-        poses: np.ndarray = se2.compose(starts[segment], within + share.unsqueeze(-1) * bent[segment]).numpy()
-        return poses
+        share[np.isin(ends_at, self._joins.values)[segment]] = 0.0
+        return planar_arrays.compose(starts[segment], within + share[:, None] * bent[segment])
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from ngo_estimator.data.relative_step import (
     LARGEST_ODOMETRY,
@@ -15,7 +14,7 @@ from ngo_estimator.data.relative_step import (
 )
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_arrays import between, compose, inverse
 
 
 @dataclass(frozen=True)
@@ -111,10 +110,10 @@ class StepLog:
             LateStep: it is not newer than the last one. Nothing has changed.
         """
         self.check_later(step)
-        laid = se2.compose(torch.from_numpy(self.last_odom), torch.from_numpy(relative))
-        self._moved = se2.compose(laid, se2.inverse(torch.from_numpy(step.odom_xyyaw))).numpy()
+        laid = compose(self.last_odom, relative)
+        self._moved = compose(laid, inverse(step.odom_xyyaw))
         self._origin_stamp_ns = step.origin_stamp_ns
-        self._append(step.stamp_ns, laid.numpy(), covariance)
+        self._append(step.stamp_ns, laid, covariance)
         return TakenStep(relative, covariance, begins=False, restarted=False, gap=False, joins=True)
 
     def check_later(self, step: RelativeStep) -> None:
@@ -134,10 +133,7 @@ class StepLog:
 
     def _laid(self, odom_xyyaw: np.ndarray) -> np.ndarray:
         """A pose ``(3,)`` of the present odometry, as ``odometry`` has it."""
-        if not self._moved.any():
-            return odom_xyyaw
-        laid: np.ndarray = se2.compose(torch.from_numpy(self._moved), torch.from_numpy(odom_xyyaw)).numpy()
-        return laid
+        return compose(self._moved, odom_xyyaw) if self._moved.any() else odom_xyyaw
 
     def state(self) -> Arrays:
         """All of it, for ``restore``."""
@@ -168,13 +164,11 @@ class StepLog:
 
         The covariance of the step stands for all that were lost, in proportion to the time that they took.
         """
-        odom = torch.from_numpy(np.stack((self.last_odom, self._laid(step.odom_xyyaw))))
+        relative = between(self.last_odom, self._laid(step.odom_xyyaw))
         longer = (step.stamp_ns - last_ns) / (step.stamp_ns - step.from_stamp_ns)
-        return se2.between(odom[0], odom[1]).numpy(), step.covariance * max(longer, 1.0)
+        return relative, step.covariance * max(longer, 1.0)
 
     def _begin(self, step: RelativeStep) -> None:
         self._origin_stamp_ns = step.origin_stamp_ns
-        odom = torch.from_numpy(step.odom_xyyaw)
-        before = se2.compose(odom, se2.inverse(torch.from_numpy(step.relative_xyyaw)))
         self.stamps_ns.append(step.from_stamp_ns)
-        self.odometry.append(before.numpy())
+        self.odometry.append(compose(step.odom_xyyaw, inverse(step.relative_xyyaw)))

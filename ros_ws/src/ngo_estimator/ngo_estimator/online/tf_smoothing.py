@@ -3,10 +3,9 @@
 import math
 
 import numpy as np
-import torch
 
 from ngo_estimator.data.state_arrays import Arrays, taken, taken_integer
-from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_arrays import compose, inverse
 
 
 class SmoothedCorrection:
@@ -55,8 +54,7 @@ class SmoothedCorrection:
 
 def _moved(from_xyyaw: np.ndarray, to_xyyaw: np.ndarray, base_xyyaw: np.ndarray, share: float) -> np.ndarray:
     """The transform that puts ``base`` at this share of the way from where one puts it to where the other does."""
-    base = torch.tensor(base_xyyaw)
-    start, end = (se2.compose(torch.tensor(transform), base).numpy() for transform in (from_xyyaw, to_xyyaw))
+    start, end = compose(from_xyyaw, base_xyyaw), compose(to_xyyaw, base_xyyaw)
     way = end - start
     way[2] = math.remainder(way[2], math.tau)
-    return np.asarray(se2.compose(torch.from_numpy(start + share * way), se2.inverse(base)).numpy())
+    return compose(start + share * way, inverse(base_xyyaw))

@@ -12,9 +12,7 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
-
-RELATIVE_JITTER = 1e-12
-"""Share of itself that is added to the diagonal: rounding over some hundred poses can take as much from it."""
+from ngo_estimator.optimizer.normal_equations import RELATIVE_JITTER
 
 
 @dataclass(frozen=True)

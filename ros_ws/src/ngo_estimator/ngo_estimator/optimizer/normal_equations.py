@@ -6,13 +6,13 @@ The factors of some hundred poses fill a few per cent of the matrix.
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numba import njit
-from torch import Tensor
 
 from ngo_estimator.data.state_arrays import Arrays, require, taken
 from ngo_estimator.optimizer.block_cholesky import Array, BlockCholesky, BlockStructure, placed
-from ngo_estimator.optimizer.gauss_newton import RELATIVE_JITTER, Factors, normal_blocks
+
+RELATIVE_JITTER = 1e-12
+"""Share of itself that is added to the diagonal: rounding over some hundred poses can take as much from it."""
 
 
 class GraphStructure:
@@ -92,18 +92,25 @@ class FactorisedInformation:
 
 
 class NormalEquations(FactorisedInformation):
-    """The factorised normal equations of one graph, at the poses where its factors were linearised."""
+    """The factorised normal equations of one graph, at the poses where its factors were linearised.
 
-    def __init__(self, factors: Sequence[Factors], structure: GraphStructure) -> None:
-        """Sum the factors of a batch of one; raises ``ArithmeticError`` where a pose has no factor at all."""
-        _, hessian, gradient = (blocks[0].numpy() for blocks in normal_blocks(factors))
+    Args:
+        hessian, gradient: the part of each factor in them, a matrix ``(factors, 6, 6)`` and a right hand side
+            ``(factors, 6)`` of its two nodes.
+        structure: of these factors.
+
+    Raises:
+        ArithmeticError: a pose has no factor at all.
+    """
+
+    def __init__(self, hessian: Array, gradient: Array, structure: GraphStructure) -> None:
         diagonal, lower, self._right = structure.empty()
         _add_all(structure.ranks, structure.place, hessian, gradient, diagonal, lower, self._right)
         super().__init__(structure.blocks, diagonal, lower)
 
-    def solution(self) -> Tensor:
-        """Changes ``(1, count, 3)`` of all poses, float64; node 0 stays where it is."""
-        return torch.from_numpy(self.step(self._right.copy())).unsqueeze(0)
+    def solution(self) -> Array:
+        """Changes ``(count, 3)`` of all poses; node 0 stays where it is."""
+        return self.step(self._right.copy())
 
 
 @njit(cache=True)

@@ -8,10 +8,8 @@ gated since registration can be wrong and sure of it: the graph may break there 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.gauss_newton import Factors
+from ngo_estimator.geometry.planar_arrays import between, wrap
 from ngo_estimator.optimizer.normal_equations import GraphStructure, NormalEquations
 
 _LEAST_STEP = 1e-4
@@ -44,14 +42,16 @@ class RelativePoses:
 
     def residuals(self, poses: np.ndarray) -> np.ndarray:
         """Whitened residuals ``(n, 3)``, measured less predicted, under poses ``(nodes, 3)``."""
-        start, end = (torch.from_numpy(poses[self.nodes[:, k]]) for k in (0, 1))
-        off = torch.from_numpy(self.relative) - se2.between(start, end)
-        off[:, 2] = se2.wrap(off[:, 2])
-        whitened: np.ndarray = (self.root @ off.numpy()[..., None])[..., 0]
+        off = self.relative - between(poses[self.nodes[:, 0]], poses[self.nodes[:, 1]])
+        off[:, 2] = wrap(off[:, 2])
+        whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
         return whitened
 
-    def factors(self, poses: np.ndarray, weights: np.ndarray | None = None) -> Factors:
-        """Linearised factors, a batch of one; ``weights`` ``(n,)`` multiply the information."""
+    def equations(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Their part in the normal equations at these poses, as ``NormalEquations`` takes it.
+
+        ``weights`` ``(n,)`` multiply the information.
+        """
         start, end = (poses[self.nodes[:, k]] for k in (0, 1))
         cos, sin = np.cos(start[:, 2]), np.sin(start[:, 2])
         x, y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
@@ -60,9 +60,9 @@ class RelativePoses:
         jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, -cos, -cos * x - sin * y
         jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
         jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = cos, sin, -sin, cos
-        information = np.ones((len(self.nodes), 3)) if weights is None else np.repeat(weights[:, None], 3, axis=1)
-        parts = (self.nodes, self.root @ jacobian, self.residuals(poses), information)
-        return Factors(*(torch.from_numpy(np.ascontiguousarray(part)).unsqueeze(0) for part in parts))
+        whitened = self.root @ jacobian
+        weighted = (weights[:, None, None] * whitened).mT
+        return weighted @ whitened, (weighted @ self.residuals(poses)[..., None])[..., 0]
 
 
 class ScanPoseGraph:
@@ -91,11 +91,7 @@ class ScanPoseGraph:
     def iterate(self) -> None:
         """Gate the loops by their residuals, and take a step that lowers the cost."""
         self.weights = self._gates * self._kernel_weights(self._loops)
-        factors = [
-            self._steps.factors(self.poses, self._kernel_weights(self._steps)),
-            self._loops.factors(self.poses, self.weights),
-        ]
-        step = NormalEquations(factors, self._structure).solution()[0].numpy()
+        step = self._equations(self._steps).solution()
         for _ in range(_HALVINGS):
             poses = self.poses + step
             cost = self._total(poses)
@@ -111,11 +107,16 @@ class ScanPoseGraph:
 
     def covariance(self, steps: RelativePoses, node: int) -> np.ndarray:
         """Covariance ``(3, 3)`` of a node's pose where the steps are known as well as ``steps`` say."""
-        factors = [
-            steps.factors(self.poses, self._kernel_weights(self._steps)),
-            self._loops.factors(self.poses, self.weights),
-        ]
-        return NormalEquations(factors, self._structure).covariance([node])
+        return self._equations(steps).covariance([node])
+
+    def _equations(self, steps: RelativePoses) -> NormalEquations:
+        """Those of ``steps`` and of the loops, at the present poses and weights."""
+        parts = (
+            steps.equations(self.poses, self._kernel_weights(self._steps)),
+            self._loops.equations(self.poses, self.weights),
+        )
+        hessian, gradient = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return NormalEquations(hessian, gradient, self._structure)
 
     def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
         squared = (measured.residuals(self.poses) ** 2).sum(1)
