@@ -18,6 +18,7 @@ setup(
         *((f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*.*"))) for folder in FOLDERS),
     ],
     install_requires=[
+        "matplotlib",
         "ngo_common",
         "ngo_recordings",
         "numba",

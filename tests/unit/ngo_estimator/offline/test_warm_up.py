@@ -42,11 +42,6 @@ from ngo_estimator.offline.lidar_run import LidarRun
 """
 
 
-def test_a_run_over_a_recording_does_without_matplotlib() -> None:
-    program = f"import sys\n{RECORDING}\nassert 'matplotlib' not in sys.modules"
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 @pytest.mark.parametrize("estimators", [ODOMETRY, TRAJECTORY, RECORDING])
 def test_the_estimators_of_a_lidar_do_without_torch(estimators: str) -> None:
     begin = f"import sys; from pathlib import Path; WEIGHTS = Path({str(WEIGHTS / 'scan')!r})"

@@ -4,14 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
-
-from ngo_estimator.trajectory.panel import BLACK, SIZE, Panel
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 TRUTH = "#1f6fd6"
 _COLORS = ("#2ca02c", "#ff7f0e", "#9467bd", "#d62728")
 _MOST_POINTS = 20_000
-_TITLE = 30  # height of the title (pixels)
 
 
 def save_plot(
@@ -28,34 +27,32 @@ def save_plot(
         truth: poses ``(frames, 3)`` in the same frame.
         walls: points ``(n, 2)`` of all scans at the last estimate's poses.
     """
-    paths = {name: _thinned(poses) for name, poses in estimates.items()}
-    true = None if truth is None else _thinned(truth)
-    shown = [*paths.values(), *([] if true is None else [true])]
-    panels = []
-    for (name, way), color in zip(paths.items(), _COLORS, strict=False):
-        panel = Panel(name, shown)
-        if true is not None:
-            panel.line(true, TRUTH, label="truth")
-            panel.dot(true[-1], TRUTH)
-        panel.line(way, color, label=name)
-        panel.dot(way[-1], color)
-        panel.dot(way[0], BLACK, "start")
-        panels.append(panel)
+    count = len(estimates) + (walls is not None)
+    figure = Figure(figsize=(6.2 * count, 6.2))
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, count, sharex=walls is None, sharey=walls is None, squeeze=False)[0]
     if walls is not None:
-        newest = list(paths.values())[-1]
-        panel = Panel("all scans at corrected poses", [walls, newest])
-        panel.cloud(walls)
-        panel.line(newest, _COLORS[1], 1.0)
-        panels.append(panel)
-    picture = Image.new("RGB", (SIZE * len(panels), SIZE + _TITLE), "white")
-    for k, panel in enumerate(panels):
-        picture.paste(panel.picture(), (SIZE * k, _TITLE))
-    middle = (picture.width / 2, _TITLE / 2 + 4)
-    ImageDraw.Draw(picture).text(middle, title, BLACK, ImageFont.load_default(18), "mm")
-    picture.save(path)
+        # One dot a point: a wall that is drawn twice shows at once.
+        panels[-1].plot(walls[:, 0], walls[:, 1], ",", color="black", alpha=0.35)
+        panels[-1].plot(*list(estimates.values())[-1][:, :2].T, color=_COLORS[1], linewidth=0.6, alpha=0.7)
+        panels[-1].set_aspect("equal", adjustable="box")
+        panels[-1].set(title="all scans at corrected poses", xlabel="x (m)")
+    for axes, (name, poses), color in zip(panels, estimates.items(), _COLORS, strict=False):
+        if truth is not None:
+            _draw(axes, truth, TRUTH, "truth")
+        _draw(axes, poses, color, name)
+        axes.plot(*poses[0, :2], "o", color="black", label="start", zorder=5)
+        axes.set_aspect("equal", adjustable="box")
+        axes.set(title=name, xlabel="x (m)")
+        axes.grid(color="#dddddd", linewidth=0.5)
+        axes.legend(frameon=False, fontsize=8)
+    panels[0].set_ylabel("y (m)")
+    figure.subplots_adjust(wspace=0.05)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
-def _thinned(poses: np.ndarray) -> np.ndarray:
-    """Positions ``(n, 2)`` of at most about ``_MOST_POINTS`` poses, the last one among them."""
-    every = max(1, len(poses) // _MOST_POINTS)
-    return np.concatenate((poses[:-1:every, :2], poses[-1:, :2]))
+def _draw(axes: Axes, poses: np.ndarray, color: str, label: str) -> None:
+    shown = poses[:: max(1, len(poses) // _MOST_POINTS)]
+    axes.plot(shown[:, 0], shown[:, 1], color=color, linewidth=1.3, label=label)
+    axes.plot(*poses[-1, :2], "X", color=color, markeredgecolor="black", zorder=5)
