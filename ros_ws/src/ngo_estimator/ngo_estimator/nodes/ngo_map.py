@@ -91,9 +91,7 @@ class NgoMap(Node):
         self._publisher = MapPublisher(self, settings.map_topic, settings.framed(settings.map_frame))
         self._listening = Listening(self, self._status, settings.source_timeout_s)
         steps = QoSProfile(depth=settings.relative_pose_depth)
-        self._listening.to(
-            RelativePose, settings.relative_pose_topic, self._on_relative_pose, steps, at_once=_AT_ONCE
-        )
+        self._listening.to(RelativePose, settings.relative_pose_topic, self._on_relative_pose, steps, at_once=_AT_ONCE)
         # The newest trajectory says all that those before it said.
         # It is taken when the map follows it, and not at each of its changes.
         newest = QoSProfile(depth=1)

@@ -35,8 +35,8 @@ def without_contradictions(loops: Loops, steps: MetaSteps, which: Array | None =
     which = np.arange(valid.shape[1]) if which is None else which
     if len(which):
         relative, std = steps.relative[0].double().numpy(), steps.std[0].double().numpy()
-        ends_and_measured = (of[0].numpy() for of in (loops.start, loops.end, loops.measured))
-        _test(relative, std, *ends_and_measured, which, valid[0].numpy())
+        start, end, measured = (of[0].numpy() for of in (loops.start, loops.end, loops.measured))
+        _test(relative, std, start, end, measured, which, valid[0].numpy())
     return replace(loops, valid=valid)
 
 
