@@ -37,7 +37,7 @@ def test_a_user_names_other_settings(named: str | None) -> None:
     assert used == Path(named) if named else used.is_file()
 
 
-def test_a_lost_message_is_sent_again_soon() -> None:
+def test_fast_dds_reads_a_short_heartbeat() -> None:
     used = Path(process.__file__).with_name("fast_dds.xml")
     space = {"": ElementTree.parse(used).getroot().tag.partition("}")[0].strip("{")}
     period = ElementTree.parse(used).find(".//publisher[@is_default_profile='true']/times/heartbeatPeriod", space)

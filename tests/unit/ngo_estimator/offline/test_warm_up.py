@@ -49,6 +49,11 @@ def test_the_estimators_of_a_lidar_do_without_torch(estimators: str) -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
+def test_the_odometry_of_networks_does_without_the_compiler() -> None:
+    program = "import sys; from ngo_estimator.odometry import local_odometry; assert 'numba' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 @pytest.mark.parametrize("world", ["maze2d", "maze3d"])
 def test_all_that_an_update_of_the_shipped_networks_runs_is_compiled(world: str) -> None:
     online = OnlineTrajectory.load(WEIGHTS / world, 2000, world, 128, 1)

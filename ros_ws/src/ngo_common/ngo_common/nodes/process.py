@@ -59,7 +59,7 @@ def run_node(
     """
     # rclpy's own handlers end the context from another thread while this one publishes, which now and then ends in a
     # crash, and so does an exception that a handler raises while rclpy makes a node or takes a message. These handlers
-    # only leave a note. It is read once the node is made, and between any two messages.
+    # only leave a note. It is read once the node is made, and between turns of a few messages.
     node, signalled = None, False
 
     def note(*_: object) -> None:

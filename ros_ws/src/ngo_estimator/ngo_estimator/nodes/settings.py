@@ -140,7 +140,7 @@ class NgoNodeSettings(EstimatorSettings):
     )
     iterations_per_step: int = setting(
         1,
-        "Iterations of an optimisation at each relative pose, which spreads its time; 0: all of them at the relative "
+        "Parts of an optimisation at each relative pose, which spreads its time; 0: all of them at the relative "
         "pose that completes a meta-pose.",
         minimum=0,
         maximum=100,

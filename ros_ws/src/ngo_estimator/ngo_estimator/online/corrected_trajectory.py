@@ -61,7 +61,7 @@ class PoseGraph(Protocol):
         """Begin to optimise."""
 
     def advance(self, iterations: int) -> bool:
-        """Run so many iterations; returns whether the optimisation is done."""
+        """Do so many parts of the update; returns whether it is done."""
 
     def finish(self) -> bool:
         """Optimise what is left; returns whether there was anything."""
@@ -88,8 +88,8 @@ class PoseGraph(Protocol):
 class CorrectedTrajectory(ABC):
     """Takes steps into a log and a graph, and tells what each changed.
 
-    An optimisation takes several iterations. ``iterations_per_step`` of them are run at the step that begins it and at
-    each one after it, so that no step takes much longer than the others.
+    An update takes several parts, most of them iterations of an optimisation. ``iterations_per_step`` of them are done
+    at the step that begins it and at each one after it, so that no step takes much longer than the others.
     """
 
     _graph: PoseGraph

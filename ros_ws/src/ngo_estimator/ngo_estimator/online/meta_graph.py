@@ -51,6 +51,9 @@ there are no features."""
 _STD = (1e-6, 1e2)
 """What a step's deviation is limited to (m or rad)."""
 
+_SHRUNK = 1e-5
+"""By less (m or rad) are poses those of the solution: a hundredth of what corrections are good to."""
+
 _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
 
@@ -275,7 +278,7 @@ class MetaGraph:
 
     @property
     def work(self) -> int:
-        """The parts of an update: taking in a block, preparing its optimisation, and each iteration of that."""
+        """The most parts of an update: registering and taking in a block, the network's preparation, and iterations."""
         config = self._optimizer.config
         return (self._registrations > 0) + len(self._all_work()) + config.network + config.iterations
 
@@ -666,7 +669,7 @@ class MetaGraph:
         joined = np.searchsorted(active, ties[0])
         solution = np.vstack((np.zeros(3), poses))
         shrunk = shrunk_corrections(solution, odometry, variance, joined, ties[1])
-        self._shrunk = shrunk is not solution
+        self._shrunk = bool(np.abs(shrunk - solution).max() > _SHRUNK)
         moved: np.ndarray = shrunk[-1] - poses[-1]
         poses[:] = shrunk[1:]
         return moved
@@ -823,7 +826,7 @@ class MetaGraph:
         require(not (left and iterated), "an optimisation has iterated before its time")
         with torch.inference_mode():
             if self._work and self._work[0][0][1] == self._measure_places:
-                self._look_for_places(self.blocks - 1)
+                self._do((("the search for loops", self._look_for_places),))
             for _ in range(iterated):
                 self._iterate()
 

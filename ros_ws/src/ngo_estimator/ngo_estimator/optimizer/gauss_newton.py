@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.normal_equations import RELATIVE_JITTER
+from ngo_estimator.optimizer.rounding import RELATIVE_JITTER
 
 
 @dataclass(frozen=True)

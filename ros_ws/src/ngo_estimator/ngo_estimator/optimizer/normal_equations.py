@@ -10,9 +10,7 @@ from numba import njit
 
 from ngo_estimator.data.state_arrays import Arrays, require, taken
 from ngo_estimator.optimizer.block_cholesky import Array, BlockCholesky, BlockStructure, placed
-
-RELATIVE_JITTER = 1e-12
-"""Share of itself that is added to the diagonal: rounding over some hundred poses can take as much from it."""
+from ngo_estimator.optimizer.rounding import RELATIVE_JITTER
 
 
 class GraphStructure:
