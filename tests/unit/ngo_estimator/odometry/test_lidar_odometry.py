@@ -193,6 +193,23 @@ def test_a_turn_that_begins_within_a_sweep_is_in_the_covariance_where_no_wheels_
     assert math.degrees(deviations[3 : begins - 2].max()) < 0.5
 
 
+def test_wheels_that_slip_bend_no_scan() -> None:
+    """A wheel slips in bursts, which turns the wheels by up to 4 degrees a sweep that the robot does not turn."""
+    poses, _, swept = swept_scans([0.0] * 5 + [math.radians(3.0 if k // 8 % 2 else -3.0) for k in range(64)])
+    steps = [between(before, after) for before, after in zip(poses[:-1], poses[1:], strict=True)]
+    slipped = [poses[0]]
+    for k, step in enumerate(steps):
+        turn = math.radians(4.0 * (-1) ** (k // 24)) if k % 24 > 15 and k % 24 < 21 else 0.0
+        slipped.append(compose(slipped[-1], step + np.array((0.0, 0.0, turn))))
+    records = [record for pair in zip(wheels(np.array(slipped)), swept, strict=False) for record in pair]
+    found = fed(LidarOdometry(), records)
+    errors = np.array([
+        between(between(poses[0], pose), step.odom_xyyaw) for pose, step in zip(poses[1:], found, strict=False)
+    ])  # fmt: skip
+    assert np.abs(errors[:, 2]).max() < 0.01
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.02
+
+
 def hostile_scans() -> dict[str, LidarScan]:
     count = 20_000
     good = cast(ROOM, way(40)[20], ANGLES)

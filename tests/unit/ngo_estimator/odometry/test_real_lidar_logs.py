@@ -14,6 +14,7 @@ import pytest
 from ngo_estimator.geometry.planar_motion import Array, between, wrap
 from ngo_estimator.geometry.scan_points import Mounting, key_scan
 from ngo_estimator.odometry.scan_odometry import ScanOdometry
+from ngo_estimator.odometry.swept_scan import SweptScan
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
 FOLDER = os.environ.get("NGO_LIDAR_LOGS")
@@ -66,7 +67,8 @@ def test_mit_csail_is_followed_open_loop(with_wheels: bool) -> None:
     for stamp, measured, wheel_pose in zip(stamps, ranges, wheel_poses, strict=True):
         if wheels is not None:
             wheels.add(stamp, wheel_pose)
-        poses.append(odometry.update(key_scan(stamp, angles, measured, (0.05, MAX_RANGE), AHEAD), wheels).pose)
+        scan = key_scan(stamp, angles, measured, (0.05, MAX_RANGE), AHEAD)
+        poses.append(odometry.update(SweptScan(scan), wheels).pose)
     metres, degrees = relation_errors(stamps, np.array(poses))
     assert metres < 0.09 and degrees < 0.5
     if wheels is not None:

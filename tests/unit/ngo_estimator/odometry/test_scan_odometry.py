@@ -11,6 +11,7 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
+from ngo_estimator.odometry.swept_scan import SweptScan
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, fan, round_trip, scan_at
 
@@ -24,7 +25,7 @@ def drive(scans: Iterable[KeyScan], wheels: Array | None = None) -> tuple[list[S
     for i, scan in enumerate(scans):
         if wheels is not None and turning is not None:
             turning.add(scan.stamp_ns, wheels[i])
-        estimates.append(odometry.update(scan, turning))
+        estimates.append(odometry.update(SweptScan(scan), turning))
     return estimates, odometry
 
 
@@ -190,7 +191,7 @@ def test_late_wheels_are_found_out() -> None:
         for j in range(10 * (i - 1), 10 * i, 2):
             wheels.add(round((j + 2) * 1e7), fine[j + 2])
         scan = scan_at(ROOM, fine[round(10 * i - 100 * lag_s)], i * STEP_NS, fan(181))
-        odometry.update(scan, wheels)
+        odometry.update(SweptScan(scan), wheels)
     assert wheels.lag_s == pytest.approx(lag_s, abs=0.02)
 
 
@@ -214,9 +215,9 @@ def test_a_match_of_few_points_after_a_pause_is_sure_by_wheels_alone(with_wheels
 def test_scans_come_in_order() -> None:
     odometry = ScanOdometry()
     scan = scan_at(ROOM, np.array((1.0, 1.0, 0.0)), 10)
-    odometry.update(scan)
+    odometry.update(SweptScan(scan))
     with pytest.raises(ValueError, match="expected one after 10"):
-        odometry.update(scan)
+        odometry.update(SweptScan(scan))
 
 
 def test_bad_settings_are_refused() -> None:

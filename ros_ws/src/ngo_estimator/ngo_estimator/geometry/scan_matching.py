@@ -188,7 +188,7 @@ def _icp(
             arm_x, arm_y = cos * points[i, 0] - sin * points[i, 1], sin * points[i, 0] + cos * points[i, 1]
             x, y = arm_x + pose[0], arm_y + pose[1]
             turned_x, turned_y = cos * nx - sin * ny, sin * nx + cos * ny
-            best = _nearest(
+            best = nearest(
                 map_points, map_normals, first, corner, rows, columns, x, y, turned_x, turned_y, facing
             )  # fmt: skip
             if best < 0:
@@ -253,7 +253,7 @@ def _icp(
 
 
 @njit(cache=True)
-def _nearest(
+def nearest(
     points: Array,
     normals: Array,
     first: NDArray[np.int64],
@@ -269,7 +269,7 @@ def _nearest(
     """The nearest point whose surface faces like ``(nx, ny)``, within a cell's side, or -1."""
     row = math.floor((y - corner[1]) / CELL_M)
     column = math.floor((x - corner[0]) / CELL_M)
-    best, nearest = -1, CELL_M * CELL_M
+    best, least = -1, CELL_M * CELL_M
     if row < -1 or row > rows or column < -1 or column > columns:
         return best
     for r in range(max(row - 1, 0), min(row + 2, rows)):
@@ -279,6 +279,6 @@ def _nearest(
         for j in range(first[r * columns + low], first[r * columns + high]):
             away_x, away_y = points[j, 0] - x, points[j, 1] - y
             square = away_x * away_x + away_y * away_y
-            if square < nearest and normals[j, 0] * nx + normals[j, 1] * ny > facing:
-                best, nearest = j, square
+            if square < least and normals[j, 0] * nx + normals[j, 1] * ny > facing:
+                best, least = j, square
     return best

@@ -3,7 +3,8 @@
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep
 from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
+from ngo_estimator.odometry.swept_scan import SweptScan
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry, WheelOdometryConfig
 from ngo_recordings.scan_stream import LidarScan
 
@@ -209,23 +211,26 @@ class LidarOdometry:
 
     def _step(self, scan: LidarScan) -> LidarStep | None:
         sweep = self._sweep(scan)
-        key = self._key_scan(scan, sweep)
-        if len(key.points) < _LEAST_POINTS:
-            raise UnusableImage(f"the scan has {len(key.points)} usable returns; expected at least {_LEAST_POINTS}")
+        swept = self._swept(scan, sweep)
+        if len(swept.scan.points) < _LEAST_POINTS:
+            raise UnusableImage(
+                f"the scan has {len(swept.scan.points)} usable returns; expected at least {_LEAST_POINTS}"
+            )
         last = self._last
-        middle_s, turn_rad_s = (0.0, 0.0) if sweep is None else (float(sweep.offsets_s.mean()), float(sweep.twist[2]))
-        estimate = self._core.update(key, self._wheels, (round(middle_s * 1e9), middle_s * turn_rad_s))
+        again = None if self._wheels is None or sweep is None else partial(self._swept_otherwise, scan, sweep)
+        estimate = self._core.update(swept, self._wheels, again)
+        key = estimate.swept.scan
         self._last = key
         if last is None:
             self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns
             return None
         elapsed_s = (key.stamp_ns - last.stamp_ns) * 1e-9
         self._last_steps.append((elapsed_s, estimate.step))
-        doubt = np.zeros((3, 3))
-        if sweep is not None and self._wheels is None:
+        doubt = estimate.sweep_doubt
+        if sweep is not None and (self._wheels is None or estimate.swept is not swept):
             # Its points were moved by another motion than the robot turned out to have: by half of it on the mean.
-            off = 0.5 * _duration_s(scan) * (estimate.step / elapsed_s - sweep.twist)
-            doubt = np.outer(off, off)
+            off = estimate.swept.off(estimate.step / elapsed_s)
+            doubt = doubt + np.outer(off, off)
         return self._published(key, last, estimate, doubt)
 
     def _published(self, key: KeyScan, last: KeyScan, estimate: ScanEstimate, doubt: Array) -> LidarStep:
@@ -269,6 +274,13 @@ class LidarOdometry:
             pose = compose(self._robot_odom, step)
         self._robot_odom = pose
         return pose
+
+    def _swept(self, scan: LidarScan, sweep: Sweep | None) -> SweptScan:
+        key = self._key_scan(scan, sweep)
+        return SweptScan(key) if sweep is None else SweptScan(key, float(sweep.offsets_s.mean()), sweep.twist)
+
+    def _swept_otherwise(self, scan: LidarScan, sweep: Sweep, twist: Array) -> SweptScan:
+        return self._swept(scan, replace(sweep, twist=twist))
 
     def _key_scan(self, scan: LidarScan, sweep: Sweep | None) -> KeyScan:
         angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)

@@ -5,6 +5,7 @@ last key scan is the prior, by its covariance: where the walls leave a direction
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,11 +18,15 @@ from ngo_estimator.networks.step_scaling import STEP_EVIDENCE, StepScaling
 from ngo_estimator.odometry.local_submap import LocalSubmap
 from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
 from ngo_estimator.odometry.step_evidence import step_evidence
+from ngo_estimator.odometry.swept_scan import Registered, SweptScan, likelier_sweep
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 
 _CLEARLY_BETTER = 0.1
 """By so much more of its points must a scan fit at the velocity's place to say that the wheels slipped."""
+
+_SWEEP_DEVIATIONS = 1.0
+"""By so many deviations must another motion of the sweep move the pose to be tried."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,9 @@ class ScanEstimate:
         evidence: ``(12,)``, columns as named in ``STEP_EVIDENCE``; zeros for the first scan.
         factors: ``(3,)`` on the deviations (x, y, yaw), by the trained network; ones without it. They are in
             ``step_covariance`` and not in ``since_key_covariance``.
+        swept: the scan that was registered, with the sweep's motion that was removed.
+        sweep_doubt: covariance ``(3, 3)`` of the pose, along the robot's axes and in none of the others, where another
+            motion of the sweep may be right.
     """
 
     stamp_ns: int
@@ -113,6 +121,8 @@ class ScanEstimate:
     unsure: bool
     evidence: Array
     factors: Array
+    swept: SweptScan
+    sweep_doubt: Array
 
 
 class ScanOdometry:
@@ -131,23 +141,26 @@ class ScanOdometry:
         self._middle = (0, 0.0)  # of the last scan's sweep
 
     def update(
-        self, scan: KeyScan, wheels: WheelOdometry | None = None, middle: tuple[int, float] = (0, 0.0)
+        self,
+        swept: SweptScan,
+        wheels: WheelOdometry | None = None,
+        again: Callable[[Array], SweptScan] | None = None,
     ) -> ScanEstimate:
         """Estimate where a scan was taken.
 
         Args:
-            scan: newer than the last one.
+            swept: newer than the last one.
             wheels: the wheels' poses so far, where the robot has wheels. The turns that the scans measure are given to
                 it, from which it learns its lag.
-            middle: of the sweep: its time after the stamp (ns), and the turn until then (rad) that was removed. What
-                removed it is none of what the scans measure.
+            again: gives the scan without a sweep of another velocity ``(3,)``.
 
         Raises:
             ValueError: the scan is not newer than the last one.
         """
+        scan = swept.scan
         if self._stamp_ns is None:
-            self._middle = middle
-            return self._begin(scan, wheels)
+            self._middle = swept.middle
+            return self._begin(swept, wheels)
         if scan.stamp_ns <= self._stamp_ns:
             raise ValueError(f"the scan's stamp is {scan.stamp_ns}; expected one after {self._stamp_ns}")
         last_ns = self._stamp_ns
@@ -156,32 +169,55 @@ class ScanOdometry:
         if wheels is not None and prediction.measured and found.share < self.config.good_share:
             other = self._prior.without_slip(scan.stamp_ns, self._pose, self._covariance, wheels)
             if other is not None:
-                again = self._best(scan, list(other.starts), (other.mean, other.information), 0.0)
-                if again.share >= max(self.config.good_share, found.share + _CLEARLY_BETTER):
-                    prediction, found = other, again
+                again_found = self._best(scan, list(other.starts), (other.mean, other.information), 0.0)
+                if again_found.share >= max(self.config.good_share, found.share + _CLEARLY_BETTER):
+                    prediction, found = other, again_found
                     self._prior.doubt()
+        sweep_doubt = np.zeros((3, 3))
+        if again is not None:
+            (swept, found), sweep_doubt = self._swept_again(swept, prediction, found, again)
         unsure = self._is_unsure(found, prediction)
         pose, covariance = prediction.mean, prediction.covariance
         if not unsure:
             pose, covariance = found.pose, self._covariance_of(found, prediction, searched)
         if doubt is not None and not unsure:
             covariance, unsure = covariance + doubt, True
-        estimate = self._accept(scan, wheels, prediction, pose, covariance, found, searched, unsure)
+        estimate = self._accept(swept, wheels, prediction, pose, covariance, found, searched, unsure, sweep_doubt)
         if wheels is not None and not unsure and found.share >= self.config.good_share:
-            (before_ns, before), (after_ns, after) = self._middle, middle
+            (before_ns, before), (after_ns, after) = self._middle, swept.middle
             turn = float(estimate.step[2]) + after - before
             wheels.observe_turn(last_ns + before_ns, scan.stamp_ns + after_ns, turn)
-        self._middle = middle
+        self._middle = swept.middle
         return estimate
 
-    def _begin(self, scan: KeyScan, wheels: WheelOdometry | None) -> ScanEstimate:
+    def _swept_again(
+        self, swept: SweptScan, prediction: Prediction, found: Registration, again: Callable[[Array], SweptScan]
+    ) -> tuple[Registered, Array]:
+        """The scan and its registration, by the sweep of the velocity that was found if that fits the walls better; and
+        the covariance ``(3, 3)`` by which the other sweep may be right."""
+        assert self._stamp_ns is not None
+        elapsed_s = (swept.scan.stamp_ns - self._stamp_ns) * 1e-9
+        velocity = swept.velocity(between(self._pose, found.pose), elapsed_s)
+        off = swept.off(velocity)
+        if off @ np.linalg.solve(turned_covariance(-self._pose[2], found.covariance), off) < _SWEEP_DEVIATIONS**2:
+            return (swept, found), np.zeros((3, 3))
+        other = again(velocity)
+        prior = (prediction.mean, prediction.information)
+        open_share = 0.0 if prediction.by_wheels else self.config.open_share
+        better = self._best(other.scan, [found.pose, *prediction.starts], prior, open_share)
+        if self._is_unsure(better, prediction):
+            return (swept, found), np.zeros((3, 3))
+        return likelier_sweep(self._submap.lines, self.config.icp, (swept, found), (other, better))
+
+    def _begin(self, swept: SweptScan, wheels: WheelOdometry | None) -> ScanEstimate:
+        scan = swept.scan
         self._submap.add(scan, self._pose)
         self._stamp_ns = scan.stamp_ns
         self._prior.begin(scan.stamp_ns, self._pose, wheels)
         zero, none = np.zeros(3), np.zeros((3, 3))
         nothing = np.zeros(len(STEP_EVIDENCE))
         return ScanEstimate(
-            scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False, nothing, np.ones(3)
+            scan.stamp_ns, zero, none, zero, zero, none, True, 1.0, False, False, nothing, np.ones(3), swept, none
         )  # fmt: skip
 
     def _register(self, scan: KeyScan, prediction: Prediction) -> tuple[Registration, Array | None, bool]:
@@ -256,7 +292,7 @@ class ScanOdometry:
 
     def _accept(
         self,
-        scan: KeyScan,
+        swept: SweptScan,
         wheels: WheelOdometry | None,
         prediction: Prediction,
         pose: Array,
@@ -264,8 +300,10 @@ class ScanOdometry:
         found: Registration,
         searched: bool,
         unsure: bool,
+        sweep_doubt: Array,
     ) -> ScanEstimate:
         assert self._stamp_ns is not None
+        scan = swept.scan
         step, since_key = between(self._pose, pose), between(self._key, pose)
         both = covariance + self._covariance
         if prediction.step_covariance is not None:
@@ -297,6 +335,8 @@ class ScanOdometry:
             unsure,
             evidence,
             factors,
+            swept,
+            turned_covariance(-pose[2], sweep_doubt),
         )
         self._pose, self._covariance, self._stamp_ns = pose, covariance, scan.stamp_ns
         if passes:
