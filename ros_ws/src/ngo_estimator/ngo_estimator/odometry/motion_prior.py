@@ -3,7 +3,7 @@
 The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
 Wheels that stopped at once while the scans moved (frozen), or that run away from them (a jump), are doubted: for that
 scan the prior widens by the disagreement, and both predictions are tried. The next prior counts from that scan. So it
-does where wheels lead to no fit, and the velocity does (a slip).
+does where the walls say that the velocity is right and the wheels are not (a slip).
 """
 
 import math
@@ -130,10 +130,10 @@ class MotionPrior:
         )
 
     def without_slip(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
-        """Another prior of the scan that ``predict`` was asked for, where the wheels led to no fit.
+        """Another prior of the scan that ``predict`` was asked for, as the wheels slipped.
 
-        It is None where nothing better is known: the velocity is forgotten, or agrees with the wheels within their
-        deviations.
+        It begins at the velocity's place and is as wide as both disagree. It is None where nothing else is known: the
+        velocity is forgotten, or agrees with the wheels within their deviations.
         """
         assert self._last_wheels is not None and self._now_wheels is not None
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9

@@ -6,7 +6,7 @@ last key scan is the prior, by its covariance: where the walls leave a direction
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,12 +18,12 @@ from ngo_estimator.networks.step_scaling import STEP_EVIDENCE, StepScaling
 from ngo_estimator.odometry.local_submap import LocalSubmap
 from ngo_estimator.odometry.motion_prior import MotionPrior, MotionPriorConfig, Prediction
 from ngo_estimator.odometry.step_evidence import step_evidence
-from ngo_estimator.odometry.swept_scan import Registered, SweptScan, likelier_sweep
+from ngo_estimator.odometry.swept_scan import Registered, SweptScan, likelier
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 
-_CLEARLY_BETTER = 0.1
-"""By so much more of its points must a scan fit at the velocity's place to say that the wheels slipped."""
+_RARE = 4.0
+"""Where the motion changes, wheels that slipped are ``exp`` of this times as rare as wheels that did not."""
 
 _SWEEP_DEVIATIONS = 1.0
 """By so many deviations must another motion of the sweep move the pose to be tried."""
@@ -166,13 +166,9 @@ class ScanOdometry:
         last_ns = self._stamp_ns
         prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
         found, doubt, searched = self._register(scan, prediction)
-        if wheels is not None and prediction.measured and found.share < self.config.good_share:
-            other = self._prior.without_slip(scan.stamp_ns, self._pose, self._covariance, wheels)
-            if other is not None:
-                again_found = self._best(scan, list(other.starts), (other.mean, other.information), 0.0)
-                if again_found.share >= max(self.config.good_share, found.share + _CLEARLY_BETTER):
-                    prediction, found = other, again_found
-                    self._prior.doubt()
+        slip_doubt = np.zeros((3, 3))
+        if wheels is not None and prediction.measured:
+            prediction, found, slip_doubt = self._without_slip(swept, prediction, found, wheels)
         sweep_doubt = np.zeros((3, 3))
         if again is not None:
             (swept, found), sweep_doubt = self._swept_again(swept, prediction, found, again)
@@ -180,6 +176,7 @@ class ScanOdometry:
         pose, covariance = prediction.mean, prediction.covariance
         if not unsure:
             pose, covariance = found.pose, self._covariance_of(found, prediction, searched)
+        covariance = covariance + slip_doubt
         if doubt is not None and not unsure:
             covariance, unsure = covariance + doubt, True
         estimate = self._accept(swept, wheels, prediction, pose, covariance, found, searched, unsure, sweep_doubt)
@@ -189,6 +186,30 @@ class ScanOdometry:
             wheels.observe_turn(last_ns + before_ns, scan.stamp_ns + after_ns, turn)
         self._middle = swept.middle
         return estimate
+
+    def _without_slip(
+        self, swept: SweptScan, prediction: Prediction, found: Registration, wheels: WheelOdometry
+    ) -> tuple[Prediction, Registration, Array]:
+        """The prediction and its registration, by the velocity where the walls say that the wheels slipped; and the
+        covariance ``(3, 3)`` by which the other may be right."""
+        other = self._prior.without_slip(swept.scan.stamp_ns, self._pose, self._covariance, wheels)
+        if other is None:
+            return prediction, found, np.zeros((3, 3))
+        again = self._best(swept.scan, list(other.starts), (other.mean, other.information), 0.0)
+        if again.share < self.config.good_share:
+            return prediction, found, np.zeros((3, 3))
+        stands, rare = found, _RARE
+        if self._is_unsure(found, prediction):
+            stands = replace(found, pose=prediction.mean)
+            if found.share >= self.config.good_share:
+                rare = 0.0  # so far from the wheels that these are as rare
+        (_, likely), doubt = likelier(self._submap.lines, self.config.icp, (swept, stands), (swept, again), rare)
+        if likely is stands:
+            if prediction.step_covariance is not None:
+                prediction = replace(prediction, step_covariance=prediction.step_covariance + doubt)
+            return prediction, found, doubt
+        self._prior.doubt()
+        return other, again, doubt
 
     def _swept_again(
         self, swept: SweptScan, prediction: Prediction, found: Registration, again: Callable[[Array], SweptScan]
@@ -207,7 +228,7 @@ class ScanOdometry:
         better = self._best(other.scan, [found.pose, *prediction.starts], prior, open_share)
         if self._is_unsure(better, prediction):
             return (swept, found), np.zeros((3, 3))
-        return likelier_sweep(self._submap.lines, self.config.icp, (swept, found), (other, better))
+        return likelier(self._submap.lines, self.config.icp, (swept, found), (other, better))
 
     def _begin(self, swept: SweptScan, wheels: WheelOdometry | None) -> ScanEstimate:
         scan = swept.scan

@@ -1,7 +1,8 @@
-"""A scan without its sweep's motion, and which of two motions it was.
+"""A scan without its sweep's motion, and which of two registrations of it is right.
 
 Not in the paper. The wheels tell how a robot moves during a sweep. Wheels that slip or freeze bend the scan, and the
-bent scan fits the walls where it is turned. Then the velocity that the scans tell bends it back.
+bent scan fits the walls where it is turned. Then the velocity that the scans tell bends it back. Where nothing sweeps,
+slipping wheels still lead the registration to a wrong place.
 """
 
 import math
@@ -47,10 +48,10 @@ class SweptScan:
 Registered = tuple[SweptScan, Registration]
 
 
-def likelier_sweep(
-    lines: LineMap, config: IcpConfig, first: Registered, second: Registered
+def likelier(
+    lines: LineMap, config: IcpConfig, first: Registered, second: Registered, rare: float = 0.0
 ) -> tuple[Registered, Array]:
-    """The one of two sweeps of a scan that fits the ``lines`` better.
+    """The registration that fits the ``lines`` better, where the second is ``exp(rare)`` times as rare as the first.
 
     Returns:
         It, and the covariance ``(3, 3)`` that the pose has since the other one may be right.
@@ -59,8 +60,8 @@ def likelier_sweep(
         misfit(lines, swept.scan.points, swept.scan.normals, found.pose, config) for swept, found in (first, second)
     ]
     independent = max(first[1].fitted, second[1].fitted) / config.correlation
-    likelier = 0.5 * independent * abs(squares[1] - squares[0]) / max(min(squares), config.noise_m**2)
+    odds = 0.5 * independent * (squares[0] - squares[1]) / max(min(squares), config.noise_m**2) - rare
     apart = second[1].pose - first[1].pose
     apart[2] = wrap(apart[2])
-    doubt = np.outer(apart, apart) / (1.0 + math.exp(min(likelier, 100.0)))
-    return second if squares[1] < squares[0] else first, doubt
+    doubt = np.outer(apart, apart) / (1.0 + math.exp(min(abs(odds), 100.0)))
+    return second if odds > 0.0 else first, doubt
