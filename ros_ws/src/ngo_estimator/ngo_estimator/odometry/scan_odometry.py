@@ -23,7 +23,7 @@ from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 from ngo_estimator.odometry.wide_search import WideSearchConfig, wide_place
 
 _RARE = 4.0
-"""Where the motion changes, wheels that slipped are ``exp`` of this times as rare as wheels that did not."""
+"""Wheels that slipped, or swept otherwise than they say, are ``exp`` of this times as rare as wheels that did not."""
 
 _SWEEP_DEVIATIONS = 1.0
 """By so many deviations must another motion of the sweep move the pose to be tried."""
@@ -228,7 +228,8 @@ class ScanOdometry:
         better = self._best(other.scan, [found.pose, *prediction.starts], prior, open_share)
         if self._is_unsure(better, prediction):
             return (swept, found), np.zeros((3, 3))
-        return likelier(self._submap.lines, self.config.icp, (swept, found), (other, better))
+        rare = _RARE if prediction.measured else 0.0
+        return likelier(self._submap.lines, self.config.icp, (swept, found), (other, better), rare)
 
     def _begin(self, swept: SweptScan, wheels: WheelOdometry | None) -> ScanEstimate:
         scan = swept.scan
