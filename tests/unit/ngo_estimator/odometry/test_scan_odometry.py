@@ -163,7 +163,7 @@ def test_frozen_wheels_that_jump_do_no_harm() -> None:
 def test_wheels_that_slip_give_way_to_the_velocity(
     rays: int, degrees: float, slips: tuple[int, ...], off_m: float, off_rad: float
 ) -> None:
-    """One wheel slips for 0.8 s, then the other, while a noisy scanner sees little: the velocity knows the way."""
+    """Wheels slip for 0.8 s at a time, while a noisy scanner sees little: the velocity knows the way."""
     poses = round_trip(120)
     steps = np.array([between(before, after) for before, after in zip(poses[:-1], poses[1:], strict=True)])
     for start, turn in zip(slips, (-0.1, 0.1), strict=False):

@@ -130,7 +130,7 @@ class MotionPrior:
         )
 
     def without_slip(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
-        """Another prior of the scan that ``predict`` was asked for, as the wheels slipped.
+        """Another prior of the scan that ``predict`` was asked for: that of wheels that slipped.
 
         It begins at the velocity's place and is as wide as both disagree. It is None where nothing else is known: the
         velocity is forgotten, or agrees with the wheels within their deviations.
