@@ -46,44 +46,69 @@ def line_map(scans: Sequence[KeyScan], poses: Sequence[Array]) -> LineMap:
 
 def line_map_of_points(points: Array, normals: Array) -> LineMap:
     """The lines at points ``(n, 2)`` with normals ``(n, 2)``, zero where there is none."""
-    has_line = (normals[:, 0] != 0.0) | (normals[:, 1] != 0.0)
-    points, normals = points[has_line], normals[has_line]
-    if len(points):
+    points, normals, low, high = _lines(points, normals)
+    if (high - low).max() >= _FARTHEST_M:  # else no point is as far from the middle one
         near = np.abs(points - np.median(points, axis=0)).max(axis=1) < _FARTHEST_M
-        points, normals = points[near], normals[near]
-    corner = points.min(axis=0) - CELL_M if len(points) else np.zeros(2)
-    extent = points.max(axis=0) - corner if len(points) else np.zeros(2)
+        points, normals, low, high = _lines(points[near], normals[near])
+    corner = low - CELL_M if len(points) else np.zeros(2)
+    extent = high - corner
     shape = (int(extent[1] / CELL_M) + 2, int(extent[0] / CELL_M) + 2)
-    first, order = _cells(points, corner, shape[0], shape[1])
-    return LineMap(points[order], normals[order], first, corner, shape)
+    return LineMap(*_in_cells(points, normals, corner, shape[0], shape[1]), corner, shape)
 
 
 @njit(cache=True)
-def averaged_lines(points: Array, normals: Array, side: float = 0.06) -> tuple[Array, Array]:
-    """Points and normals ``(m, 2)``, averaged over squares of a side (m) and an eighth of a turn of the normals.
-
-    Points without normals are left out. Averages are less noisy than single points, and fewer.
-    """
-    keys = np.empty(len(points), dtype=np.int64)
+def _lines(points: Array, normals: Array) -> tuple[Array, Array, Array, Array]:
+    """Points and normals ``(m, 2)`` of those that have normals, and the least and largest coordinates ``(2,)``."""
+    on_lines, facing = np.empty_like(points), np.empty_like(normals)
+    low, high = np.full(2, math.inf), np.full(2, -math.inf)
     count = 0
     for i in range(len(points)):
         if normals[i, 0] == 0.0 and normals[i, 1] == 0.0:
-            keys[i] = -1
+            continue
+        for axis in range(2):
+            value = points[i, axis]
+            on_lines[count, axis], facing[count, axis] = value, normals[i, axis]
+            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+        count += 1
+    if count == 0:
+        low[:], high[:] = 0.0, 0.0
+    return on_lines[:count].copy(), facing[:count].copy(), low, high
+
+
+@njit(cache=True)
+def line_squares(points: Array, normals: Array, side: float = 0.06) -> NDArray[np.int64]:
+    """Numbers ``(n,)`` of the squares of a side (m), and of the eighth of a turn of the normals, that points lie in.
+
+    Points without normals have -1.
+    """
+    squares = np.empty(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        if normals[i, 0] == 0.0 and normals[i, 1] == 0.0:
+            squares[i] = -1
             continue
         row, column = math.floor(points[i, 1] / side), math.floor(points[i, 0] / side)
         direction = math.floor((math.atan2(normals[i, 1], normals[i, 0]) / math.pi + 1.125) * 4.0) % 8
         # 30 bits for either coordinate: thousands of kilometres.
-        keys[i] = (((row + (1 << 29)) << 30 | (column + (1 << 29))) << 3) | direction
-    order = np.argsort(keys)
+        squares[i] = (((row + (1 << 29)) << 30 | (column + (1 << 29))) << 3) | direction
+    return squares
+
+
+@njit(cache=True)
+def averaged_lines(points: Array, normals: Array, squares: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Points and normals ``(m, 2)``, averaged over those ``(n, 2)`` of the same of ``line_squares`` ``(n,)``.
+
+    Points without normals are left out. Averages are less noisy than single points, and fewer.
+    """
+    order = np.argsort(squares)
     mean_points, mean_normals = np.zeros_like(points), np.zeros_like(normals)
-    last, size = np.int64(-1), 0
+    last, size, count = np.int64(-1), 0, 0
     for i in order:
-        if keys[i] < 0:
+        if squares[i] < 0:
             continue
-        if keys[i] != last:
+        if squares[i] != last:
             if size:
                 _finish(mean_points, mean_normals, count - 1, size)
-            last, size, count = keys[i], 0, count + 1
+            last, size, count = squares[i], 0, count + 1
         for axis in range(2):
             mean_points[count - 1, axis] += points[i, axis]
             mean_normals[count - 1, axis] += normals[i, axis]
@@ -100,7 +125,10 @@ def _finish(points: Array, normals: Array, i: int, size: int) -> None:
 
 
 @njit(cache=True)
-def _cells(points: Array, corner: Array, rows: int, columns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _in_cells(
+    points: Array, normals: Array, corner: Array, rows: int, columns: int
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Points and normals in the order of their cells, and where those of each cell begin."""
     cells = np.empty(len(points), dtype=np.int64)
     first = np.zeros(rows * columns + 1, dtype=np.int64)
     for i in range(len(points)):
@@ -111,8 +139,10 @@ def _cells(points: Array, corner: Array, rows: int, columns: int) -> tuple[NDArr
     for c in range(rows * columns):
         first[c + 1] += first[c]
     place = first.copy()
-    order = np.empty(len(points), dtype=np.int64)
+    ordered, facing = np.empty_like(points), np.empty_like(normals)
     for i in range(len(points)):
-        order[place[cells[i]]] = i
+        at = place[cells[i]]
         place[cells[i]] += 1
-    return first, order
+        for axis in range(2):
+            ordered[at, axis], facing[at, axis] = points[i, axis], normals[i, axis]
+    return ordered, facing, first

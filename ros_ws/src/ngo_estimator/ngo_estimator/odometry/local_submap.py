@@ -4,11 +4,12 @@ import math
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ngo_estimator.geometry import branch_and_bound
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import LikelihoodField, SearchConfig, draw, joined, likelihood_field
-from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points
+from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points, line_squares
 from ngo_estimator.geometry.planar_motion import Array, rotated, transformed, wrap
 
 _REDRAWN_SCANS = 10
@@ -29,6 +30,7 @@ class LocalSubmap:
     def __init__(self, most_scans: int, search: SearchConfig) -> None:
         self._points: deque[Array] = deque(maxlen=most_scans)
         self._normals: deque[Array] = deque(maxlen=most_scans)
+        self._squares: deque[NDArray[np.int64]] = deque(maxlen=most_scans)
         self._poses: deque[tuple[Array, bool]] = deque(maxlen=most_scans)
         self._search = search
         self._last = np.zeros(2)
@@ -43,6 +45,7 @@ class LocalSubmap:
         """Add a scan whose base frame has the pose ``(3,)``; the oldest leaves where there are too many."""
         self._points.append(transformed(pose, scan.points))
         self._normals.append(rotated(pose[2], scan.normals))
+        self._squares.append(line_squares(self._points[-1], self._normals[-1]))
         self._poses.append((pose, _sees_all_round(scan)))
         self._last = pose[:2].copy()
         self._lines = self._grid = None
@@ -65,7 +68,7 @@ class LocalSubmap:
         """The lines of all scans, averaged where they lie on each other."""
         if self._lines is None:
             points, normals = np.concatenate(self._points), np.concatenate(self._normals)
-            self._lines = line_map_of_points(*averaged_lines(points, normals))
+            self._lines = line_map_of_points(*averaged_lines(points, normals, np.concatenate(self._squares)))
         return self._lines
 
     def grid(self, config: branch_and_bound.SearchConfig) -> branch_and_bound.PooledGrid:
