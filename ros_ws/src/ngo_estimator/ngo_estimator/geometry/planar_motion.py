@@ -90,6 +90,43 @@ def turned_covariance(yaw: float, covariance: Array) -> Array:
 
 
 @njit(cache=True)
+def propagated(covariance: Array, pose: Array, relative: Array, relative_covariance: Array) -> Array:
+    """``planar_covariance.propagate`` of a single pose.
+
+    Args:
+        covariance: ``(3, 3)`` of the pose before a step.
+        pose: ``(3,)`` after it.
+        relative: the step ``(3,)``, with its covariance ``(3, 3)``.
+    """
+    yaw = pose[2] - relative[2]
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    lever = np.eye(3)
+    lever[0, 2] = -(sin * relative[0] + cos * relative[1])
+    lever[1, 2] = cos * relative[0] - sin * relative[1]
+    return lever @ covariance @ lever.T + turned_covariance(yaw, relative_covariance)
+
+
+@njit(cache=True)
+def inverted(matrix: Array) -> Array:
+    """``np.linalg.inv`` of a matrix ``(3, 3)``, to the last bit: the call takes a third of its time."""
+    return np.ascontiguousarray(np.linalg.solve(matrix, np.eye(3)))
+
+
+@njit(cache=True)
+def fused(a: Array, b: Array) -> Array:
+    """Covariance ``(3, 3)`` of what two independent measurements with covariances ``(3, 3)`` tell together."""
+    return inverted(inverted(a) + inverted(b))
+
+
+@njit(cache=True)
+def squared_deviations(pose: Array, mean: Array, information: Array) -> float:
+    """Squared distance of a pose from a mean with an information matrix ``(3, 3)``, in deviations."""
+    away = pose - mean
+    away[2] = wrap(away[2])
+    return away @ information @ away
+
+
+@njit(cache=True)
 def frames_between_nodes(nodes: Array, odometry: Array, block: int, shares: Array) -> Array:
     """Poses ``(frames, 3)`` of all frames, of which each ``block``-th is a node; those behind the last follow it.
 

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ngo_estimator.geometry.line_map import CELL_M, LineMap
-from ngo_estimator.geometry.planar_motion import Array, wrap
+from ngo_estimator.geometry.planar_motion import Array, inverted, wrap
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,9 @@ def icp(
             f"start, mean and information have shapes {start.shape}, {mean.shape} and {information.shape}; expected "
             "(3,), (3,) and (3, 3)"
         )
-    if not (np.isfinite(start).all() and np.isfinite(mean).all() and np.isfinite(information).all()):
+    if not _all_finite(start, mean, information):
         raise ValueError("start or prior are not finite; expected finite numbers")
-    pose, total, data, fitted, tried = _icp(
+    pose, covariance, data, fitted, tried = _icp(
         lines.points,
         lines.normals,
         lines.first,
@@ -137,8 +137,12 @@ def icp(
         config.correlation,
         (config.normal_deviations, open_share),
     )
-    covariance = np.linalg.inv(total).astype(np.float64)
     return Registration(pose, covariance, data, fitted / max(tried, 1), int(fitted))
+
+
+@njit(cache=True)
+def _all_finite(start: Array, mean: Array, information: Array) -> bool:
+    return bool(np.isfinite(start).all() and np.isfinite(mean).all() and np.isfinite(information).all())
 
 
 @njit(cache=True)
@@ -249,7 +253,7 @@ def _icp(
         pose[2] = wrap(pose[2])
         if step >= annealing and abs(change[0]) + abs(change[1]) < 2e-4 and abs(change[2]) < 5e-5:
             break
-    return pose, total, data, fitted, tried
+    return pose, inverted(total), data, fitted, tried
 
 
 @njit(cache=True)

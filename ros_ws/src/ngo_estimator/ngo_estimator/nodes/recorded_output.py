@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.planar_motion import propagated
 from ngo_estimator.mapping.map_files import write_map
 from ngo_estimator.mapping.scan_map import ScanMap
 from ngo_estimator.mapping.scan_source import ScanSource
@@ -84,7 +84,7 @@ class RecordedOutput:
     def add(self, step: RecordedStep) -> None:
         """Write the messages that the nodes publish about a step."""
         local = step.local
-        self._covariance = propagate(self._covariance, local.odom_xyyaw, local.relative_xyyaw, local.covariance)
+        self._covariance = propagated(self._covariance, local.odom_xyyaw, local.relative_xyyaw, local.covariance)
         for topic, message in self._messages.of(local, self._covariance, step.update).items():
             self._writer.write(topic, message, local.stamp_ns)
         if self._source is not None:

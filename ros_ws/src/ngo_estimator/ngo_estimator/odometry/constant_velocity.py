@@ -6,6 +6,7 @@ takes its steps as independent: what a step shares with those before it is added
 """
 
 import numpy as np
+from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array
 
@@ -63,18 +64,13 @@ class ConstantVelocity:
 
     def measure(self, velocity: Array, covariance: Array, noise: Array) -> None:
         """Another source measured a ``velocity`` ``(3,)``, after changes of the deviations ``noise`` ``(3,)``."""
-        before = self._joint[_V, _V] + np.diag(noise**2)
-        gain = np.linalg.solve((before + covariance).T, before.T).T
-        self.velocity = self.velocity + gain @ (velocity - self.velocity)
-        self._joint, self._drift = np.zeros((6, 6)), np.zeros((3, 6))
-        self._joint[_V, _V] = (np.eye(3) - gain) @ before
+        self.velocity, self._joint = _measured(self._joint, self.velocity, velocity, covariance, noise)
+        self._drift = np.zeros((3, 6))
 
     def shared(self) -> Array:
         """What ``(3, 3)`` the covariance of the pose lacks in a sum of independent steps."""
-        twice = self._drift[:, _R] + self._drift[:, _R].T
-        values, vectors = np.linalg.eigh(twice)
-        result: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        return result
+        shared: Array = _shared(self._drift)
+        return shared
 
     def begin_at_key(self) -> None:
         """The newest pose is that of a key scan: the next ones count from it."""
@@ -82,3 +78,23 @@ class ConstantVelocity:
         self._drift = np.zeros((3, 6))
         self._drift[:, _V] = drift
         self._joint[_R, :] = self._joint[:, _R] = 0.0
+
+
+@njit(cache=True)
+def _measured(
+    joint: Array, velocity: Array, measured: Array, covariance: Array, noise: Array
+) -> tuple[Array, Array]:
+    """Velocity ``(3,)`` and joint covariance ``(6, 6)`` after ``measure``."""
+    before = joint[3:, 3:] + np.diag(noise**2)
+    gain = np.ascontiguousarray(np.linalg.solve((before + covariance).T, before.T)).T
+    after = np.zeros((6, 6))
+    after[3:, 3:] = (np.eye(3) - gain) @ before
+    return velocity + gain @ (measured - velocity), after
+
+
+@njit(cache=True)
+def _shared(drift: Array) -> Array:
+    """The positive part ``(3, 3)`` of the drift ``(3, 6)`` of poses, twice."""
+    twice = drift[:, :3] + drift[:, :3].T
+    values, vectors = np.linalg.eigh(twice)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_motion import Array, compose, wrap
+from ngo_estimator.geometry.planar_motion import Array, compose, inverted, wrap
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
 from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
@@ -122,7 +122,7 @@ class MotionPrior:
         return Prediction(
             compose(self._anchor, moved),
             total,
-            np.linalg.inv(total).astype(np.float64),
+            inverted(total),
             tuple(starts),
             by_wheels=True,
             measured=not doubted,
@@ -146,7 +146,7 @@ class MotionPrior:
         off_m = math.hypot(off[0], off[1])
         total = np.diag((deviations + np.array((off_m, off_m, abs(off[2])))) ** 2) + covariance
         mean = compose(last, step)
-        information = np.linalg.inv(total).astype(np.float64)
+        information = inverted(total)
         return Prediction(mean, total, information, (compose(last, constant),), by_wheels=True)
 
     def doubt(self) -> None:
@@ -174,7 +174,7 @@ class MotionPrior:
         changes = np.minimum(changes, largest / elapsed)
         self._motion.largest[:2] = self._usual.largest_m_s
         total = self._motion.predict(last[2], elapsed, still, changes)
-        information = np.linalg.inv(total).astype(np.float64)
+        information = inverted(total)
         return Prediction(mean, total, information, (mean,))
 
     def accept(

@@ -12,7 +12,7 @@ import numpy as np
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, search
-from ngo_estimator.geometry.planar_motion import Array, between, turned_covariance, wrap
+from ngo_estimator.geometry.planar_motion import Array, between, fused, squared_deviations, turned_covariance, wrap
 from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
 from ngo_estimator.networks.step_scaling import STEP_EVIDENCE, StepScaling
 from ngo_estimator.odometry.local_submap import LocalSubmap
@@ -296,7 +296,7 @@ class ScanOdometry:
     def _icp(self, scan: KeyScan, start: Array, prior: tuple[Array, Array], open_share: float) -> Registration:
         mean, information = prior
         found = icp(self._submap.lines, scan.points, scan.normals, start, prior, self.config.icp, open_share)
-        far = _squared_deviations(found.pose, mean, information)
+        far = squared_deviations(found.pose, mean, information)
         if found.share >= self.config.good_share and far > 9.0:
             # Scans that fit, far from the prior: wheels that slipped or froze must not pull.
             found = icp(
@@ -309,7 +309,7 @@ class ScanOdometry:
         config = self.config
         if found.share < config.least_share or found.fitted < config.least_points:
             return True
-        far = _squared_deviations(found.pose, prediction.mean, prediction.information) > config.farthest_deviations**2
+        far = squared_deviations(found.pose, prediction.mean, prediction.information) > config.farthest_deviations**2
         return far and found.share < (config.sure_share if prediction.measured else config.good_share)
 
     def _accept(
@@ -330,7 +330,7 @@ class ScanOdometry:
         both = covariance + self._covariance
         if prediction.step_covariance is not None:
             # Both poses share the errors of the submap, and of the prior where the walls say nothing.
-            both = np.linalg.inv(np.linalg.inv(both) + np.linalg.inv(prediction.step_covariance))
+            both = fused(both, prediction.step_covariance)
         distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
         passed = between(self._passed, pose)
         passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
@@ -367,9 +367,3 @@ class ScanOdometry:
             self._key, self._covariance = pose, np.zeros((3, 3))
             self._submap.add(scan, pose)
         return estimate
-
-
-def _squared_deviations(pose: Array, mean: Array, information: Array) -> float:
-    away = pose - mean
-    away[2] = wrap(away[2])
-    return float(away @ information @ away)

@@ -79,7 +79,7 @@ class WheelLag:
             start_s, end_s, turn = self._waiting.popleft()
             if start_s - self.config.largest_s < stamps_s[0]:
                 continue
-            turns = self._averaged(end_s, stamps_s, yaws) - self._averaged(start_s, stamps_s, yaws)
+            turns = _turns(start_s, end_s, self._lags, stamps_s, yaws, self.config.largest_s)
             if max(abs(turn), float(np.abs(turns).max())) < self.config.least_turn_rad:
                 continue
             fade = 0.5 ** (1.0 / self.config.half_life)
@@ -88,16 +88,6 @@ class WheelLag:
             self._weight = fade * self._weight + 1.0
             taken = True
         return taken and self._decide()
-
-    def _averaged(self, at_s: float, stamps_s: Array, yaws: Array) -> Array:
-        """The wheels' yaw around a time, for each lag."""
-        first, last = np.searchsorted(
-            stamps_s, (at_s - 2.0 * self.config.largest_s, at_s + 2.0 * self.config.largest_s)
-        )
-        first, last = max(int(first) - 1, 0), int(last) + 1
-        near = np.ascontiguousarray(stamps_s[first:last]), np.ascontiguousarray(yaws[first:last])
-        averaged: Array = _averages(at_s - self._lags.astype(np.float64), *near, self.config.largest_s)
-        return averaged
 
     def _decide(self) -> bool:
         best = int(np.argmin(self._sums))
@@ -116,12 +106,21 @@ class WheelLag:
 
 
 @njit(cache=True)
-def _averages(times_s: Array, stamps_s: Array, yaws: Array, longest_s: float) -> Array:
-    """Yaws ``(times,)`` averaged around times over two periods of the stamps, of ``longest_s`` at most."""
+def _turns(start_s: float, end_s: float, lags_s: Array, stamps_s: Array, yaws: Array, largest_s: float) -> Array:
+    """The wheels' turn ``(lags,)`` between two times, for each lag."""
+    return _averages(end_s, lags_s, stamps_s, yaws, largest_s) - _averages(start_s, lags_s, stamps_s, yaws, largest_s)
+
+
+@njit(cache=True)
+def _averages(at_s: float, lags_s: Array, stamps_s: Array, yaws: Array, largest_s: float) -> Array:
+    """Yaws ``(lags,)`` around a time, for each lag: means over two periods of the stamps, of ``largest_s`` at most."""
+    first = max(np.searchsorted(stamps_s, at_s - 2.0 * largest_s) - 1, 0)
+    last = np.searchsorted(stamps_s, at_s + 2.0 * largest_s) + 1
+    stamps_s, yaws = stamps_s[first:last].copy(), yaws[first:last].copy()
     period_s = 0.0
     if len(stamps_s) > 1:
-        period_s = min(float(np.median(stamps_s[1:] - stamps_s[:-1])), longest_s)
-    averages = np.empty(len(times_s))
-    for k in range(len(times_s)):
-        averages[k] = np.interp(times_s[k] + period_s * _WITHIN, stamps_s, yaws).mean()
+        period_s = min(float(np.median(stamps_s[1:] - stamps_s[:-1])), largest_s)
+    averages = np.empty(len(lags_s))
+    for k in range(len(lags_s)):
+        averages[k] = np.interp(at_s - lags_s[k] + period_s * _WITHIN, stamps_s, yaws).mean()
     return averages

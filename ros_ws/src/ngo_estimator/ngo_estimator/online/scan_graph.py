@@ -15,8 +15,8 @@ from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
 from ngo_estimator.geometry import planar_arrays
 from ngo_estimator.geometry.key_scan import no_scan
-from ngo_estimator.geometry.planar_covariance import bounded, propagate
-from ngo_estimator.geometry.planar_motion import between, compose, transformed
+from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.geometry.planar_motion import between, compose, propagated, transformed
 from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_matcher import ScanMatcher
@@ -147,7 +147,7 @@ class ScanGraph:
         if joins:
             self._joins.append(len(self.odometry) - 1)
         since = self._since_key()
-        self._since = propagate(self._since, since, relative, covariance)
+        self._since = propagated(self._since, since, relative, covariance)
         if key is None:
             return False
         if self._running is not None:  # what comes now adds a node to those that it is about
@@ -187,7 +187,7 @@ class ScanGraph:
         self._step_variance.append(largest_variances((covariance + floor)[None])[0])
         self._published_covariance.append(published + floor)
         pose = compose(self._nodes.values[-1], since)
-        self._end = propagate(self._end, pose, since, published + floor)
+        self._end = propagated(self._end, pose, since, published + floor)
         self._nodes.append(pose)
         self._frames.append(len(self.odometry) - 1)
         self._scans.append(key.scan)
@@ -351,7 +351,7 @@ class ScanGraph:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
         since = self._since_key()
         pose = compose(self._nodes.values[-1], since)
-        return pose, propagate(self._end, pose, since, self._since)
+        return pose, propagated(self._end, pose, since, self._since)
 
     def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
         """Poses of all frames ``(frames, 3)``, as they are or as they were before the last optimisation.
