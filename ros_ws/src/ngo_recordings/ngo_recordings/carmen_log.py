@@ -43,6 +43,8 @@ _MAX_LOG_BYTES = 4 * 2**30
 _FREE_BYTES, _MAX_RATIO = 64 * 2**20, 200
 _FREE_LINES, _MAX_USELESS = 100_000, 50
 _BAD_SHARE = 0.1
+# So many rays of a log stay in memory (16 MB): then its scans need no second reading.
+_MOST_KEPT_RAYS = 4_000_000
 # What a SICK LMS writes for no return, by its settings, m; logs differ in the last digits.
 _LIMITS_M = (8.191, 16.383, 32.767, 51.15, NO_RETURN_M)
 _NEAR_LIMIT = 0.01
@@ -64,9 +66,9 @@ class CarmenLog:
     (frame map) is where a mapper put the robot at each scan: good, but not the truth. `carmen_poses.interpret` says
     which is which. Scans are those of FLASER lines, else of ROBOTLASER, else of RAWLASER lines with the lowest number.
 
-    The file is read once to index it and again for scans; memory holds poses alone. unfinished: the last line, or the
-    gzip stream, is cut off. stamps_made: no stamps of the log can be used, and scans are MADE_PERIOD_S apart. notes:
-    what else a person should know, one sentence each.
+    The file is read once to index it, and again for scans where it has many: memory holds poses, and the scans of a
+    short log. unfinished: the last line, or the gzip stream, is cut off. stamps_made: no stamps of the log can be used,
+    and scans are MADE_PERIOD_S apart. notes: what else a person should know, one sentence each.
 
     Raises:
         RecordingError: the file has no line of such a log, a line is too long, or a tenth of the scans is damaged.
@@ -80,7 +82,7 @@ class CarmenLog:
         self.topics: dict[str, Stored] = {}
         index = _Index(path)
         self.unfinished = index.unfinished
-        self._kind, self._limit_m = index.kind, index.limit_m
+        self._kind, self._limit_m, self._kept = index.kind, index.limit_m, index.kept
         self._is_scan = np.array([row[0] for row in index.rows])
         poses = np.array([row[1] for row in index.rows], np.float64).reshape(-1, 2, 3)
         self._speeds = [row[2] for row in index.rows]
@@ -122,6 +124,9 @@ class CarmenLog:
                 yield SCAN_TOPIC, log_ns, laser_scan(stamp_ns, scan, self._limit_m)
 
     def _scans(self) -> Iterator[ScanLine]:
+        if self._kept is not None:
+            yield from self._kept
+            return
         kind = [self._kind.encode()]
         for _, line in _lines(self.path):
             if line.split(None, 1)[:1] == kind:
@@ -161,6 +166,8 @@ class _Index:
         bad: list[tuple[int, str, bool]] = []
         left_out: Counter[str] = Counter()
         guessed: set[int] = set()
+        kept: list[ScanLine] = []
+        kept_rays = 0
         number, ended = 0, True
         for number, line in _lines(path, self):
             ended = line.endswith(b"\n")
@@ -175,6 +182,11 @@ class _Index:
                 continue
             if isinstance(parsed, ScanLine):
                 found.append(self._scan_row(parsed))
+                kept_rays += len(parsed.ranges)
+                if kept_rays <= _MOST_KEPT_RAYS:
+                    kept.append(parsed)
+                else:
+                    kept.clear()
                 if parsed.kind == "FLASER" and len(parsed.ranges) not in (180, 181, 360, 361, 400, 401):
                     guessed.add(len(parsed.ranges))
             elif isinstance(parsed, OdometryLine):
@@ -189,6 +201,7 @@ class _Index:
         if bad and bad[-1][0] == number and not ended:
             self.unfinished = True
         self.kind = min((row[0] for row in found if row[0]), key=_preference, default="")
+        self.kept = [scan for scan in kept if scan.kind == self.kind] if kept_rays <= _MOST_KEPT_RAYS else None
         left_out.update(row[0] for row in found if row[0] not in ("", self.kind))
         self.rows = [(row[0] != "", *row[1:]) for row in found if row[0] in ("", self.kind)]
         self._check(bad)

@@ -102,6 +102,8 @@ class Recording:
             )
         # Of equal times, the file that was named first comes first: the order does not depend on chance.
         streams = [_decoded(source, decoder, wanted) for source, decoder in self._sources]
+        if len(streams) == 1:
+            return streams[0]
         return heapq.merge(*streams, key=lambda message: message.log_time_ns)
 
     def first(self, name: str) -> Message:
