@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from numba import njit
 
 
 @dataclass(frozen=True)
@@ -42,21 +41,36 @@ class WindowConfig:
             )
 
 
+@njit(cache=True)
 def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarray:
     """Length ``(keys,)`` of the shortest way through the graph from a key to each other (m).
 
-    The ways lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys.
+    The ways lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys. Each sweep goes
+    along the chain in both directions and over all loops: a way over n loops is found in n sweeps.
     """
     count = len(poses)
-    chain = np.arange(count - 1)
-    # Each pair once: a sparse array sums what it is given twice.
-    across = loops[np.abs(loops[:, 1] - loops[:, 0]) > 1]
-    across = across[np.unique(across[:, 0] * count + across[:, 1], return_index=True)[1]]
-    nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), across))
-    lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
-    # An edge of no length would be none.
-    graph = csr_array((lengths + 1e-3, (nodes[:, 0], nodes[:, 1])), shape=(count, count))
-    distances: np.ndarray = dijkstra(graph, directed=False, indices=key)
+    nodes = np.empty((count - 1 + len(loops), 2), np.int64)
+    for k in range(count - 1):
+        nodes[k, 0], nodes[k, 1] = k, k + 1
+    nodes[count - 1 :] = loops
+    lengths = np.empty(len(nodes))
+    for k in range(len(nodes)):
+        x = poses[nodes[k, 1], 0] - poses[nodes[k, 0], 0]
+        y = poses[nodes[k, 1], 1] - poses[nodes[k, 0], 1]
+        lengths[k] = math.sqrt(x * x + y * y) + 1e-3  # a loop takes a way, too
+    distances = np.full(count, math.inf)
+    distances[key] = 0.0
+    changed = True
+    while changed:
+        changed = False
+        for turn in range(2):
+            for k in range(len(nodes)):
+                edge = len(nodes) - 1 - k if turn else k
+                a, b = nodes[edge, 0], nodes[edge, 1]
+                if distances[a] + lengths[edge] < distances[b]:
+                    distances[b], changed = distances[a] + lengths[edge], True
+                elif distances[b] + lengths[edge] < distances[a]:
+                    distances[a], changed = distances[b] + lengths[edge], True
     return distances
 
 
