@@ -123,7 +123,7 @@ def squared_deviations(pose: Array, mean: Array, information: Array) -> float:
     """Squared distance of a pose from a mean with an information matrix ``(3, 3)``, in deviations."""
     away = pose - mean
     away[2] = wrap(away[2])
-    return away @ information @ away
+    return float(away @ information @ away)
 
 
 @njit(cache=True)

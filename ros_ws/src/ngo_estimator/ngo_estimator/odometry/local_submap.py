@@ -4,6 +4,7 @@ import math
 from collections import deque
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from ngo_estimator.geometry import branch_and_bound
@@ -31,7 +32,8 @@ class LocalSubmap:
         self._points: deque[Array] = deque(maxlen=most_scans)
         self._normals: deque[Array] = deque(maxlen=most_scans)
         self._squares: deque[NDArray[np.int64]] = deque(maxlen=most_scans)
-        self._poses: deque[tuple[Array, bool]] = deque(maxlen=most_scans)
+        self._poses: deque[Array] = deque(maxlen=most_scans)
+        self._round_views: deque[bool] = deque(maxlen=most_scans)
         self._search = search
         self._last = np.zeros(2)
         self._middle = np.zeros(2)
@@ -46,7 +48,8 @@ class LocalSubmap:
         self._points.append(transformed(pose, scan.points))
         self._normals.append(rotated(pose[2], scan.normals))
         self._squares.append(line_squares(self._points[-1], self._normals[-1]))
-        self._poses.append((pose, _sees_all_round(scan)))
+        self._poses.append(pose)
+        self._round_views.append(_sees_all_round(scan))
         self._last = pose[:2].copy()
         self._lines = self._grid = None
         self._undrawn += 1
@@ -56,12 +59,8 @@ class LocalSubmap:
 
         Scanners that see all round may be turned as they like.
         """
-        round_view = _sees_all_round(scan)
-        return any(
-            math.dist(pose[:2], other[:2]) < distance_m
-            and ((round_view and round_too) or abs(wrap(pose[2] - other[2])) < turn_rad)
-            for other, round_too in self._poses
-        )
+        poses, round_views = np.array(self._poses), np.array(self._round_views)
+        return bool(_is_known(poses, round_views, pose, _sees_all_round(scan), distance_m, turn_rad))
 
     @property
     def lines(self) -> LineMap:
@@ -95,3 +94,16 @@ class LocalSubmap:
 
 def _sees_all_round(scan: KeyScan) -> bool:
     return len(scan.angles) > 1 and scan.angles[-1] - scan.angles[0] > _ALL_ROUND_RAD
+
+
+@njit(cache=True)
+def _is_known(
+    poses: Array, round_views: NDArray[np.bool_], pose: Array, round_view: bool, distance_m: float, turn_rad: float
+) -> bool:
+    """``LocalSubmap.knows`` for scans at ``poses`` ``(n, 3)``, of which ``round_views`` ``(n,)`` see all round."""
+    for k in range(len(poses)):
+        if math.hypot(pose[0] - poses[k, 0], pose[1] - poses[k, 1]) < distance_m and (
+            (round_view and round_views[k]) or abs(wrap(pose[2] - poses[k, 2])) < turn_rad
+        ):
+            return True
+    return False

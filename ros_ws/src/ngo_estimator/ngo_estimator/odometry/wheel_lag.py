@@ -59,7 +59,7 @@ class WheelLag:
     def __init__(self, config: WheelLagConfig | None = None) -> None:
         self.config = config or WheelLagConfig()
         count = round(self.config.largest_s / self.config.step_s)
-        self._lags = np.arange(-count, count + 1) * self.config.step_s
+        self._lags: Array = (np.arange(-count, count + 1) * self.config.step_s).astype(np.float64)
         self._sums = np.zeros(len(self._lags))
         self._weight = 0.0
         self._waiting: deque[tuple[float, float, float]] = deque(maxlen=64)

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array, between, wrap
 from ngo_estimator.odometry.wheel_lag import WheelLag, WheelLagConfig
@@ -94,17 +95,7 @@ class WheelOdometry:
         if self._origin_ns is None:
             return None
         at = (stamp_ns - self._origin_ns) * 1e-9 - self.lag_s
-        rows = self._rows[: self._count]
-        if not rows[0, 0] - 1e-6 <= at <= rows[-1, 0] + self.config.extrapolated_s:
-            return None
-        after = int(np.clip(np.searchsorted(rows[:, 0], at), 1, max(self._count - 1, 1)))
-        if self._count == 1:
-            return rows[0, 1:].copy()
-        (t0, *_), (t1, *_) = rows[after - 1], rows[after]
-        share = (at - t0) / (t1 - t0)
-        result: Array = rows[after - 1, 1:] + share * (rows[after, 1:] - rows[after - 1, 1:])
-        result[2] = wrap(result[2])
-        return result
+        return _pose_at(self._rows, self._count, at, self.config.extrapolated_s)
 
     def observe_turn(self, start_ns: int, end_ns: int, turn: float) -> None:
         """Take a turn (rad) that scans measured between their stamps: it tells the lag."""
@@ -118,3 +109,18 @@ class WheelOdometry:
         """Motion ``(3,)`` between two of the wheels' poses, and the deviations ``(3,)`` of it."""
         moved = between(start, end)
         return moved, self.config.deviations(moved)
+
+
+@njit(cache=True)
+def _pose_at(rows: Array, count: int, at_s: float, extrapolated_s: float) -> Array | None:
+    """The pose ``(3,)`` at a time among the first ``count`` rows; None where there is none."""
+    if not rows[0, 0] - 1e-6 <= at_s <= rows[count - 1, 0] + extrapolated_s:
+        return None
+    if count == 1:
+        return rows[0, 1:].copy()
+    after = min(max(int(np.searchsorted(rows[:count, 0], at_s)), 1), count - 1)
+    before, next_one = rows[after - 1], rows[after]
+    share = (at_s - before[0]) / (next_one[0] - before[0])
+    pose = before[1:] + share * (next_one[1:] - before[1:])
+    pose[2] = wrap(pose[2])
+    return pose
