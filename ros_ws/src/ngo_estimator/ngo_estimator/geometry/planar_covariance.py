@@ -2,7 +2,7 @@
 
 import numpy as np
 
-_PLANAR = np.array([0, 1, 5])  # x, y and yaw among x, y, z, roll, pitch, yaw
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and yaw among x, y, z, roll, pitch, yaw
 _VARIANCES = (1e-10, 1e4)  # farther apart, rounding would make some negative
 
 
@@ -54,13 +54,13 @@ def _is_within(symmetric: np.ndarray) -> bool:
 def to_spatial(covariance: np.ndarray) -> np.ndarray:
     """Row-major ``(36,)`` covariance of x, y, z, roll, pitch, yaw; z, roll and pitch are exactly 0."""
     spatial = np.zeros((6, 6))
-    spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
+    spatial[_PLANAR] = covariance
     return spatial.ravel()
 
 
 def to_planar(spatial: np.ndarray) -> np.ndarray:
     """The covariance ``(3, 3)`` of x, y and yaw in a row-major one ``(36,)`` of x, y, z, roll, pitch, yaw."""
-    return np.asarray(spatial.reshape(6, 6)[np.ix_(_PLANAR, _PLANAR)])
+    return np.asarray(spatial.reshape(6, 6)[_PLANAR])
 
 
 def position_std(covariance: np.ndarray) -> float:

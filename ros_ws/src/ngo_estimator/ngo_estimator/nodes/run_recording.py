@@ -10,6 +10,7 @@ trajectories.mcap (odometry, poses, transforms and paths), map.pgm and map.yaml 
 the recording holds the truth, also truth.tum and metrics.json. The same recording gives the same bytes.
 """
 
+import gc
 import json
 import math
 import sys
@@ -17,6 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
 
 NAME = "run_recording"
 LIDAR_WORLD = "scan"
+_OBJECTS_BETWEEN_COLLECTIONS = 100_000
+"""New objects after which Python looks for cycles among them; its 700 cost imports and messages a twentieth."""
 _SCANS_AT_ONCE = 500
 """Scans that wait for the map: it follows in between, so that memory does not grow with the recording."""
 
@@ -143,6 +147,7 @@ def _run(arguments: Arguments, out: Path, console: Console) -> dict[str, Any]:
             world, topics, core, events = _lidar(arguments, folder, recording, console)
         else:
             world, topics, core, events = _networks(arguments, folder, recording, console)
+        import_module("ngo_estimator.nodes.recorded_output")  # with matplotlib: no work on frames
         began_s = time.monotonic()
         trajectories = _write(arguments, out, recording, topics, core, events, scan_source(folder), console)
     took_s = time.monotonic() - began_s
@@ -335,6 +340,7 @@ def _losses(core: "RecordingRun | LidarRun", images: int) -> list[str]:
 
 def main() -> None:
     """Run with the command line's arguments."""
+    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     console = Console()
     try:
         arguments = tyro.cli(Arguments, prog=NAME, description=__doc__)
