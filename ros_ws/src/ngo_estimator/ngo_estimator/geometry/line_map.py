@@ -100,28 +100,23 @@ def averaged_lines(points: Array, normals: Array, squares: NDArray[np.int64]) ->
     Points without normals are left out. Averages are less noisy than single points, and fewer.
     """
     order = np.argsort(squares)
-    mean_points, mean_normals = np.zeros_like(points), np.zeros_like(normals)
-    last, size, count = np.int64(-1), 0, 0
-    for i in order:
-        if squares[i] < 0:
-            continue
-        if squares[i] != last:
-            if size:
-                _finish(mean_points, mean_normals, count - 1, size)
-            last, size, count = squares[i], 0, count + 1
-        for axis in range(2):
-            mean_points[count - 1, axis] += points[i, axis]
-            mean_normals[count - 1, axis] += normals[i, axis]
-        size += 1
-    if size:
-        _finish(mean_points, mean_normals, count - 1, size)
+    mean_points, mean_normals = np.empty_like(points), np.empty_like(normals)
+    count, begin = 0, 0
+    while begin < len(order) and squares[order[begin]] < 0:
+        begin += 1
+    while begin < len(order):
+        square, end = squares[order[begin]], begin
+        x, y, normal_x, normal_y = 0.0, 0.0, 0.0, 0.0
+        while end < len(order) and squares[order[end]] == square:
+            i = order[end]
+            x, y = x + points[i, 0], y + points[i, 1]
+            normal_x, normal_y = normal_x + normals[i, 0], normal_y + normals[i, 1]
+            end += 1
+        size, length = end - begin, math.hypot(normal_x, normal_y)
+        mean_points[count, 0], mean_points[count, 1] = x / size, y / size
+        mean_normals[count, 0], mean_normals[count, 1] = normal_x / length, normal_y / length
+        count, begin = count + 1, end
     return mean_points[:count].copy(), mean_normals[:count].copy()
-
-
-@njit(cache=True)
-def _finish(points: Array, normals: Array, i: int, size: int) -> None:
-    points[i] /= size
-    normals[i] /= math.hypot(normals[i, 0], normals[i, 1])
 
 
 @njit(cache=True)
