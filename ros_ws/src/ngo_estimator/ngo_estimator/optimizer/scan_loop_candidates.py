@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from ngo_estimator.optimizer.shortest_ways import shortest_ways
 
 
 @dataclass(frozen=True)
@@ -41,36 +42,16 @@ class WindowConfig:
             )
 
 
-@njit(cache=True)
 def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarray:
     """Length ``(keys,)`` of the shortest way through the graph from a key to each other (m).
 
-    The ways lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys. Each sweep goes
-    along the chain in both directions and over all loops: a way over n loops is found in n sweeps.
+    The ways lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys.
     """
-    count = len(poses)
-    nodes = np.empty((count - 1 + len(loops), 2), np.int64)
-    for k in range(count - 1):
-        nodes[k, 0], nodes[k, 1] = k, k + 1
-    nodes[count - 1 :] = loops
-    lengths = np.empty(len(nodes))
-    for k in range(len(nodes)):
-        x = poses[nodes[k, 1], 0] - poses[nodes[k, 0], 0]
-        y = poses[nodes[k, 1], 1] - poses[nodes[k, 0], 1]
-        lengths[k] = math.sqrt(x * x + y * y) + 1e-3  # a loop takes a way, too
-    distances = np.full(count, math.inf)
-    distances[key] = 0.0
-    changed = True
-    while changed:
-        changed = False
-        for turn in range(2):
-            for k in range(len(nodes)):
-                edge = len(nodes) - 1 - k if turn else k
-                a, b = nodes[edge, 0], nodes[edge, 1]
-                if distances[a] + lengths[edge] < distances[b]:
-                    distances[b], changed = distances[a] + lengths[edge], True
-                elif distances[b] + lengths[edge] < distances[a]:
-                    distances[a], changed = distances[b] + lengths[edge], True
+    chain = np.arange(len(poses) - 1)
+    nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), loops))
+    lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
+    # A loop takes a way, too, where both of its keys are in one place.
+    distances: np.ndarray = shortest_ways(nodes, lengths + 1e-3, len(poses), key)
     return distances
 
 

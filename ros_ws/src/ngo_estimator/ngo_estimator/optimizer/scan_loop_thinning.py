@@ -6,7 +6,8 @@ The cost of an optimisation then follows what the robot saw, and not how often i
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+
+from ngo_estimator.optimizer.shortest_ways import shortest_ways
 
 WALLS_M = 4.0
 """Distance of the walls: an error of heading counts by what it moves there."""
@@ -37,8 +38,7 @@ def needed_loops(
     count = int(joined.max(initial=0)) + 1
     for k, (earlier, later) in enumerate(pairs):
         limit = redundant * own_variance[k]
-        graph = edge_graph(joined[kept], variance[kept], count)
-        known = dijkstra(graph, directed=False, indices=later, limit=limit)[earlier] <= limit
+        known = shortest_ways(joined[kept], variance[kept], count, later)[earlier] <= limit
         kept[len(edges) + k] = surprising[k] or not known
     return kept[len(edges) :]
 

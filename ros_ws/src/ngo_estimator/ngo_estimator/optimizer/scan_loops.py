@@ -517,8 +517,9 @@ def _within(points: np.ndarray, range_m: float) -> np.ndarray:
 
 
 def _spread(points: np.ndarray, cell_m: float, most: int) -> np.ndarray:
-    """One point of each cell, and of these every so many that at most ``most`` remain."""
-    _, first = np.unique(np.floor(points / cell_m).astype(np.int64), axis=0, return_index=True)
+    """One point ``(n, 2)`` of each cell, and of these every so many that at most ``most`` remain."""
+    row, column = np.floor(points / cell_m).astype(np.int64).T
+    _, first = np.unique((row << 32) + column, return_index=True)
     chosen = points[np.sort(first)]
     return chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)] if len(chosen) > most else chosen
 

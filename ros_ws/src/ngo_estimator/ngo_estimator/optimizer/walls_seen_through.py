@@ -36,11 +36,19 @@ class PlacedScans:
 
 def range_profile(scan: KeyScan) -> Array:
     """Least range ``(360,)`` within a degree of each direction from the sensor (m, 0 where no ray came back)."""
+    profile: Array = _profile(scan.angles, scan.ranges)
+    return profile
+
+
+@njit(cache=True)
+def _profile(angles: Array, ranges: Array) -> Array:
     nearest = np.full(PROFILE_BINS, np.inf)
-    known = np.isfinite(scan.ranges)
-    bins = np.floor(scan.angles[known] * (PROFILE_BINS / (2.0 * math.pi))).astype(np.int64)
-    for neighbour in (-1, 0, 1):
-        np.minimum.at(nearest, (bins + neighbour) % PROFILE_BINS, scan.ranges[known])
+    for k in range(len(ranges)):
+        if not math.isfinite(ranges[k]):
+            continue
+        direction = math.floor(angles[k] * (PROFILE_BINS / (2.0 * math.pi)))
+        for neighbour in range(direction - 1, direction + 2):
+            nearest[neighbour % PROFILE_BINS] = min(nearest[neighbour % PROFILE_BINS], ranges[k])
     return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
