@@ -35,6 +35,8 @@ class KeyScans:
 
     def scans(self, step: RelativeStep) -> list[Stamped]:
         """The key scan, and the first scan of all."""
+        if step.origin_scan is None and step.key is None:
+            return []
         check_step(step, 0, None)
         keys = [step.origin_scan, step.key.scan if step.key is not None else None]
         return [

@@ -203,7 +203,8 @@ def _write(
                 output.add(event)
                 if output.waiting >= _SCANS_AT_ONCE and (trajectory := core.trajectory()) is not None:
                     output.follow(trajectory)
-                progress.update(task, completed=core.frames)
+                if not bar.disable:
+                    progress.update(task, completed=core.frames)
                 continue
             found.append(
                 {

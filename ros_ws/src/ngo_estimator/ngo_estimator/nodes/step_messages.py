@@ -1,5 +1,6 @@
 """The messages that both nodes publish about a step as bytes, written by numpy: much cheaper than by objects."""
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -143,5 +144,5 @@ def _stamp(stamp_ns: int) -> bytes:
 
 def _pose(pose_xyyaw: np.ndarray) -> np.ndarray:
     """Position and quaternion ``(7,)`` of a pose ``(3,)``."""
-    x, y, yaw = pose_xyyaw
-    return np.array((x, y, 0.0, 0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)))
+    x, y, yaw = pose_xyyaw.tolist()
+    return np.array((x, y, 0.0, 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)))

@@ -1,5 +1,6 @@
 """Key scans in bounded memory: compact, and forgotten where many others show the same place."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -135,7 +136,10 @@ class KeyScanStore(Sequence[KeyScan]):
 def _whole(scan: KeyScan) -> KeyScan:
     if scan.points.dtype == np.float64:
         return scan
-    return replace(scan, points=scan.points.astype(np.float64), normals=scan.normals.astype(np.float64))
+    whole = copy.copy(scan)  # not a new one: nothing needs to be checked again
+    object.__setattr__(whole, "points", scan.points.astype(np.float64))
+    object.__setattr__(whole, "normals", scan.normals.astype(np.float64))
+    return whole
 
 
 def _most_redundant(poses: np.ndarray, keys: np.ndarray, count: int) -> list[list[int]]:
