@@ -59,7 +59,7 @@ class LocalSubmap:
 
         Scanners that see all round may be turned as they like.
         """
-        poses, round_views = np.array(self._poses), np.array(self._round_views)
+        poses, round_views = np.array(self._poses).reshape(-1, 3), np.array(self._round_views, np.bool_)
         return bool(_is_known(poses, round_views, pose, _sees_all_round(scan), distance_m, turn_rad))
 
     @property
