@@ -11,6 +11,7 @@ NAME ?= my_robot
 ARGS ?=
 TRAIN_ARGS ?=
 VIEW ?=
+WORKERS ?= 2
 
 export PYTHON ROS V
 
@@ -54,8 +55,10 @@ results: build ## tables and figures of a world, from networks to docs/: WORLD=m
 bench: build ## speed of nodes and online core beside GTSAM, last a line of JSON: ARGS="--worlds maze3d"
 	@$(OPEN) && exec python -m benchmarks.online $(ARGS)
 
-test: build ## every test below tests/: ARGS="tests/unit -k name" goes to pytest
-	@$(OPEN) && exec python -m pytest $(ARGS)
+# A file's tests stay in one worker, which share what they need. Files in the order of their names: the many short ones
+# come last, so that workers end together.
+test: build ## every test below tests/, WORKERS=2 at a time: ARGS="tests/unit -k name" goes to pytest
+	@$(OPEN) && exec python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 fuzz: build ## minutes of mutated files, messages and service calls: ARGS="--files 10000 --messages 100000"
 	@$(OPEN) && exec python -m tests.fuzz $(ARGS)

@@ -21,7 +21,7 @@ from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.meta_poses import MetaSteps
-from training.common.runs import WEIGHTS
+from training.common.records import WEIGHTS
 from training.data.episodes import images_of
 from training.data.worlds import world_named
 

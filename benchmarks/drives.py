@@ -20,7 +20,7 @@ from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.episodes import Episode
-from training.common.runs import ROOT, WEIGHTS
+from training.common.records import ROOT, WEIGHTS
 from training.data.batches import seen_from_first
 from training.data.features import features_of
 from training.data.worlds import MazeSize, world_named

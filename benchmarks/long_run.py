@@ -39,7 +39,7 @@ from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
-from training.common.runs import ROOT, WEIGHTS
+from training.common.records import ROOT, WEIGHTS
 from training.data.batches import seen_from_first
 from training.data.building_drives import building_drive
 from training.data.lidar_drives import LidarDrive, TruePoses

@@ -24,7 +24,7 @@ from benchmarks.drives import CACHE, drive_of, stamp_ns
 from benchmarks.pinned import in_process, two_cores
 from ngo_estimator.mapping.scan_map import ScanMap, warm_up
 from ngo_estimator.mapping.scan_source import scan_source
-from training.common.runs import WEIGHTS
+from training.common.records import WEIGHTS
 
 LONGEST_UPDATE_S, LONGEST_FOLLOW_S = 0.5, 1.0
 BUDGET_S = 0.35

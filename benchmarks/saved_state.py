@@ -35,7 +35,7 @@ from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.saved_state import read_state, write_state
 from ngo_estimator.online.scan_graph import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from training.common.runs import WEIGHTS
+from training.common.records import WEIGHTS
 
 MOST_LOAD_S = 5.0
 

@@ -18,6 +18,9 @@ from typing import Any
 import yaml
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
+FIRST_FREE_DOMAIN = 51
+"""The ROS domains from here on are for `free_domain_id`; those below are for test runs, which claim theirs first."""
+
 _LOG_TAIL_LINES = 15
 _POLL_S = 0.05
 _END_S = 20.0  # a loaded machine; a second Ctrl-C kills at once
@@ -173,18 +176,18 @@ class Graph:
 
 
 def free_domain_id() -> int:
-    """A ROS domain that no process of this machine uses now.
+    """A ROS domain that no process of this machine uses now, and that no test run claims.
 
     The first participant of domain d takes UDP port 7410 + 250 d; above domain 101 these ports meet those that Linux
     hands out by itself.
     """
-    first = 1 + os.getpid() % 100
-    for offset in range(100):
-        domain_id = 1 + (first + offset) % 100
+    domains = range(FIRST_FREE_DOMAIN, 102)
+    for offset in range(len(domains)):
+        domain_id = domains[(os.getpid() + offset) % len(domains)]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind(("", 7410 + 250 * domain_id))
             except OSError:
                 continue
             return domain_id
-    raise GraphError("all ROS domains from 1 to 100 are in use on this machine")
+    raise GraphError(f"all ROS domains from {domains[0]} to {domains[-1]} are in use on this machine")

@@ -24,7 +24,7 @@ from ngo_estimator.mapping.scan_source import scan_source
 from ngo_estimator.trajectory.files import write_tum
 from ngo_sim.flow_control import header_stamp_ns
 from ngo_sim.mazes import Maze
-from training.common.runs import WEIGHTS
+from training.common.records import WEIGHTS
 from training.recordings.recorder import Recorder
 
 START_TIMEOUT_S = 180.0  # the first start after an installation compiles

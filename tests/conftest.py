@@ -1,4 +1,4 @@
-"""Gives each test run a ROS 2 domain of its own, and removes what its killed processes leave behind."""
+"""Gives each process of a test run a ROS 2 domain of its own, and removes what killed processes leave behind."""
 
 import contextlib
 import ctypes
@@ -7,19 +7,20 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
 import pytest
 
+from demo.graph import FIRST_FREE_DOMAIN
+
 SHARED_MEMORY = Path("/dev/shm")
-# Above 101 the ports of a domain meet those that Linux hands out to others; 0 is what people use by hand.
-DOMAINS = range(1, 102)
+# 0 is what people use by hand. Those above are for `demo.graph`, which takes an idle one, as ours are at times.
+DOMAINS = range(1, FIRST_FREE_DOMAIN)
 
 
 def claim_domain() -> tuple[int, IO[str]]:
-    """A domain that no other test run on this machine uses, and the lock that keeps it."""
+    """A domain that no other process of tests on this machine uses, and the lock that keeps it."""
     for offset in range(len(DOMAINS)):
         domain = DOMAINS[(os.getpid() + offset) % len(DOMAINS)]
         path = Path(tempfile.gettempdir()) / f"ngo_test_domain_{domain}.lock"
@@ -29,13 +30,17 @@ def claim_domain() -> tuple[int, IO[str]]:
         except OSError:
             continue
         return domain, lock
-    raise RuntimeError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use by other test runs")
+    raise RuntimeError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use by other processes of tests")
 
 
 # Before any test module imports rclpy: children inherit both.
 _domain, _domain_lock = claim_domain()
 os.environ["ROS_DOMAIN_ID"] = str(_domain)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+# Processes that run tests side by side share the cores already. Before any test module imports torch.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 # A shell that runs this in the background hands over an ignored SIGINT, which children would inherit.
@@ -102,10 +107,21 @@ def remove_orphans(before: set[Path]) -> list[Path]:
     return removed
 
 
-@pytest.fixture(scope="session", autouse=True)
-def leave_nothing_behind() -> Iterator[None]:
+_CHILDREN = pytest.StashKey[set[int]]()
+_FILES = pytest.StashKey[set[Path]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Note what was there before this run."""
+    config.stash[_CHILDREN] = children()
+    # With `-n` the workers' parent alone removes files, when the last worker has ended: what one does not use yet, for
+    # its nodes are about to start, must not be removed by another.
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        config.stash[_FILES] = shared_memory_files()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
     """Remove what the killed processes of this run leave: their own children, and files in shared memory."""
-    files, processes = shared_memory_files(), children()
-    yield
-    end_leftover_children(processes)
-    remove_orphans(files)
+    end_leftover_children(config.stash[_CHILDREN])
+    if _FILES in config.stash:
+        remove_orphans(config.stash[_FILES])

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.episodes import simulate
 from training.data.features import features_of
@@ -36,7 +36,7 @@ class Arguments:
     """Trajectories, each in a validation maze of its own."""
     frames: int = 0
     """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with WORLD/*.safetensors; the optimizer's description gets the factor."""
 
 

@@ -26,7 +26,7 @@ from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings
-from training.common import runs
+from training.common import records
 from training.data.episodes import simulate
 from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, WorldName, world_named
@@ -54,7 +54,7 @@ class Arguments:
     """Trajectories, each in a maze of its own."""
     frames: int = 0
     """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with NAME/*.safetensors."""
     online: bool = True
     """Whether to measure the online estimate also; it runs the optimizer at every eighth frame."""
@@ -77,7 +77,7 @@ class Arguments:
     """Files: whether pairs of the RPE start at every pose, or at the end of the pair before."""
     segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
     """Files: lengths of KITTI's segments."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Recordings: folder with NAME/data, which was read from them; gets NAME/results/."""
 
     def __post_init__(self) -> None:

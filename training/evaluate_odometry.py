@@ -17,7 +17,7 @@ from typing import Any, Literal
 import tyro
 
 from ngo_estimator.checkpoint import load_local
-from training.common import runs
+from training.common import records
 from training.data.worlds import world_named
 from training.report.results_page import interval, markdown
 from training.scoring.validation_steps import odometry_errors
@@ -30,7 +30,7 @@ class Arguments:
 
     world: Literal["maze2d", "maze3d"]
     """World to drive in."""
-    weights: tuple[Path, ...] = (runs.WEIGHTS,)
+    weights: tuple[Path, ...] = (records.WEIGHTS,)
     """Folders with WORLD/local_pose_network.safetensors."""
     driver: str | None = None
     """Driver; none: the world's."""

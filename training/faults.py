@@ -22,9 +22,9 @@ from ngo_estimator.checkpoint import FAMILIARITY, load_local, load_place
 from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data.episodes import simulate
 from training.data.faults import SensedDrive, faulted
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
@@ -59,13 +59,13 @@ class Arguments:
     """Frames of a drive."""
     worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")
     """Worlds to measure."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with WORLD/*.safetensors."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets faults.json."""
-    docs: Path = runs.ROOT / "docs"
+    docs: Path = records.ROOT / "docs"
     """Folder that gets results_faults.md."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of what was measured."""
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
             for name in (SCENARIOS[arguments.split] if world == "doom" else (CLEAN, *FAULTS_OF[world]))
         }
     result = {
-        **runs.record("faults", arguments),
+        **records.record("faults", arguments),
         "split": arguments.split,
         "drives": arguments.mazes,
         "frames": arguments.frames,

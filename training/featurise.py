@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_place
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.data_source import MIRRORED_STORE, OTHER_TRAIN_STORE, TRAIN_STORE
 from training.data.drive_plan import Drives, drives_of_table
@@ -59,9 +59,9 @@ class Arguments:
     """Trajectories of the validation split for each table of results."""
     test_trajectories: int = 0
     """Trajectories of the test split for each table of results."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with NAME/local_pose_network.safetensors and NAME/place_encoder.safetensors."""
-    out: Path = runs.ROOT / "runs"
+    out: Path = records.ROOT / "runs"
     """Folder that gets NAME/features/."""
     part: int = 0
     """Number of this process, from 0, where several share the work."""
@@ -127,7 +127,7 @@ def _main_recorded(arguments: Arguments) -> None:
     place, place_description = load_place(arguments.weights / name, name)
     data = open_recorded(arguments.recordings, arguments.out, (local, local_description))
     if place.config.image != local.config.image:
-        raise runs.RunError(
+        raise records.RunError(
             f"the place encoder of {name} takes {place.config.image}, its local network {local.config.image}; expected "
             "one sensor: train the place encoder anew"
         )

@@ -27,7 +27,7 @@ from training import (
     tune_pose_graph,
 )
 from training.baselines.deepvo import DEEPVO
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data.data_source import TRAIN_STORE
 from training.data.feature_store import open_store
 from training.scoring.network_odometry import make_odometry, open_odometry

@@ -27,9 +27,9 @@ import training
 from ngo_common.files import written_whole
 from ngo_estimator.geometry import se2
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data.kidnapped_drives import Features, kidnapped_drives
 from training.data.worlds import WORLDS, World
 from training.recordings.lidar_logs import log_identity, logs_below, read_drive
@@ -73,13 +73,13 @@ class Arguments:
     """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: they stay as the JSON has them."""
     log_starts: int = 20
     """Starts in each log."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with WORLD/*.safetensors."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets relocalisation.json."""
-    docs: Path = runs.ROOT / "docs"
+    docs: Path = records.ROOT / "docs"
     """Folder that gets results_relocalisation.md."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of drives, maps and what was measured."""
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write the JSON, and return its content."""
-    record, path = runs.record("relocalisation", arguments), arguments.out / "relocalisation.json"
+    record, path = records.record("relocalisation", arguments), arguments.out / "relocalisation.json"
     result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}, "logs": {}}
     made = {"command": record["command"], "revision": record["revision"]}
     if arguments.tables:

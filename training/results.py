@@ -20,9 +20,9 @@ import numpy as np
 from tqdm import tqdm
 
 from training import results_doom, results_scan
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.prerequisites import Scripts, Wanted, prepare
@@ -49,13 +49,13 @@ class Arguments:
     """Trainings of each optimizer, with the seeds 0, 1, ..."""
     prefixes: tuple[int, ...] = ()
     """Numbers of steps after which errors are given, as if the robot had stopped there; none: the world's."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with WORLD/*.safetensors of the local network and the place encoder."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets WORLD.json, and holds WORLD.gtsam.json."""
-    docs: Path = runs.ROOT / "docs"
+    docs: Path = records.ROOT / "docs"
     """Folder that gets results_WORLD.md and images/."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of feature stores, rows' weights, logs and estimates."""
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ _ATTENTION_TRAJECTORIES = 24
 
 def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]:
     """Make what is missing, measure, write everything, and return the JSON's content."""
-    world, record = world_named(arguments.world), runs.record("results", arguments)
+    world, record = world_named(arguments.world), records.record("results", arguments)
     trajectories, prefixes = arguments.trajectories or world.table_trajectories, arguments.prefixes or world.prefixes
     arguments = replace(arguments, trajectories=trajectories, prefixes=prefixes)
     sources = Sources(world, arguments.weights, arguments.runs, arguments.out)

@@ -25,9 +25,9 @@ from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
 from training.data.episodes import images_of
 from training.data.features import features_of
@@ -67,13 +67,13 @@ class Arguments:
     """Frames of a drive."""
     maps: int = 0
     """Number of maps; 0: all."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with doom/*.safetensors."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets doom.json, and holds doom.gtsam.json."""
-    docs: Path = runs.ROOT / "docs"
+    docs: Path = records.ROOT / "docs"
     """Folder that gets results_doom.md and images/."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of what is kept of each drive."""
 
 
@@ -85,7 +85,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     rows = row_estimators(arguments, drives)
     seeds = range(_FIRST_SEED[arguments.split], _FIRST_SEED[arguments.split] + arguments.seeds)
     maps = _MAPS[arguments.split][: arguments.maps or None]
-    result: dict[str, Any] = {**runs.record("results_doom", arguments), "path_m": {}, "returns": {}, "maps": {}}
+    result: dict[str, Any] = {**records.record("results_doom", arguments), "path_m": {}, "returns": {}, "maps": {}}
     result.pop("arguments")
     tracks: dict[str, dict[str, np.ndarray]] = {}
     for of in tqdm(maps, desc=f"{arguments.world} {arguments.split}", unit="map"):

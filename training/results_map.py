@@ -25,9 +25,9 @@ from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
 from ngo_estimator.mapping.scan_source import KeyScans, ScanSource, scan_source
 from ngo_estimator.odometry.lidar_odometry import LidarStep
 from ngo_estimator.optimizer.whole_trajectory import optimize_offline
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data.episodes import GROUP, simulate
 from training.data.features import OPTIMIZER_INPUTS, features_of
 from training.data.lidar_drives import ReferencePoses
@@ -65,11 +65,11 @@ class Arguments:
     """Log odds that a scan takes from a cell which it looks through."""
     max_range_m: float = 0.0
     """Longest range that enters a map; 0: that of ngo_map."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with the weights of each world."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets map.json."""
-    docs: Path = runs.ROOT / "docs"
+    docs: Path = records.ROOT / "docs"
     """Folder that gets results_map.md."""
 
     def __post_init__(self) -> None:
@@ -84,7 +84,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record = runs.record("results_map", arguments)
+    record = records.record("results_map", arguments)
     skipped: list[str] = []
     result = {
         "command": "python -m training.results_map" + (" --logs FOLDER" if arguments.logs else ""),

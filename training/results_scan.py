@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from ngo_recordings import mounting, recording, scan_stream, topics
 from ngo_sim import building2d, episodes, maze2d
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
-from training.common.curves import write_at_once
+from training.common.records import write_at_once
 from training.data import building_drives, scans, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
 from training.data.scans import CONDITIONS
@@ -73,13 +73,13 @@ class Arguments:
     """Rows to measure, by name; none: all."""
     known: bool = False
     """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
-    weights: Path = runs.WEIGHTS / "scan"
+    weights: Path = records.WEIGHTS / "scan"
     """Folder with lidar.json, the settings of our estimators."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets scan.json."""
-    docs: Path = runs.ROOT / "docs"
+    docs: Path = records.ROOT / "docs"
     """Folder that gets results_scan.md and images/."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of what was measured."""
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record = runs.record("results", arguments)
+    record = records.record("results", arguments)
     rows, skipped = _rows(arguments.rows)
     slip_rows = {name: row for name, row in rows.items() if name in _SLIP_ROWS}
     tables = {

@@ -22,9 +22,10 @@ from ngo_estimator.checkpoint import save_checkpoint
 from ngo_estimator.geometry import se2
 from training.baselines.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
 from training.baselines.graph_settings import fit_calibration
-from training.common import runs
+from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.step_losses import step_losses, step_metrics, windows_within
+from training.common.trainer_arguments import TrainerArguments
 from training.data import episodes
 from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, seen_from_first
 from training.data.data_module import StreamedData
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(TrainerArguments):
     """Settings of a training of DeepVO."""
 
     world: Literal["maze3d"]
@@ -63,9 +64,9 @@ class Arguments(runs.TrainerArguments):
     """Processes that simulate for each one that trains."""
     seed: int = 0
     """Seed of the initial weights."""
-    out: Path = runs.ROOT / "runs"
+    out: Path = records.ROOT / "runs"
     """Folder that gets WORLD/deepvo.safetensors."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of checkpoints and logs."""
 
 

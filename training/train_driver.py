@@ -28,8 +28,8 @@ from tqdm import tqdm
 
 from ngo_common.files import written_whole
 from ngo_sim.policy_network import SHIPPED, PolicyConfig
-from training.common import runs
-from training.common.curves import write_at_once
+from training.common import records
+from training.common.records import write_at_once
 from training.data.worlds import World, world_named
 from training.driver.driver_network import Features, MirroredPolicy, export
 from training.driver.driving_task import REWARD_PER_M, DrivingTask
@@ -78,7 +78,7 @@ class Arguments:
     """Seed of the weights, the mazes and the actions."""
     out: Path = SHIPPED
     """File that gets the weights; its JSON lies beside it."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of checkpoints and logs."""
 
     def __post_init__(self) -> None:
@@ -166,7 +166,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     """Train to the last decision, from the last checkpoint; returns the description written beside the weights."""
     torch.set_num_threads(arguments.threads)
     folder = arguments.runs / "maze3d" / "driver"
-    record = runs.record("train_driver", arguments)
+    record = records.record("train_driver", arguments)
     state = load_state(folder, record)
     done = 0 if state is None else int(state["decisions"])
     write_at_once(folder / "run.json", json.dumps({**record, "state": "running"}, indent=2) + "\n")
@@ -263,7 +263,7 @@ def load_state(folder: Path, record: dict[str, Any]) -> dict[str, Any] | None:
     if differing := sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name)):
         given = ", ".join(f"{name} {now.get(name)}" for name in differing)
         expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
-        raise runs.RunError(
+        raise records.RunError(
             f"{folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, or the "
             "folder removed to begin anew"
         )

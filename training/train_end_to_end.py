@@ -31,9 +31,10 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
 from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
-from training.common import runs
+from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
+from training.common.trainer_arguments import TrainerArguments
 from training.data.batches import Batch, Share
 from training.data.data_module import StreamedData
 from training.data.streams import TrajectoryStream
@@ -43,7 +44,7 @@ from training.train_optimizer import trajectory_loss
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(TrainerArguments):
     """Settings of a training of all networks together."""
 
     world: Literal["maze2d", "maze3d"]
@@ -68,11 +69,11 @@ class Arguments(runs.TrainerArguments):
     """Processes that simulate for each one that trains."""
     seed: int = 0
     """Seed of whatever is drawn at random."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with WORLD/ as the stages made it: the three networks to start from."""
-    out: Path = runs.ROOT / "runs" / "end_to_end"
+    out: Path = records.ROOT / "runs" / "end_to_end"
     """Folder that gets WORLD/ with the three networks."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of checkpoints and logs."""
 
 

@@ -35,7 +35,7 @@ from ngo_estimator.networks.familiarity import (
     told_vector,
 )
 from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.batches import action_histories, relative_poses, seen_from_first
 from training.data.episodes import simulate
@@ -73,9 +73,9 @@ class Arguments:
     """Drives that get each fault."""
     frames: int = 400
     """Frames of a drive."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with NAME/*.safetensors, which gets NAME/familiarity.safetensors."""
-    out: Path = runs.ROOT / "runs"
+    out: Path = records.ROOT / "runs"
     """Folder of recordings that were read."""
 
     def __post_init__(self) -> None:
@@ -126,7 +126,7 @@ def main(arguments: Arguments) -> Familiarity:
     details: dict[str, Any] = {
         f"{LOCAL}_sha256": about_local["sha256"],
         f"{PLACE}_sha256": about_place["sha256"],
-        "training": runs.record("train_familiarity", arguments),
+        "training": records.record("train_familiarity", arguments),
         "metrics": {"validation": {f"within_three_deviations_{kind}": share for kind, share in shares.items()}},
     }
     save_checkpoint(folder / f"{FAMILIARITY}.safetensors", familiarity, FAMILIARITY, name, details)

@@ -26,7 +26,7 @@ from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
-from training.common import runs
+from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics
 from training.data.batches import ACTION_HISTORY, Batch, Share, action_histories, relative_poses
@@ -69,9 +69,9 @@ class Arguments(SourceArguments):
     """Processes that simulate for each one that trains."""
     seed: int = 0
     """Seed of the initial weights."""
-    out: Path = runs.WEIGHTS
+    out: Path = records.WEIGHTS
     """Folder that gets NAME/local_pose_network.safetensors."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of checkpoints and logs."""
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ from ngo_estimator.optimizer.loop_closure import LoopSearch
 from ngo_estimator.optimizer.loop_judge import LoopJudge, evidence_of
 from ngo_estimator.optimizer.meta_poses import with_origin
 from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.doom_drives import doom_episodes
 from training.data.features import Networks, features_of
@@ -66,7 +66,7 @@ class Arguments:
     """Learning rate at first; it falls to zero."""
     seed: int = 0
     """Seed of the initial weights."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with doom/*.safetensors, which gets the optimizer."""
 
     def __post_init__(self) -> None:
@@ -170,11 +170,11 @@ def main(arguments: Arguments) -> None:
             drives.append(judged_of(optimizer, networks.place.pair_head, features))
     loops = together(drives)
     if len(loops.off) < 2:
-        raise runs.RunError(f"there are {len(loops.off)} loops to learn from; expected drives that return")
+        raise records.RunError(f"there are {len(loops.off)} loops to learn from; expected drives that return")
     judge = learn(loops, arguments.steps, arguments.learning_rate, arguments.seed)
     optimizer.loop_judge.load_state_dict(judge.state_dict())
     metrics = {"loops": len(loops.off), "true": float(loops.true.double().mean())}
-    training = {**runs.record("train_loop_judge", arguments), "metrics": metrics}
+    training = {**records.record("train_loop_judge", arguments), "metrics": metrics}
     details = {"place_encoder_sha256": place_sha256, "judge": training, "metrics": {}}
     save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, "doom", details)
     print(f"{metrics['loops']} loops, {metrics['true']:.0%} true")

@@ -29,7 +29,7 @@ from ngo_estimator.optimizer.neural_graph_optimizer import (
     NeuralGraphOptimizer,
     NeuralGraphOptimizerConfig,
 )
-from training.common import runs
+from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.precision import Precision
 from training.data.batches import Batch
@@ -85,11 +85,11 @@ class Arguments(SourceArguments):
     """Seed of initial weights and of the order of the data."""
     precision: Precision = field(default="32-true", kw_only=True)
     """Arithmetic of the network; loops are always closed in float64."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with NAME's other networks."""
-    out: Path = runs.WEIGHTS
+    out: Path = records.WEIGHTS
     """Folder that gets NAME/neural_graph_optimizer.safetensors."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
 
 
@@ -252,7 +252,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     if NO_LOOPS in place_description:
         return _without_loops(arguments, domain, about, str(place_description[NO_LOOPS]))
     if arguments.smoothing and arguments.form != "paper" and place.config.registers_odometry:
-        raise runs.RunError(
+        raise records.RunError(
             f"smoothing is asked for in {domain.name}, whose odometry is registered; expected one of the two, as what "
             "smooths odometry learned from steps that are not"
         )
@@ -327,7 +327,7 @@ def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], 
     print(f"no loops will be closed{' and nothing is smoothed' if arguments.smoothing else ''}: {why}")
     aggregation = config_of(arguments, domain, (1.0, 1.0, 1.0)).aggregation
     optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig.paper_form(aggregation, iterations=1))
-    details = {NO_LOOPS: why, **about, "training": runs.record("train_optimizer", arguments), "metrics": {}}
+    details = {NO_LOOPS: why, **about, "training": records.record("train_optimizer", arguments), "metrics": {}}
     path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
     save_checkpoint(path, optimizer, OPTIMIZER, domain.name, details)
     return {}

@@ -22,7 +22,7 @@ from torch.utils.data import IterableDataset
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PlaceConfig
-from training.common import runs
+from training.common import records, runs
 from training.common.command_line import run_command
 from training.data.batches import Batch, Share
 from training.data.data_module import StreamedData
@@ -59,9 +59,9 @@ class Arguments(SourceArguments):
     """Processes that simulate for each one that trains."""
     seed: int = 0
     """Seed of the initial weights."""
-    out: Path = runs.WEIGHTS
+    out: Path = records.WEIGHTS
     """Folder that gets NAME/place_encoder.safetensors."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of checkpoints and logs."""
 
 
@@ -256,7 +256,7 @@ def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetwork
         print(f"ranges that {arguments.recordings.from_weights} sees in pictures are left out: recordings hold none")
         networks = networks.without_ranges()
     if (networks.config.sees_ranges or domain.sees_ranges) and networks.config.registration != domain.registration:
-        raise runs.RunError(
+        raise records.RunError(
             f"{arguments.recordings.from_weights} has the registration {networks.config.registration}; expected "
             f"{domain.registration}, that of {domain.name}"
         )
@@ -267,7 +267,7 @@ def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> 
     """The encoder as it was, which the estimator needs to run, and which tells the optimizer to close no loops."""
     print(f"places are not learned: {why}")
     networks, begun = initial_networks(arguments, recorded.domain)
-    training = {**runs.record("train_place", arguments), **begun}
+    training = {**records.record("train_place", arguments), **begun}
     details = {NO_LOOPS: why, "training": training, "data": recorded.about, "metrics": {}}
     path = arguments.out / recorded.domain.name / f"{PLACE}.safetensors"
     save_checkpoint(path, networks, PLACE, recorded.domain.name, details)

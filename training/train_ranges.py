@@ -21,7 +21,7 @@ from tqdm import trange
 
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
 from ngo_estimator.networks.place_encoder import SeenRanges
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.doom_drives import doom_episodes
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS
@@ -44,7 +44,7 @@ Frames = tuple[Tensor, Tensor]
 class Arguments:
     """Settings of a training of ranges."""
 
-    from_weights: Path = runs.WEIGHTS / "maze3d"
+    from_weights: Path = records.WEIGHTS / "maze3d"
     """Folder with a place encoder that sees ranges."""
     drives: int = 400
     """Drives to learn from, half of them on training maps."""
@@ -60,7 +60,7 @@ class Arguments:
     """Highest learning rate; it falls to zero."""
     seed: int = 0
     """Seed of the order of the data."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with doom/place_encoder.safetensors, which is written anew."""
 
 
@@ -96,7 +96,7 @@ def driven(seeds: range, arguments: Arguments, networks: PlaceNetworks) -> Frame
 def with_ranges(networks: PlaceNetworks, seeing: PlaceNetworks) -> PlaceNetworks:
     """The networks with the ranges of others, of early features that need not be theirs; raises ``RunError``."""
     if not seeing.config.sees_ranges or seeing.config.width != networks.config.width:
-        raise runs.RunError(
+        raise records.RunError(
             f"the encoder to begin with has width {seeing.config.width} and sees ranges: {seeing.config.sees_ranges}; "
             f"expected width {networks.config.width}, and ranges"
         )
@@ -165,7 +165,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     learn(networks, driven(range(first, first + arguments.drives), arguments, networks), arguments)
     metrics = measured(networks, driven(VALIDATION_SEEDS[:16], arguments, networks))
     kept = {name: value for name, value in described.items() if name not in _OWN}
-    about = {**runs.record("train_ranges", arguments), "began_with_sha256": began["sha256"], "metrics": metrics}
+    about = {**records.record("train_ranges", arguments), "began_with_sha256": began["sha256"], "metrics": metrics}
     save_checkpoint(folder / f"{PLACE}.safetensors", networks, PLACE, "doom", {**kept, "ranges": about})
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics

@@ -24,7 +24,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
-from training.common import runs
+from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.precision import Precision
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
@@ -63,11 +63,11 @@ class Arguments(SourceArguments):
     """Seed of initial weights and of the order of the data."""
     precision: Precision = field(default="32-true", kw_only=True)
     """Arithmetic of the network."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with NAME's local network and place encoder, of which the features are."""
-    out: Path = runs.WEIGHTS
+    out: Path = records.WEIGHTS
     """Folder that gets NAME/odometry_smoother.safetensors, or the local network with its memory."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of the feature stores, checkpoints and logs."""
 
 
@@ -128,7 +128,9 @@ def main(arguments: Arguments) -> dict[str, float]:
     folder = arguments.weights / name
     local, local_description = load_local(folder, name)
     if arguments.memory and local.config.memory is not None:
-        raise runs.RunError(f"the local network in {folder} has a memory already; expected one as train_local wrote it")
+        raise records.RunError(
+            f"the local network in {folder} has a memory already; expected one as train_local wrote it"
+        )
     recorded: RecordedData | None = None
     if arguments.world is None:
         recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
@@ -213,7 +215,7 @@ def initial_smoother(arguments: Arguments, local: LocalPoseConfig) -> tuple[Odom
         return OdometrySmoother(config), {}
     smoother, description = load_smoother(began)
     if smoother.config.motion_feature_size != config.motion_feature_size:
-        raise runs.RunError(
+        raise records.RunError(
             f"the smoother in {began} takes {smoother.config.motion_feature_size} motion features; expected "
             f"{config.motion_feature_size}, as the local network gives"
         )

@@ -23,7 +23,7 @@ from ngo_estimator.networks.step_deviation import StepDeviation
 from ngo_estimator.networks.step_scaling import STEP_DEVIATION, StepDeviationConfig
 from ngo_estimator.odometry.lidar_odometry import LidarOdometryConfig
 from ngo_estimator.online.scan_graph import ScanGraphConfig
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.lidar_steps import KeySteps, building_steps, log_steps
 from training.data.step_windows import WINDOWS, StepWindows, figures, negative_log_likelihood, windows_of
@@ -59,9 +59,9 @@ class Arguments:
     """Highest learning rate."""
     seed: int = 0
     """Seed of initial weights and of the order of the data."""
-    out: Path = runs.WEIGHTS
+    out: Path = records.WEIGHTS
     """Folder that gets scan/step_deviation.safetensors."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of stored steps."""
 
 
@@ -91,7 +91,7 @@ def main(arguments: Arguments) -> dict[str, float]:
             ):
                 metrics |= {f"{name}_{steps}_{key}": value for key, value in figures(windows, factors).items()}
     details = {
-        "training": {**runs.record("train_step_deviation", arguments), "seconds": round(time.monotonic() - began)},
+        "training": {**records.record("train_step_deviation", arguments), "seconds": round(time.monotonic() - began)},
         "metrics": {"validation": metrics},
     }
     save_checkpoint(arguments.out / WORLD / f"{STEP_DEVIATION}.safetensors", network, STEP_DEVIATION, WORLD, details)

@@ -25,7 +25,7 @@ from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.optimizer.whole_trajectory import optimize_offline
 from training import results_doom
 from training.baselines.pose_graph import PoseGraphSettings
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.doom_drives import MAZES, ROOMS, VALIDATION_MAPS, Map
 from training.data.features import OPTIMIZER_INPUTS
@@ -63,11 +63,11 @@ class Arguments:
     """Drives of each validation map, and twice as many through generated levels."""
     frames: int = 1000
     """Frames of a drive."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with doom/*.safetensors, which gets the optimizer."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets doom.gtsam.json."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of what is kept of each drive."""
 
 
@@ -75,7 +75,7 @@ def main(arguments: Arguments) -> None:
     """Choose, print and write."""
     torch.set_num_threads(1)
     folder = arguments.weights / "doom"
-    about = runs.record("tune_doom", arguments)
+    about = records.record("tune_doom", arguments)
     drives = results_doom.Drives(
         folder, results_doom.Arguments(weights=arguments.weights, runs=arguments.runs, frames=arguments.frames)
     )
@@ -175,7 +175,7 @@ def write_pose_graph(
     result = {
         "settings": dataclasses.asdict(best),
         "validation": {"ate_ratio": least},
-        "tuning": runs.record("tune_doom", arguments),
+        "tuning": records.record("tune_doom", arguments),
     }
     path = arguments.out / "doom.gtsam.json"
     path.write_text(json.dumps(result, indent=2) + "\n")

@@ -34,7 +34,7 @@ from training.baselines.loop_factors import (
     smoothed_odometry,
 )
 from training.baselines.pose_graph import PoseGraphSettings, optimize
-from training.common import runs
+from training.common import records
 from training.common.command_line import run_command
 from training.data.feature_store import open_store
 from training.data.worlds import WorldName, world_named
@@ -82,11 +82,11 @@ class Arguments:
     """Odometry of the graph: that of the local network, registered again, or as our optimizer smooths it."""
     passes: int = 2
     """Largest number of passes over all groups."""
-    weights: Path = runs.WEIGHTS
+    weights: Path = records.WEIGHTS
     """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
-    out: Path = runs.ROOT / "training" / "results"
+    out: Path = records.ROOT / "training" / "results"
     """Folder that gets WORLD.gtsam.json, of another form WORLD.gtsam_FORM.json."""
-    runs: Path = runs.ROOT / "runs"
+    runs: Path = records.ROOT / "runs"
     """Folder of WORLD/features/."""
 
 
@@ -232,7 +232,7 @@ def main(arguments: Arguments) -> PoseGraphSettings:
             "position_rmse_m": least,
             "odometry_position_rmse_m": odometry,
         },
-        "tuning": {**runs.record("tune_pose_graph", arguments), "seconds": round(time.monotonic() - started)},
+        "tuning": {**records.record("tune_pose_graph", arguments), "seconds": round(time.monotonic() - started)},
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=2) + "\n")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from training.common.runs import ROOT
+from training.common.records import ROOT
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(180)]
 

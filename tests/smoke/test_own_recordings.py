@@ -14,7 +14,7 @@ from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.ros.processes import NodeProcess
-from training.common import runs
+from training.common import records
 from training.recordings.recording_source import NO_LOOPS
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(400)]
@@ -54,7 +54,7 @@ def test_a_minute_of_training_from_files_alone_beats_the_untrained_estimator(
     given = {"folder": str(tmp_path), "data": [str(path) for path in files], "width": 0.06, **settings}
     done = subprocess.run(
         [sys.executable, "-m", "tests.smoke.without_simulators", json.dumps(given)],
-        cwd=runs.ROOT,
+        cwd=records.ROOT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
@@ -89,5 +89,5 @@ def test_a_minute_of_training_from_files_alone_beats_the_untrained_estimator(
 
 def test_a_simulator_cannot_be_imported_there() -> None:
     code = "import tests.smoke.without_simulators as w, sys; sys.meta_path.insert(0, w.NoSimulators()); import ngo_sim"
-    done = subprocess.run([sys.executable, "-c", code], cwd=runs.ROOT, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=records.ROOT, capture_output=True, text=True)
     assert "No module named 'ngo_sim'" in done.stderr

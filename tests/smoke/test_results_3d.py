@@ -20,7 +20,7 @@ from training import (
     train_smoother,
     tune_pose_graph,
 )
-from training.common.runs import RunError
+from training.common.records import RunError
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.scoring.network_odometry import open_odometry

@@ -1,14 +1,15 @@
 """The lidar's results at toy size: every row, the files, and a second run that computes nothing."""
 
 import json
-import subprocess
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from training import results_scan
+from training import results, results_scan
+from training.common import command_line
 from training.data.scans import CONDITIONS
 from training.scoring import lidar_rows
 from training.scoring.lidar_rows import ROWS
@@ -74,8 +75,15 @@ def test_a_row_that_does_not_exist_is_refused() -> None:
 
 
 @pytest.mark.parametrize("world", [("--world", "scan"), ("--world=scan",)])
-def test_the_command_of_results_takes_the_lidar(world: tuple[str, ...]) -> None:
-    command = [sys.executable, "-m", "training.results", *world, "--help"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+def test_the_command_of_results_takes_the_lidar(
+    world: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Run as a program within this process, which has imported everything already."""
+    monkeypatch.setattr(sys, "argv", [results.__file__, *world, "--help"])
+    monkeypatch.setattr(command_line, "quiet_framework", lambda: None)  # as it was for the other tests
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(results.__file__, run_name="__main__")
+    shown = capsys.readouterr().out
+    assert ended.value.code == 0
     assert "--logs" in shown
     assert "--prefixes" not in shown

@@ -12,7 +12,7 @@ from ngo_sim.distance_driver import DistanceDriver
 from ngo_sim.learned_driver import LearnedDriver
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.policy_network import PolicyConfig, PolicyView, load_policy
-from training.common.runs import RunError
+from training.common.records import RunError
 from training.data.worlds import TRAIN_SEEDS, world_named
 from training.driver.driver_network import Features
 from training.driver.driving_task import REWARD_PER_M, DrivingTask, held

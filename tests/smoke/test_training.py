@@ -44,7 +44,7 @@ from training import (
     train_smoother,
 )
 from training.baselines.deepvo import DEEPVO
-from training.common import runs
+from training.common import records
 from training.data import feature_store, worlds
 
 ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -148,7 +148,7 @@ def test_a_smoother_of_another_local_network_is_refused(tmp_path: Path, monkeypa
     # Nor does a run on the features of one network go on with those of another.
     monkeypatch.setattr(train_smoother, "load_local", lambda folder, _: (load_local(before)[0], {"sha256": "another"}))
     monkeypatch.setattr(feature_store, "check_networks", lambda *_: None)
-    with pytest.raises(runs.RunError, match="given local_pose_network_sha256 another"):
+    with pytest.raises(records.RunError, match="given local_pose_network_sha256 another"):
         train_smoother.main(toy.smoother("maze2d", tmp_path))
 
 
@@ -259,7 +259,7 @@ def two_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training of two epochs by two processes of one machine."""
     folder = tmp_path_factory.mktemp("two_processes")
     command = [sys.executable, "-m", "tests.smoke.two_processes", str(folder)]
-    done = subprocess.run(command, cwd=runs.ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=150)
+    done = subprocess.run(command, cwd=records.ROOT, env=ONE_THREAD, capture_output=True, text=True, timeout=150)
     assert done.returncode == 0, done.stderr[-2000:]
     return folder
 
@@ -293,7 +293,9 @@ def test_two_machines_train_as_two_processes_and_go_on_after_one_is_lost(two_pro
         for rank, (folder, log) in enumerate(zip(folders, logs, strict=True)):
             program = [f"--node-rank={rank}", "-m", "tests.smoke.two_processes", str(folder), *arguments]
             with log.open("w") as stderr:
-                machines.append(subprocess.Popen([*torchrun, *program], cwd=runs.ROOT, env=ONE_THREAD, stderr=stderr))
+                machines.append(
+                    subprocess.Popen([*torchrun, *program], cwd=records.ROOT, env=ONE_THREAD, stderr=stderr)
+                )
         return [(machine.wait(150), log.read_text()) for machine, log in zip(machines, logs, strict=True)]
 
     assert all(code != 0 for code, _ in train([tmp_path] * 2, "lost"))

@@ -141,6 +141,17 @@ def layer_of(module: str) -> int | None:
     return next((index for index, names in enumerate(layers) if part in names), last)
 
 
+def reached_from(module: str, imports: Mapping[str, set[str]]) -> set[str]:
+    """The modules of the project that a module imports, directly or through others."""
+    reached: set[str] = set()
+    todo = [module]
+    while todo:
+        for name in imports.get(todo.pop(), set()) & imports.keys() - reached:
+            reached.add(name)
+            todo.append(name)
+    return reached
+
+
 def upward_imports(imports: Mapping[str, set[str]]) -> Iterator[str]:
     """One line for each module that reaches, over whatever path, one of a later layer of its package."""
     for module in sorted(imports):
@@ -148,13 +159,7 @@ def upward_imports(imports: Mapping[str, set[str]]) -> Iterator[str]:
         if level is None:
             continue
         package = module.partition(".")[0]
-        reached: set[str] = set()
-        todo = [module]
-        while todo:
-            for name in imports.get(todo.pop(), set()) & imports.keys() - reached:
-                reached.add(name)
-                todo.append(name)
-        for name in sorted(reached):
+        for name in sorted(reached_from(module, imports)):
             other = layer_of(name) if is_below(name, package) else None
             if other is not None and other > level:
                 command = package == COMMANDS and other == len(LAYERS[package])
@@ -252,6 +257,15 @@ def test_a_planted_crossing_in_the_training_is_caught(module: str, source: str, 
 def test_every_folder_of_the_training_has_a_layer() -> None:
     folders = {path.parent.name for path in OUTSIDE["training"].glob("*/__init__.py")}
     assert folders == set().union(*LAYERS["training"])
+
+
+def test_demo_and_benchmarks_start_without_the_framework_of_trainings() -> None:
+    """Its import takes longer than all else that they begin with."""
+    imports = read_imports()
+    starts = ["demo.run", *(module for module in imports if is_below(module, "benchmarks"))]
+    reached = set(starts).union(*(reached_from(start, imports) for start in starts))
+    assert "training.common.records" in reached and len(starts) > 5
+    assert [name for name in sorted(reached) if any(is_below(one, "lightning") for one in imports[name])] == []
 
 
 def test_a_command_may_import_a_command() -> None:

@@ -10,7 +10,7 @@ import tyro
 
 from ngo_estimator.data.weights_file import CheckpointError
 from ngo_recordings.errors import RecordingError
-from training.common.runs import RunError
+from training.common.records import RunError
 
 Arguments = TypeVar("Arguments")
 

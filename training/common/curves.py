@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from ngo_common.files import write_whole
+from training.common.records import write_at_once
 
 Batch = dict[str, Tensor]
 
@@ -135,9 +135,3 @@ def _kilobytes(path: str, field: str) -> int:
     except OSError:  # the process has just ended, or is no process of ours
         return 0
     return next((int(line.split()[1]) for line in lines if line.startswith(field)), 0)
-
-
-def write_at_once(path: Path, text: str) -> None:
-    """Write a file so that whoever reads it sees all of it or none, in a folder that is made for it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text)

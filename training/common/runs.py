@@ -4,10 +4,7 @@ import dataclasses
 import hashlib
 import json
 import os
-import shlex
-import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -18,88 +15,10 @@ from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 
-from training.common.curves import Batch, Curves, batch_size, write_at_once
+from training.common.curves import Batch, Curves, batch_size
 from training.common.precision import Precision, resolved
-
-ROOT = Path(__file__).resolve().parents[2]
-WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
-
-
-class RunError(ValueError):
-    """The files of a run and its arguments do not fit together; the message is one line with the remedy."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainerArguments:
-    """Device, processes, machines and precision of a training."""
-
-    accelerator: str = "auto"
-    """Kind of device by Lightning's name, such as cpu or gpu; auto: a GPU where there is one."""
-    devices: str = "auto"
-    """Processes that train together on a machine, each on batches of its own; auto: one, or one a GPU."""
-    num_nodes: int = 1
-    """Machines that train together, each started by torchrun, with one ``runs`` folder that all of them share."""
-    strategy: str = "auto"
-    """How processes work together, by Lightning's name, such as ddp; auto: ddp if there are several."""
-    precision: Precision = "auto"
-    """Arithmetic of the networks; auto: the faster one on this device, which the run prints when it begins."""
-
-
-def revision() -> str:
-    """The commit that is checked out, with ``+changes`` where files differ from it."""
-    try:
-        commit = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True
-        ).stdout.strip()
-        changes = subprocess.run(
-            ["git", "status", "--porcelain", "--untracked-files=no"],
-            cwd=ROOT,
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return commit + ("+changes" if changes.strip() else "")
-
-
-def record(script: str, arguments: Any) -> dict[str, Any]:
-    """Command, arguments and revision of a run, for the JSON beside its weights.
-
-    Folders are left out: they say where a network was made, not how; of recordings, the names are kept.
-    """
-    values, changed = recorded_values(arguments), []
-    for field, value in _flat(arguments):
-        if field.name in values and value != field.default:
-            flag = field.name.replace("_", "-")
-            if isinstance(value, bool) and field.default is not None:
-                changed.append(f"--{flag}" if value else f"--no-{flag}")
-            else:
-                kept = values[field.name]
-                changed += [f"--{flag}", *map(str, kept if isinstance(kept, tuple) else (kept,))]
-    command = shlex.join(["python", "-m", f"training.{script}", *changed])
-    return {"command": command, "arguments": values, "revision": revision()}
-
-
-def recorded_values(arguments: Any) -> dict[str, Any]:
-    """Values of arguments by name, of files the names alone, and none of folders."""
-    values = {}
-    for field, value in _flat(arguments):
-        if isinstance(value, tuple) and value and isinstance(value[0], Path):
-            values[field.name] = tuple(path.name for path in value)
-        elif not isinstance(value, Path):
-            values[field.name] = value
-    return values
-
-
-def _flat(arguments: Any) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
-    """Fields and their values, those of nested arguments among them where any of these was given."""
-    for field in dataclasses.fields(arguments):
-        value = getattr(arguments, field.name)
-        if not dataclasses.is_dataclass(value):
-            yield field, value
-        elif field.default_factory is dataclasses.MISSING or value != field.default_factory():
-            yield from _flat(value)
+from training.common.records import RunError, record, write_at_once
+from training.common.trainer_arguments import TrainerArguments
 
 
 class BestWeights(Callback):

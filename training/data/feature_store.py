@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from training.common import runs
+from training.common import records
 from training.data import episodes
 from training.data.data_source import Domain
 from training.data.drive_plan import Drives
@@ -37,7 +37,7 @@ def check_count(store: Path, count: int) -> None:
     """Raise ``RunError`` where a store was begun with another number of trajectories."""
     path = store / "relative.npy"
     if count and path.exists() and (begun := len(np.load(path, mmap_mode="r"))) != count:
-        raise runs.RunError(
+        raise records.RunError(
             f"{store} was begun with {begun} trajectories, {count} are asked for; expected as many, or {store.parent} "
             "removed to make all stores anew"
         )
@@ -71,7 +71,7 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
     """Raise ``RunError`` if what is in ``store`` was made with other networks than those described."""
     path, networks = store / NETWORKS_FILE, [local_description["sha256"], place_description["sha256"]]
     if path.exists() and json.loads(path.read_text()) != networks:
-        raise runs.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
+        raise records.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
 def training_stores(
@@ -92,12 +92,12 @@ def open_store(store: Path, stored: Sequence[str] = STORED) -> dict[str, np.ndar
     """The arrays of a whole feature store, memory-mapped; raises ``RunError`` if it is not whole."""
     hint = "run `python -m training.featurise` first, with as many trajectories as the other stores were made with"
     if missing := [name for name in stored if not (store / f"{name}.npy").exists()]:
-        raise runs.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")
+        raise records.RunError(f"{store} lacks {missing}; expected a feature store: {hint}")
     arrays: dict[str, np.ndarray] = {name: np.load(store / f"{name}.npy", mmap_mode="r") for name in stored}
     count = len(arrays["relative"])
     groups = set(groups_of(count, 0, 1))
     if left := groups - _done(store):
-        raise runs.RunError(f"{store} lacks {len(left)} of {len(groups)} groups of trajectories: {hint}")
+        raise records.RunError(f"{store} lacks {len(left)} of {len(groups)} groups of trajectories: {hint}")
     return arrays
 
 
@@ -122,5 +122,5 @@ def stored_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> np.memm
         unfinished.unlink()
     array: np.memmap = np.load(path, mmap_mode="r+")
     if array.shape != shape:
-        raise runs.RunError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")
+        raise records.RunError(f"{path} is of shape {array.shape}; expected {shape}: remove its folder to make it anew")
     return array

@@ -19,7 +19,8 @@ from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.topics import TopicArguments
-from training.common.runs import TrainerArguments, recorded_values
+from training.common.records import recorded_values
+from training.common.trainer_arguments import TrainerArguments
 from training.data.batches import ACTION_HISTORY, relative_poses
 from training.data.data_source import MIRRORED_ACTIONS, Domain
 from training.data.worlds import WorldName

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import LOCAL, load_local
 from training.baselines.deepvo import DEEPVO, load_deepvo, trajectory_steps
-from training.common import runs
+from training.common import records
 from training.data.batches import seen_from_first
 from training.data.drive_plan import drives_of_table
 from training.data.episodes import images_of
@@ -44,7 +44,7 @@ def make_odometry(row: str, sources: Sources, split: str, table: str, count: int
     store = own.store_folder(split, table)
     made_with = store / _MADE_WITH
     if made_with.exists() and json.loads(made_with.read_text()) != [sha256]:
-        raise runs.RunError(f"{store} was made with another network than the present one; remove it to make it anew")
+        raise records.RunError(f"{store} was made with another network than the present one; remove it to make it anew")
     store.mkdir(parents=True, exist_ok=True)
     made_with.write_text(json.dumps([sha256]))
 

@@ -10,7 +10,7 @@ import pytest
 import tyro
 
 from training.common.command_line import quiet_framework, run_command
-from training.common.runs import ROOT, RunError
+from training.common.records import ROOT, RunError
 from training.recordings.recording_source import RecordedArguments
 
 COMMANDS = sorted(path.stem for path in (ROOT / "training").glob("*.py") if "\nif __name__" in path.read_text())

@@ -11,7 +11,7 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.common.runs import WEIGHTS, RunError
+from training.common.records import WEIGHTS, RunError
 from training.data.worlds import WORLDS, world_named
 from training.train_optimizer import (
     Arguments,

@@ -10,7 +10,7 @@ from torch import Tensor
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint, write_untrained
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.networks.place_encoder import SeenRanges
-from training.common.runs import RunError
+from training.common.records import RunError
 from training.data.worlds import world_named
 from training.recordings.recording_source import RecordedArguments
 from training.train_place import Arguments, PlaceTraining, initial_networks

@@ -10,7 +10,7 @@ from ngo_estimator.checkpoint import LOCAL, SMOOTHER, load_local, load_smoother,
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from tests.unit.ngo_estimator.samples import small_optimizer, trajectory_inputs
-from training.common.runs import RunError
+from training.common.records import RunError
 from training.data.worlds import world_named
 from training.recordings.recording_source import RecordedArguments
 from training.train_local import Arguments as TrainLocal

@@ -18,7 +18,7 @@ from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.samples import small_pair_head
 from training.baselines.graph_settings import fit_calibration, load_settings
 from training.baselines.pose_graph import PoseGraphSettings
-from training.common.runs import WEIGHTS
+from training.common.records import WEIGHTS
 from training.data.worlds import world_named
 from training.prerequisites import is_tuned
 from training.scoring.table_rows import Sources

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from training.common import curves
-from training.common.curves import Curves, memory_mb, write_at_once
+from training.common.curves import Curves, memory_mb
+from training.common.records import write_at_once
 
 
 def trainer(epoch: int, **metrics: float) -> Any:

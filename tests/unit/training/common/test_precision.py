@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.unit.training.common.test_runs import Arguments
-from training.common import precision, runs
+from training.common import precision, records, runs
 from training.common.precision import cpu_gain, resolved
 
 
@@ -58,5 +58,5 @@ def test_a_run_says_its_precision_once_and_keeps_it(
     monkeypatch.setattr(precision, "cpu_gain", lambda: 2.0)
     assert begin().record["arguments"]["precision"] == "32-true"
     assert json.loads((tmp_path / "run.json").read_text())["arguments"]["precision"] == "32-true"
-    with pytest.raises(runs.RunError, match="given precision bf16-mixed; expected precision 32-true"):
+    with pytest.raises(records.RunError, match="given precision bf16-mixed; expected precision 32-true"):
         begin("bf16-mixed")

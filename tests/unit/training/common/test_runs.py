@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 import tyro
 
-from training.common import runs
+from training.common import records, runs
+from training.common.trainer_arguments import TrainerArguments
 
 
 @dataclass(frozen=True)
-class Arguments(runs.TrainerArguments):
+class Arguments(TrainerArguments):
     world: str
     learning_rate: float = 1e-3
     batch_size: int = 8
@@ -24,7 +25,7 @@ def begin(folder: Path, **changes: object) -> runs.Run:
 
 
 def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
-    record = runs.record("train_local", Arguments("maze2d", batch_size=4, out=Path("/elsewhere"), devices="2"))
+    record = records.record("train_local", Arguments("maze2d", batch_size=4, out=Path("/elsewhere"), devices="2"))
     assert record["command"] == "python -m training.train_local --devices 2 --world maze2d --batch-size 4"
     expected = {"world": "maze2d", "learning_rate": 1e-3, "batch_size": 4}
     trainer = {"accelerator": "auto", "devices": "2", "num_nodes": 1, "strategy": "auto", "precision": "auto"}
@@ -51,7 +52,7 @@ class Switches:
     ],
 )
 def test_the_command_is_one_that_the_command_line_takes(given: Switches, flags: str) -> None:
-    command = runs.record("results", given)["command"]
+    command = records.record("results", given)["command"]
     assert command == f"python -m training.results{flags}"
     assert tyro.cli(Switches, args=command.split()[3:]) == given
 
@@ -104,5 +105,5 @@ def test_a_run_does_not_go_on_with_other_settings_of_its_world(tmp_path: Path) -
 
 @pytest.mark.parametrize("nodes", [0, 2])
 def test_a_training_on_machines_that_nothing_started_together_is_refused(nodes: int, tmp_path: Path) -> None:
-    with pytest.raises(runs.RunError, match=f"--num-nodes is {nodes}, and this process was started alone"):
+    with pytest.raises(records.RunError, match=f"--num-nodes is {nodes}, and this process was started alone"):
         begin(tmp_path, num_nodes=nodes)

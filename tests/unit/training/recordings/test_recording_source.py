@@ -20,7 +20,7 @@ from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_recordings import messages as m
 from tests.unit.training import drives
 from training import evaluate, featurise, train_familiarity, train_local, train_optimizer, train_place, train_smoother
-from training.common import runs
+from training.common import records
 from training.recordings import recording_source
 from training.recordings.recording_source import RecordedArguments, TrainedLocal, open_recorded, trained_local
 from training.recordings.recording_store import MOST_RAYS, format_of, make_store
@@ -190,7 +190,7 @@ def local_of(given: RecordedArguments, folder: Path, **changes: Any) -> TrainedL
             **changes,
         }
     )
-    training = runs.record("train_local", train_local.Arguments(recordings=given))
+    training = records.record("train_local", train_local.Arguments(recordings=given))
     training["arguments"]["data_sha256"] = data.sha256
     path = folder / "weights" / given.name / f"{LOCAL}.safetensors"
     save_checkpoint(path, LocalPoseNetwork(config), LOCAL, given.name, {"training": training})
