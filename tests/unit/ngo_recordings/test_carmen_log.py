@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ngo_recordings import carmen_log
 from ngo_recordings.carmen_lines import BadLine, OdometryLine, ScanLine, parse_line
 from ngo_recordings.carmen_stamps import MADE_PERIOD_S
 from ngo_recordings.errors import RecordingError
@@ -22,6 +23,14 @@ from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import RecordingTopics, TopicArguments, WheelSource, choose_topics
 
 Pose = tuple[float, float, float]
+
+
+@pytest.fixture(autouse=True, params=[0, 4_000_000], ids=["long", "short"])
+def kept_numbers(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Each log is read as a long one, whose scans are read again, and as a short one, whose scans stay in memory."""
+    kept = int(request.param)
+    monkeypatch.setattr(carmen_log, "_MOST_KEPT_NUMBERS", kept)
+    return kept
 
 
 def numbers(values: Any) -> str:
@@ -378,3 +387,23 @@ def test_damaged_logs_give_whole_scans_or_one_clear_line(
         complaint = str(error)
     shutil.rmtree(folder)
     assert "\n" not in complaint and str(path) in complaint
+
+
+def test_a_long_log_that_gets_shorter_meanwhile_is_refused(tmp_path: Path, kept_numbers: int) -> None:
+    lines = [flaser(k, (0.2 * k, 0.0, 0.0)) for k in range(20)]
+    path = write(tmp_path / "a.log", lines)
+    with open_recording([path]) as recording:
+        write(path, lines[:10])
+        if kept_numbers:
+            assert len(list(recording.messages(["/scan"]))) == 20
+            return
+        with pytest.raises(RecordingError, match="has changed while it was read"):
+            list(recording.messages(["/scan"]))
+
+
+def test_who_writes_into_a_message_changes_no_other_reading(tmp_path: Path) -> None:
+    lines = [f"RAWLASER1 0 -1.57 3.14 1.57 50 0.01 0 3 1 2 3 0 {100 + k} robot {100 + k}" for k in range(5)]
+    with open_recording([write(tmp_path / "a.log", lines)]) as recording:
+        first, again = (next(recording.messages(["/scan"])).value for _ in range(2))
+        first.ranges[:] = -1.0
+        np.testing.assert_array_equal(again.ranges, [1.0, 2.0, 3.0])

@@ -43,8 +43,9 @@ _MAX_LOG_BYTES = 4 * 2**30
 _FREE_BYTES, _MAX_RATIO = 64 * 2**20, 200
 _FREE_LINES, _MAX_USELESS = 100_000, 50
 _BAD_SHARE = 0.1
-# So many rays of a log stay in memory (16 MB): then its scans need no second reading.
-_MOST_KEPT_RAYS = 4_000_000
+# Scans of so many numbers stay in memory (16 MB): then they need no second reading. A scan's other fields take as much
+# as 160 rays.
+_MOST_KEPT_NUMBERS, _NUMBERS_OF_A_SCAN = 4_000_000, 160
 # What a SICK LMS writes for no return, by its settings, m; logs differ in the last digits.
 _LIMITS_M = (8.191, 16.383, 32.767, 51.15, NO_RETURN_M)
 _NEAR_LIMIT = 0.01
@@ -167,7 +168,7 @@ class _Index:
         left_out: Counter[str] = Counter()
         guessed: set[int] = set()
         kept: list[ScanLine] = []
-        kept_rays = 0
+        kept_numbers = 0
         number, ended = 0, True
         for number, line in _lines(path, self):
             ended = line.endswith(b"\n")
@@ -182,8 +183,8 @@ class _Index:
                 continue
             if isinstance(parsed, ScanLine):
                 found.append(self._scan_row(parsed))
-                kept_rays += len(parsed.ranges)
-                if kept_rays <= _MOST_KEPT_RAYS:
+                kept_numbers += len(parsed.ranges) + _NUMBERS_OF_A_SCAN
+                if kept_numbers <= _MOST_KEPT_NUMBERS:
                     kept.append(parsed)
                 else:
                     kept.clear()
@@ -201,7 +202,7 @@ class _Index:
         if bad and bad[-1][0] == number and not ended:
             self.unfinished = True
         self.kind = min((row[0] for row in found if row[0]), key=_preference, default="")
-        self.kept = [scan for scan in kept if scan.kind == self.kind] if kept_rays <= _MOST_KEPT_RAYS else None
+        self.kept = [scan for scan in kept if scan.kind == self.kind] if kept_numbers <= _MOST_KEPT_NUMBERS else None
         left_out.update(row[0] for row in found if row[0] not in ("", self.kind))
         self.rows = [(row[0] != "", *row[1:]) for row in found if row[0] in ("", self.kind)]
         self._check(bad)

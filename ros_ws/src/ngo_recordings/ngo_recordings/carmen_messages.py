@@ -58,9 +58,9 @@ def odometry(stamp_ns: int, pose_xyyaw: list[float], speed: tuple[float, float])
 
 def laser_scan(stamp_ns: int, scan: ScanLine, limit_m: float | None) -> Any:
     """A sensor_msgs/LaserScan; limit_m: from here on nothing came back, for lines that do not say their range."""
-    ranges = scan.ranges
+    ranges = scan.ranges.copy()  # the scan may be read again
     if limit_m is not None and scan.range_max is None:
-        ranges = np.where(ranges < limit_m, ranges, np.float32(np.inf))
+        ranges[~(ranges < limit_m)] = np.inf
     high = scan.range_max if scan.range_max is not None else (limit_m or NO_RETURN_M)
     angle_max = scan.angle_min + (len(ranges) - 1) * scan.angle_increment
     numbers = (scan.angle_min, angle_max, scan.angle_increment, 0.0, 0.0, 0.0, high)
