@@ -8,7 +8,7 @@ import pytest
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, likelihood_field, search
-from ngo_estimator.geometry.line_map import line_map
+from ngo_estimator.geometry.line_map import line_map, line_map_of_points
 from ngo_estimator.geometry.planar_motion import Array, between, rotated, transformed
 from ngo_estimator.geometry.scan_matching import IcpConfig, icp
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, fan, round_trip, scan_at
@@ -181,3 +181,14 @@ def test_bad_settings_are_refused() -> None:
         SearchConfig(step_m=0.0)
     with pytest.raises(ValueError, match="0 scans"):
         line_map([], [])
+
+
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf, 1e9])
+def test_points_that_lie_nowhere_or_far_away_are_in_no_map(odd: float) -> None:
+    scan = scan_at(ROOM, A)
+    points = scan.points.copy()
+    first = int(np.flatnonzero(scan.normals.any(axis=1))[0])
+    points[first, 0] = odd
+    lines = line_map_of_points(points, scan.normals)
+    assert len(lines.points) == len(line_map([scan], [IDENTITY]).points) - 1
+    assert np.abs(lines.points).max() < 100.0

@@ -58,13 +58,15 @@ def line_map_of_points(points: Array, normals: Array) -> LineMap:
 
 @njit(cache=True)
 def _lines(points: Array, normals: Array) -> tuple[Array, Array, Array, Array]:
-    """Points and normals ``(m, 2)`` of those that have normals, and the least and largest coordinates ``(2,)``."""
+    """Finite points that have normals ``(m, 2)``, these normals, and the least and largest coordinates ``(2,)``."""
     on_lines, facing = np.empty_like(points), np.empty_like(normals)
     low, high = np.full(2, math.inf), np.full(2, -math.inf)
     count = 0
     for i in range(len(points)):
         if normals[i, 0] == 0.0 and normals[i, 1] == 0.0:
             continue
+        if not (math.isfinite(points[i, 0]) and math.isfinite(points[i, 1])):
+            continue  # it lies in no cell
         for axis in range(2):
             value = points[i, axis]
             on_lines[count, axis], facing[count, axis] = value, normals[i, axis]
@@ -95,9 +97,10 @@ def line_squares(points: Array, normals: Array, side: float = 0.06) -> NDArray[n
 
 @njit(cache=True)
 def averaged_lines(points: Array, normals: Array, squares: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Points and normals ``(m, 2)``, averaged over those ``(n, 2)`` of the same of ``line_squares`` ``(n,)``.
+    """Points and normals ``(m, 2)``, averaged over the points that lie in the same square.
 
-    Points without normals are left out. Averages are less noisy than single points, and fewer.
+    ``squares`` ``(n,)`` are their numbers by ``line_squares``. Points without normals are left out. Averages are less
+    noisy than single points, and fewer.
     """
     order = np.argsort(squares)
     mean_points, mean_normals = np.empty_like(points), np.empty_like(normals)
