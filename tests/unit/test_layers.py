@@ -259,10 +259,10 @@ def test_every_folder_of_the_training_has_a_layer() -> None:
     assert folders == set().union(*LAYERS["training"])
 
 
-def test_demo_and_benchmarks_start_without_the_framework_of_trainings() -> None:
+def test_demo_benchmarks_and_evaluation_start_without_the_framework_of_trainings() -> None:
     """Its import takes longer than all else that they begin with."""
     imports = read_imports()
-    starts = ["demo.run", *(module for module in imports if is_below(module, "benchmarks"))]
+    starts = ["demo.run", "training.evaluate", *(module for module in imports if is_below(module, "benchmarks"))]
     reached = set(starts).union(*(reached_from(start, imports) for start in starts))
     assert "training.common.records" in reached and len(starts) > 5
     assert [name for name in sorted(reached) if any(is_below(one, "lightning") for one in imports[name])] == []

@@ -108,12 +108,12 @@ def propagated(covariance: Array, pose: Array, relative: Array, relative_covaria
 
 @njit(cache=True)
 def inverted(matrix: Array) -> Array:
-    """``np.linalg.inv`` of a matrix ``(3, 3)``, to the last bit: the call takes a third of its time."""
+    """``np.linalg.inv`` of a matrix ``(3, 3)``, to the last bit, in a third of the time."""
     return np.ascontiguousarray(np.linalg.solve(matrix, np.eye(3)))
 
 
 @njit(cache=True)
-def fused(a: Array, b: Array) -> Array:
+def fused_covariance(a: Array, b: Array) -> Array:
     """Covariance ``(3, 3)`` of what two independent measurements with covariances ``(3, 3)`` tell together."""
     return inverted(inverted(a) + inverted(b))
 

@@ -81,9 +81,7 @@ class ConstantVelocity:
 
 
 @njit(cache=True)
-def _measured(
-    joint: Array, velocity: Array, measured: Array, covariance: Array, noise: Array
-) -> tuple[Array, Array]:
+def _measured(joint: Array, velocity: Array, measured: Array, covariance: Array, noise: Array) -> tuple[Array, Array]:
     """Velocity ``(3,)`` and joint covariance ``(6, 6)`` after ``measure``."""
     before = joint[3:, 3:] + np.diag(noise**2)
     gain = np.ascontiguousarray(np.linalg.solve((before + covariance).T, before.T)).T

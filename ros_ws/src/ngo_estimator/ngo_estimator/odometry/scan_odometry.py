@@ -12,7 +12,14 @@ import numpy as np
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.likelihood_field import SearchConfig, search
-from ngo_estimator.geometry.planar_motion import Array, between, fused, squared_deviations, turned_covariance, wrap
+from ngo_estimator.geometry.planar_motion import (
+    Array,
+    between,
+    fused_covariance,
+    squared_deviations,
+    turned_covariance,
+    wrap,
+)
 from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
 from ngo_estimator.networks.step_scaling import STEP_EVIDENCE, StepScaling
 from ngo_estimator.odometry.local_submap import LocalSubmap
@@ -330,7 +337,7 @@ class ScanOdometry:
         both = covariance + self._covariance
         if prediction.step_covariance is not None:
             # Both poses share the errors of the submap, and of the prior where the walls say nothing.
-            both = fused(both, prediction.step_covariance)
+            both = fused_covariance(both, prediction.step_covariance)
         distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
         passed = between(self._passed, pose)
         passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad

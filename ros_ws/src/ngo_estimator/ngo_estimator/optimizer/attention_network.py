@@ -58,23 +58,23 @@ class AttentionNetwork(nn.Module):
 
         ``place_similarity`` ``(batch, poses, poses)`` of the place codes pulls the attention as far as it was learned.
         """
-        return self.weights_with(features, self.pull(place_similarity))
+        return self.attention_weights(features, self.place_logits(place_similarity))
 
-    def pull(self, place_similarity: Tensor | None) -> Tensor | None:
+    def place_logits(self, place_similarity: Tensor | None) -> Tensor | None:
         """What the similarity of places adds to the attention's logits, the same in all iterations."""
         if place_similarity is None or self._form.attention == "sum":
             return None
         return 10.0 * self.place_gain * place_similarity
 
-    def weights_with(self, features: Tensor, pull: Tensor | None) -> Tensor:
-        """As ``attend``, with what ``pull`` gave."""
+    def attention_weights(self, features: Tensor, place_logits: Tensor | None) -> Tensor:
+        """As ``attend``, with what ``place_logits`` gave."""
         queries = self.query(features)
         if self._form.attention == "sum":
             # The paper divides by a sum that can vanish; queries of one sign, like the features, keep it positive.
             logits = torch.relu(queries) @ features.mT + 1e-6
             return logits / logits.sum(-1, keepdim=True)
         logits = (queries / math.sqrt(features.shape[-1])) @ features.mT
-        return torch.softmax(logits if pull is None else logits + pull, dim=-1)
+        return torch.softmax(logits if place_logits is None else logits + place_logits, dim=-1)
 
     def phases(self, blocks: int, place_similarity: Tensor | None, correction_std: Tensor) -> AttentionPhases:
         """Both phases over the last ``blocks`` meta-poses, for all iterations of one optimisation."""
@@ -93,7 +93,7 @@ class AttentionPhases:
         correction_std: Tensor,
     ) -> None:
         self._network, self._residual = network, form.residual
-        self._pull, self._correction_std = network.pull(place_similarity), correction_std
+        self._place_logits, self._correction_std = network.place_logits(place_similarity), correction_std
         layers = [layer for layer in network.convolutions if isinstance(layer, nn.Conv1d)]
         weights = [layer.weight.transpose(1, 2).flatten(1) for layer in layers]
         index = torch.arange(blocks, device=weights[0].device)
@@ -112,7 +112,7 @@ class AttentionPhases:
 
     def attend(self, state: GraphState) -> Tensor:
         """Attention vectors a ``(batch, blocks, width)`` ("Attention Phase")."""
-        return self._network.weights_with(state.features, self._pull) @ state.features
+        return self._network.attention_weights(state.features, self._place_logits) @ state.features
 
     def optimise(self, state: GraphState, loops: Callable[[GraphState], Tensor]) -> tuple[GraphState, Tensor]:
         """Both phases once: ``attend``, then "Optimization", Delta P + beta nabla P and the next features F.

@@ -50,7 +50,7 @@ def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarra
     chain = np.arange(len(poses) - 1)
     nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), loops))
     lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
-    # A loop takes a way, too, where both of its keys are in one place.
+    # A millimetre more: a loop between keys in one place has a length, too.
     distances: np.ndarray = shortest_ways(nodes, lengths + 1e-3, len(poses), key)
     return distances
 

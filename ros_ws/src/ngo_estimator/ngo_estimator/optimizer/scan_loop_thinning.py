@@ -5,7 +5,6 @@ The cost of an optimisation then follows what the robot saw, and not how often i
 """
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from ngo_estimator.optimizer.shortest_ways import shortest_ways
 
@@ -41,12 +40,3 @@ def needed_loops(
         known = shortest_ways(joined[kept], variance[kept], count, later)[earlier] <= limit
         kept[len(edges) + k] = surprising[k] or not known
     return kept[len(edges) :]
-
-
-def edge_graph(edges: np.ndarray, variance: np.ndarray, count: int) -> csr_array:
-    """A graph of ``count`` keys whose edges ``(e, 2)`` are as long as their variances ``(e,)``; doubles count once."""
-    # A sparse array sums what it is given twice: of several edges between two keys the surest one counts.
-    order = np.lexsort((variance, edges[:, 1], edges[:, 0]))
-    edges, variance = edges[order], variance[order]
-    first = np.append(True, (np.diff(edges, axis=0) != 0).any(1))
-    return csr_array((variance[first], (edges[first, 0], edges[first, 1])), shape=(count, count))

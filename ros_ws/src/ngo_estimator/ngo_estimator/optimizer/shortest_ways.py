@@ -10,8 +10,9 @@ from numba import njit
 def shortest_ways(edges: np.ndarray, lengths: np.ndarray, count: int, key: int) -> np.ndarray:
     """Length ``(count,)`` of the shortest way from a key to each other; infinite where there is none.
 
-    Sweeps go along the edges in their order and back. In one of them a way along a chain is found from end to end,
-    so that no more are needed than a way has loops. Sums are those of Dijkstra's search, to the last bit.
+    Sweeps go along the edges in their order and back. One of them finds a way along a chain from end to end, so that
+    few more are needed than a way has loops; the last changes nothing. Sums are those of Dijkstra's search, to the
+    last bit.
 
     Args:
         edges: keys ``(e, 2)`` that the graph joins, the chain first, with the positive length of each ``(e,)``.

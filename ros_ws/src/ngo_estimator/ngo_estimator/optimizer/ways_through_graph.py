@@ -4,9 +4,10 @@ Not in the paper. One way tells less than all of them together, so that the cova
 """
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ngo_estimator.optimizer.scan_loop_thinning import edge_graph, largest_variances
+from ngo_estimator.optimizer.scan_loop_thinning import largest_variances
 
 
 def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -23,7 +24,7 @@ def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray
     order = np.lexsort((variance, codes))
     known, first = np.unique(codes[order], return_index=True)
     later, which = np.unique(pairs[:, 1], return_inverse=True)
-    graph = edge_graph(edges, variance, count)
+    graph = _edge_graph(edges, variance, count)
     _, before = dijkstra(graph, directed=False, indices=later, return_predecessors=True)
     result = np.zeros((len(pairs), 3, 3))
     for n, (key, end) in enumerate(pairs.tolist()):
@@ -41,3 +42,12 @@ def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray
         moved[:, 0, 2], moved[:, 1, 2] = pivot[:, 1] - poses[end, 1], poses[end, 0] - pivot[:, 0]
         result[n] = (moved @ covariance[way] @ moved.mT).sum(0)
     return result
+
+
+def _edge_graph(edges: np.ndarray, variance: np.ndarray, count: int) -> csr_array:
+    """A graph of ``count`` keys whose edges ``(e, 2)`` are as long as their variances ``(e,)``; doubles count once."""
+    # A sparse array sums what it is given twice: of several edges between two keys the surest one counts.
+    order = np.lexsort((variance, edges[:, 1], edges[:, 0]))
+    edges, variance = edges[order], variance[order]
+    first = np.append(True, (np.diff(edges, axis=0) != 0).any(1))
+    return csr_array((variance[first], (edges[first, 0], edges[first, 1])), shape=(count, count))
