@@ -281,9 +281,8 @@ def _fed(solve: Solver, percent: float, **changes: Any) -> Row:
 
 def _mrpt(program: mrpt_slam.Program) -> Row:
     config = mrpt_slam.MrptConfig()
-    return Row(
-        partial(mrpt, program=program), config, True, (mrpt_slam,), partial(mrpt_slam.missing, program)
-    )  # fmt: skip
+    missing = partial(mrpt_slam.missing, program)
+    return Row(partial(mrpt, program=program), config, True, (mrpt_slam,), missing, ablation=True)
 
 
 def _kiss_missing() -> str:

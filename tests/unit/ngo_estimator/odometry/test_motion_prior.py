@@ -1,5 +1,6 @@
 """Where the next scan is expected, with wheels and without."""
 
+import copy
 import math
 
 import numpy as np
@@ -128,3 +129,24 @@ def test_wheels_that_stand_for_long_are_believed() -> None:
     assert not all(prediction.measured for prediction in predictions[:19])
     assert all(prediction.measured for prediction in predictions[21:])
     assert all(math.sqrt(prediction.covariance[0, 0]) < 0.04 for prediction in predictions[21:])
+
+
+def test_a_robot_drives_on_as_it_did_unless_it_stands() -> None:
+    """It drove on after each turn. Where the ranges say that it stands, nothing speeds it up."""
+    prior, pose, random = MotionPrior(MotionPriorConfig()), np.zeros(3), np.random.default_rng(1)
+    prior.begin(0, pose, None)
+    velocity = step = np.zeros(3)
+    for k in range(1, 378):  # until the third step after a turn
+        turns = (k // 15) % 3 == 0
+        aim = np.array((0.05, 0.0, 1.0 if (k // 45) % 2 else -1.0) if turns else (0.6, 0.0, 0.0))
+        velocity = velocity + 0.3 * (aim - velocity)
+        step = 0.1 * (velocity + 0.01 * random.standard_normal(3))
+        prior.predict(k * PERIOD_NS, pose, np.zeros((3, 3)), None)
+        pose = compose(pose, step)
+        prior.accept(k * PERIOD_NS, pose, SURE, step, SURE, False, False, False)
+    other = copy.deepcopy(prior)
+    stands = prior.predict(378 * PERIOD_NS, pose, np.zeros((3, 3)), None, True)
+    drives = other.predict(378 * PERIOD_NS, pose, np.zeros((3, 3)), None, False)
+    assert stands.standing and not drives.standing
+    constant, sped_up = (np.hypot(*between(pose, each.mean)[:2]) for each in (stands, drives))
+    assert constant + 0.001 < sped_up < 1.2 * step[0]

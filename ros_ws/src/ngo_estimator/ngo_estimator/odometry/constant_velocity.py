@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array
+from ngo_estimator.odometry.motion_model import NextVelocity
 
 _R, _V = slice(0, 3), slice(3, 6)
 
@@ -27,11 +28,19 @@ class ConstantVelocity:
         self._drift = np.zeros((3, 6))  # errors of the last key scan's pose, against both
         self._predicted = np.zeros((3, 3))
 
-    def predict(self, yaw: float, elapsed: float, pose_noise: Array, velocity_noise: Array) -> Array:
+    def predict(
+        self,
+        yaw: float,
+        elapsed: float,
+        pose_noise: Array,
+        velocity_noise: Array,
+        following: NextVelocity | None = None,
+    ) -> Array:
         """Covariance ``(3, 3)`` of the next pose, ``elapsed`` seconds after one of heading ``yaw``.
 
         The velocity between both changes by deviations ``velocity_noise`` ``(3,)`` at once. ``pose_noise`` ``(3,)`` are
-        those of motion that is none of the velocity.
+        those of motion that is none of the velocity. Where a model knows the ``following`` velocity, it replaces the
+        constant one, and both deviations count.
         """
         cos, sin = np.cos(yaw), np.sin(yaw)
         # An error of the velocity is forgotten as new ones come, so that it stays below the largest.
@@ -40,6 +49,10 @@ class ConstantVelocity:
         changes[_V, _V] = np.diag(kept)
         moves[_R, _V] = elapsed * np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
         noise = np.diag(np.concatenate((np.zeros(3), velocity_noise**2)))
+        if following is not None:
+            self.velocity = following.mean
+            changes[_V, _V] = following.by_velocity @ changes[_V, _V]
+            noise[_V, _V] += following.covariance
         self._joint = moves @ (changes @ self._joint @ changes.T + noise) @ moves.T
         self._joint[_R, _R] += np.diag(pose_noise**2)
         self._drift = self._drift @ changes.T @ moves.T

@@ -17,6 +17,7 @@ from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep
 from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.odometry.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
+from ngo_estimator.odometry.standstill import StandstillDetector
 from ngo_estimator.odometry.swept_scan import SweptScan
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry, WheelOdometryConfig
 from ngo_recordings.scan_stream import LidarScan
@@ -117,6 +118,7 @@ class LidarOdometry:
     def reset(self) -> None:
         """Forget everything: the next scan is the new origin of ``odom``."""
         self._core = ScanOdometry(self.config.odometry, self._scaling)
+        self._standstill = StandstillDetector()
         self._wheels: WheelOdometry | None = None
         self._newest_wheels_ns: int | None = None
         self._waiting: deque[LidarScan] = deque()
@@ -218,7 +220,8 @@ class LidarOdometry:
             )
         last = self._last
         again = None if self._wheels is None or sweep is None else partial(self._swept_otherwise, scan, sweep)
-        estimate = self._core.update(swept, self._wheels, again)
+        stands = self._wheels is None and self._standstill.stands(scan)
+        estimate = self._core.update(swept, self._wheels, again, stands)
         key = estimate.swept.scan
         self._last = key
         if last is None:

@@ -13,6 +13,8 @@ import numpy as np
 
 from ngo_estimator.geometry.planar_motion import Array, compose, inverted, wrap
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
+from ngo_estimator.odometry.motion_model import MotionModel
+from ngo_estimator.odometry.standstill import StandstillBelief
 from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
@@ -21,13 +23,13 @@ from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 class MotionPriorConfig:
     """How far predictions may be wrong.
 
-    Without wheels the velocity is constant, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside
-    ``still_m`` and ``still_deg``, at most ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as
-    zero. Where nothing measures it, its deviation grows to ``largest_m_s`` and ``largest_rad_s``. Robots
-    that were seen to change their speed by more get more of both (``UsualMotion``). Wheels are doubted
-    where they differ from constant velocity by more than ``doubt_m`` and ``doubt_m_s2``, or ``doubt_deg`` and
-    ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most ``longest_freeze_s``, while constant
-    velocity moves by ``frozen_m``.
+    Without wheels the velocity goes on as the robot's did before (``MotionModel``), or is constant where that is not
+    known, up to ``acceleration_m_s2`` and ``acceleration_rad_s2``, beside ``still_m`` and ``still_deg``, at most
+    ``largest_m`` and ``largest_deg``; after ``longest_s`` it counts as zero. Where nothing measures it, its deviation
+    grows to ``largest_m_s`` and ``largest_rad_s``. Robots that were seen to change their speed by more get more of both
+    (``UsualMotion``). Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and
+    ``doubt_m_s2``, or ``doubt_deg`` and ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most
+    ``longest_freeze_s``, while constant velocity moves by ``frozen_m``.
     """
 
     still_m: float = 0.03
@@ -56,7 +58,8 @@ class Prediction:
     """The prior of a scan's pose in the odometry's frame: ``mean`` ``(3,)`` with ``covariance`` and ``information``
     ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``by_wheels`` says that wheels made it, and
     ``measured`` that they are not doubted. Where these moved, ``step_covariance`` ``(3, 3)`` is that of their motion
-    since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen."""
+    since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen. Where no wheels
+    lead, ``standing`` says that the ranges look as if the robot stands."""
 
     mean: Array
     covariance: Array
@@ -65,6 +68,7 @@ class Prediction:
     by_wheels: bool = False
     measured: bool = False
     step_covariance: Array | None = None
+    standing: bool = False
 
 
 class MotionPrior:
@@ -75,6 +79,8 @@ class MotionPrior:
         self._stamp_ns = 0
         self._motion = ConstantVelocity(np.array((config.largest_m_s, config.largest_m_s, config.largest_rad_s)))
         self._usual = UsualMotion(config.largest_m_s)
+        self._model = MotionModel()
+        self._standstill = StandstillBelief(config.acceleration_m_s2)
         self._expected: Array | None = None  # by the velocity alone
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None
@@ -89,11 +95,13 @@ class MotionPrior:
         self._stamp_ns, self._anchor, self._moved_ns = stamp_ns, pose, stamp_ns
         self._last_wheels = self._anchor_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
 
-    def predict(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry | None) -> Prediction:
+    def predict(
+        self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry | None, stands: bool = False
+    ) -> Prediction:
         """The prior of the scan at a stamp, after the last one had the pose ``last`` ``(3,)``.
 
         ``covariance`` ``(3, 3)`` is that of ``last`` against the last key scans. It counts where wheels do not lead
-        back to a key scan.
+        back to a key scan. ``stands``: the ranges look as if the robot stands.
         """
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
         if elapsed > self.config.longest_s:
@@ -101,7 +109,7 @@ class MotionPrior:
         constant = self._motion.velocity * elapsed
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
-            return self._without_wheels(last, constant, elapsed)
+            return self._without_wheels(last, elapsed, self._standstill.stands(stamp_ns, stands))
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
         self._expected = None
         starts = [compose(last, step)]
@@ -164,18 +172,20 @@ class MotionPrior:
         )
         return not step.any() and moves and still_s <= config.longest_freeze_s
 
-    def _without_wheels(self, last: Array, constant: Array, elapsed: float) -> Prediction:
+    def _without_wheels(self, last: Array, elapsed: float, stands: bool) -> Prediction:
         config = self.config
         still = np.array((config.still_m, config.still_m, math.radians(config.still_deg)))
         largest = np.array((config.largest_m, config.largest_m, math.radians(config.largest_deg)))
-        self._expected = mean = compose(last, constant)
         changes = 0.5 * self._changes(elapsed)
         changes[:2] = np.maximum(changes[:2], self._usual.rate_m_s * math.sqrt(elapsed))
         changes = np.minimum(changes, largest / elapsed)
         self._motion.largest[:2] = self._usual.largest_m_s
-        total = self._motion.predict(last[2], elapsed, still, changes)
-        information = inverted(total)
-        return Prediction(mean, total, information, (mean,))
+        # A robot that stands may go on standing, which its model seldom saw.
+        known = elapsed <= config.longest_s and not stands
+        following = self._model.after(self._motion.velocity, elapsed) if known else None
+        total = self._motion.predict(last[2], elapsed, still, changes, following)
+        self._expected = mean = compose(last, self._motion.velocity * elapsed)
+        return Prediction(mean, total, inverted(total), (mean,), standing=stands)
 
     def accept(
         self,
@@ -206,8 +216,13 @@ class MotionPrior:
             self._motion.update(change, covariance)
             if unsure or float(np.linalg.eigvalsh(covariance[:2, :2])[-1]) > self.config.still_m**2:
                 self._usual.interrupt()
+                self._model.interrupt()
             else:
                 self._usual.observe(step, elapsed)
+                if elapsed > self.config.longest_s:
+                    self._model.interrupt()
+                self._model.observe(step / elapsed, elapsed)
+                self._standstill.observe(stamp_ns, math.hypot(step[0], step[1]) / elapsed)
             if unsure:
                 self._motion.velocity = 0.5 * self._motion.velocity
         shared = self._motion.shared()

@@ -46,10 +46,11 @@ class ScanOdometryConfig:
     are what the next scan is registered to. A search precedes the registration where the prediction may be
     ``poor_m`` or ``poor_deg`` wrong (one deviation); its window is ``search_deviations`` wide to each side, at most
     ``largest_window_m`` and ``largest_window_deg``. Where fewer than ``good_share`` of the points lie on lines, or
-    where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where fewer than
-    ``least_share`` do, or ``least_points``, the prediction stands. A registration of less than ``good_share`` that
-    is ``farthest_deviations`` from the prediction is no better than it. Where no wheels lead, one of less than
-    ``sure_share`` after a search is as likely as the prediction.
+    where no wheels lead and the prediction may be ``wide_m`` wrong, a ``wide`` search follows. Where no wheels lead it
+    also does where fewer than ``sure_share`` lie on lines though the prediction is not poor; what it finds must then
+    have ``better_share`` more. Where fewer than ``least_share`` do, or ``least_points``, the prediction stands. A
+    registration of less than ``good_share`` that is ``farthest_deviations`` from the prediction is no better than it.
+    Where no wheels lead, one of less than ``sure_share`` after a search is as likely as the prediction.
     """
 
     key_distance_m: float = 0.3
@@ -62,6 +63,7 @@ class ScanOdometryConfig:
     search_deviations: float = 2.0
     good_share: float = 0.5
     sure_share: float = 0.7
+    better_share: float = 0.2
     wide_m: float = 0.5
     largest_window_m: float = 1.0
     largest_window_deg: float = 30.0
@@ -86,10 +88,11 @@ class ScanOdometryConfig:
                 f"submap_scans, least_points are {self.submap_scans}, {self.least_points}; expected at least 1 and 3"
             )
         shares = (self.least_share, self.good_share, self.sure_share)
-        if not (0.0 < shares[0] <= shares[1] <= shares[2] <= 1.0 and 0.0 < self.known_share <= 1.0):
+        others = (self.known_share, self.better_share)
+        if not (0.0 < shares[0] <= shares[1] <= shares[2] <= 1.0 and all(0.0 < share <= 1.0 for share in others)):
             raise ValueError(
-                f"least_share, good_share, sure_share are {shares} and known_share is {self.known_share}; "
-                "expected 0 < least_share <= good_share <= sure_share <= 1, and known_share over 0 to 1"
+                f"least_share, good_share, sure_share are {shares} and known_share, better_share are {others}; "
+                "expected 0 < least_share <= good_share <= sure_share <= 1, and the others over 0 to 1"
             )
 
 
@@ -152,6 +155,7 @@ class ScanOdometry:
         swept: SweptScan,
         wheels: WheelOdometry | None = None,
         again: Callable[[Array], SweptScan] | None = None,
+        stands: bool = False,
     ) -> ScanEstimate:
         """Estimate where a scan was taken.
 
@@ -160,6 +164,7 @@ class ScanOdometry:
             wheels: the wheels' poses so far, where the robot has wheels. The turns that the scans measure are given to
                 it, from which it learns its lag.
             again: gives the scan without a sweep of another velocity ``(3,)``.
+            stands: the ranges look as if the robot stands.
 
         Raises:
             ValueError: the scan is not newer than the last one.
@@ -171,7 +176,7 @@ class ScanOdometry:
         if scan.stamp_ns <= self._stamp_ns:
             raise ValueError(f"the scan's stamp is {scan.stamp_ns}; expected one after {self._stamp_ns}")
         last_ns = self._stamp_ns
-        prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels)
+        prediction = self._prior.predict(scan.stamp_ns, self._pose, self._covariance, wheels, stands)
         found, doubt, searched = self._register(scan, prediction)
         slip_doubt = np.zeros((3, 3))
         if wheels is not None and prediction.measured:
@@ -267,11 +272,12 @@ class ScanOdometry:
             starts.append(search(self._submap.field, on_lines, starts[0], prior, window)[0])
         best = self._best(scan, starts, prior, open_share)
         lost = best.share < config.good_share or (not prediction.by_wheels and deviation_m > config.wide_m)
-        if not lost or len(on_lines) < config.least_points:
+        unlike = not prediction.by_wheels and best.share < config.sure_share and deviation_m <= config.poor_m
+        if not (lost or unlike) or len(on_lines) < config.least_points:
             return best, None, poor
         place = wide_place(
-            config.wide, self._submap.grid(config.wide.search), on_lines, prediction.mean, deviation_m, best.pose
-        )
+            config.wide, self._submap.grid(config.wide.search), on_lines, prior, deviation_m, best.pose
+        )  # fmt: skip
         if place is None:
             return best, None, True
         if place.better:
@@ -279,9 +285,10 @@ class ScanOdometry:
                 # Nothing measured this motion, and it led to no fit.
                 prior = (place.pose, np.diag((1.0, 1.0, 1.0)))
             again = self._best(scan, [place.pose], prior, open_share)
-            if again.share > best.share and not self._is_unsure(again, prediction):
-                best = again
-        return best, None if prediction.measured else place.doubt, True
+            more = 0.0 if lost else config.better_share
+            if again.share > best.share + more and not self._is_unsure(again, prediction):
+                best, lost = again, True
+        return best, None if prediction.measured or not lost else place.doubt, True
 
     def _covariance_of(self, found: Registration, prediction: Prediction, searched: bool) -> Array:
         """The registration's covariance; that of two places where it may as well be the predicted one."""
@@ -344,6 +351,8 @@ class ScanOdometry:
         if not prediction.by_wheels and found.share < self.config.known_share:
             # It may have come as far along a corridor, where only the next key scan holds what comes into view.
             passes = passes or math.sqrt(max(covariance[0, 0], covariance[1, 1])) >= distance_m
+        if prediction.standing:
+            passes = False  # it would show nothing new, and hold the robot to where it is believed to be
         # Where the robot may be elsewhere, nobody knows what it would see.
         certain = float(max(covariance[0, 0], covariance[1, 1])) < self.config.poor_m**2
         is_key = passes and not (certain and self._submap.knows(scan, pose, self.config.known_m, turn_rad))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ngo_estimator.geometry.branch_and_bound import PooledGrid, SearchConfig, SearchMatch, response_at, search
-from ngo_estimator.geometry.planar_motion import Array, wrap
+from ngo_estimator.geometry.planar_motion import Array, squared_deviations, wrap
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,11 @@ class WideSearchConfig:
     """How far wide searches go.
 
     A search goes ``least_m`` from the prediction, or ``deviations`` of it where that is farther, at most ``most_m``. It
-    turns by each of ``turns_deg`` until a pose has a response of ``enough``. A metre from the prediction costs
-    ``metre_cost`` of the response, a radian ``radian_cost``. The place that was found near it is left for one that is
-    better by ``better`` after that. A second place whose response is at least ``alike`` of the best makes it doubtful.
-    ``most_points`` of the scan are looked up.
+    turns by each of ``turns_deg`` until a pose has a response of ``enough``. A place away from the prediction costs
+    ``squared_cost`` of the response for each squared deviation, but at most ``far_cost`` and ``metre_cost`` a metre and
+    ``radian_cost`` a radian. The place that was found near it is left for one that is better by ``better`` after that.
+    A second place whose response is at least ``alike`` of the best makes it doubtful. ``most_points`` of the scan are
+    looked up.
     """
 
     least_m: float = 1.5
@@ -30,6 +31,8 @@ class WideSearchConfig:
     turns_deg: tuple[float, ...] = (60.0, 180.0)
     enough: float = 0.55
     better: float = 0.03
+    squared_cost: float = 0.05
+    far_cost: float = 0.1
     metre_cost: float = 0.02
     radian_cost: float = 0.15
     alike: float = 0.92
@@ -62,12 +65,19 @@ class WidePlace:
 
 
 def wide_place(
-    config: WideSearchConfig, grid: PooledGrid, points: Array, mean: Array, deviation_m: float, given: Array
+    config: WideSearchConfig,
+    grid: PooledGrid,
+    points: Array,
+    prior: tuple[Array, Array],
+    deviation_m: float,
+    given: Array,
 ) -> WidePlace | None:
-    """Search points ``(n, 2)`` around the predicted pose ``mean`` ``(3,)``; None where nothing fits.
+    """Search points ``(n, 2)`` around the predicted pose; None where nothing fits.
 
-    ``deviation_m`` is how far the prediction may be wrong. ``given`` ``(3,)`` is the pose that was found near it.
+    ``prior`` is its mean ``(3,)`` and its information ``(3, 3)``; ``deviation_m`` is how far it may be wrong. ``given``
+    ``(3,)`` is the pose that was found near it.
     """
+    mean, _ = prior
     few = points[:: max(1, math.ceil(len(points) / config.most_points))]
     reach = min(max(config.least_m, config.deviations * deviation_m), config.most_m)
     match: SearchMatch | None = None
@@ -83,7 +93,7 @@ def wide_place(
     second = match.second if match.second_pose is not None else 0.0
     alike = match.second_pose is not None and second >= config.alike * match.response
     best, other, response = match.pose, match.second_pose, match.response
-    costs = [_cost(config, mean, pose) for pose in (best, best if other is None else other)]
+    costs = [_cost(config, prior, pose) for pose in (best, best if other is None else other)]
     if alike and other is not None and second - costs[1] > response - costs[0]:
         best, other, response, costs = other, best, second, costs[::-1]
     doubt = None
@@ -91,11 +101,13 @@ def wide_place(
         apart = other - best
         apart[2] = wrap(apart[2])
         doubt = 0.25 * np.outer(apart, apart)  # of two places, one as likely as the other
-    near = response_at(grid, few, given) - _cost(config, mean, given)
+    near = response_at(grid, few, given) - _cost(config, prior, given)
     return WidePlace(best, response - costs[0] > near + config.better, doubt)
 
 
-def _cost(config: WideSearchConfig, mean: Array, pose: Array) -> float:
+def _cost(config: WideSearchConfig, prior: tuple[Array, Array], pose: Array) -> float:
     """What a pose costs by its distance from the prediction."""
-    way = math.hypot(pose[0] - mean[0], pose[1] - mean[1])
-    return config.metre_cost * way + config.radian_cost * abs(wrap(pose[2] - mean[2]))
+    mean, information = prior
+    way, turn = math.hypot(pose[0] - mean[0], pose[1] - mean[1]), abs(wrap(pose[2] - mean[2]))
+    most = config.far_cost + config.metre_cost * way + config.radian_cost * turn
+    return min(config.squared_cost * squared_deviations(pose, mean, information), most)
