@@ -279,7 +279,7 @@ class ScanOdometry:
             config.wide, self._submap.grid(config.wide.search), on_lines, prior, deviation_m, best.pose
         )  # fmt: skip
         if place is None:
-            return best, None, True
+            return best, None, lost or poor
         if place.better:
             if prediction.step_covariance is None:
                 # Nothing measured this motion, and it led to no fit.
@@ -288,7 +288,7 @@ class ScanOdometry:
             more = 0.0 if lost else config.better_share
             if again.share > best.share + more and not self._is_unsure(again, prediction):
                 best, lost = again, True
-        return best, None if prediction.measured or not lost else place.doubt, True
+        return best, None if prediction.measured or not lost else place.doubt, lost or poor
 
     def _covariance_of(self, found: Registration, prediction: Prediction, searched: bool) -> Array:
         """The registration's covariance; that of two places where it may as well be the predicted one."""
