@@ -15,7 +15,7 @@ from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarStep
 from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_recordings.scan_stream import LidarScan, WheelPose
-from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan
+from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan, walls
 
 BEGIN_NS = 10**12
 STEP_NS = 100_000_000
@@ -313,3 +313,55 @@ def test_noise_of_the_wheels_that_a_sweep_was_moved_by_is_no_lag() -> None:
     off = [turn - 0.6 * (math.sin(0.9e-9 * end) - math.sin(0.9e-9 * start)) for start, end, turn in told[20:]]
     assert len(off) > 300
     assert np.std(off) < 0.006
+
+
+def corridor() -> np.ndarray:
+    """A room, a corridor of 30 m that shows nothing, and a room again."""
+    outline = (
+        (-6.0, -3.0), (0.0, -3.0), (0.0, -1.0), (30.0, -1.0), (30.0, -3.0), (36.0, -3.0),
+        (36.0, 3.0), (30.0, 3.0), (30.0, 1.0), (0.0, 1.0), (0.0, 3.0), (-6.0, 3.0),
+    )  # fmt: skip
+    cupboard = ((-5.0, 1.5), (-4.4, 1.5), (-4.4, 2.2), (-5.0, 2.2))
+    return np.concatenate((walls(outline), walls(cupboard)))
+
+
+@pytest.mark.parametrize("speed", [0.2, 0.5, 2.0])
+def test_a_corridor_that_shows_nothing_is_driven_through_without_wheels(speed: float) -> None:
+    """Ranges do not change, as if the robot stood, and it sped up before: its speed neither ends nor grows."""
+    segments, noise, angles = corridor(), np.random.default_rng(0), fan(181, 180.0)
+    odometry, pose, velocity, steps = LidarOdometry(), np.array((-5.0, 0.0, 0.0)), 0.0, []
+    for k in range(450):
+        velocity = min(velocity + (0.03 if k > 15 else 0.0), speed)
+        pose = compose(pose, np.array((0.1 * velocity, 0.0, 0.0)))
+        if pose[0] > 25.0:
+            break
+        ranges = cast(segments, pose, angles) + noise.normal(0.0, 0.01, len(angles))
+        ranges[ranges > 6.0] = np.inf
+        steps += fed(odometry, [scan_of(ranges, k, angles, range_max=6.0)], at_end=False)
+    travelled = pose[0] + 5.0
+    assert steps[-1].odom_xyyaw[0] == pytest.approx(travelled, rel=0.25)
+    assert sum(step.key is not None for step in steps) > 2.0 * travelled
+
+
+def test_a_standing_robot_of_a_noisy_scanner_drives_on_as_fast_as_it_drives() -> None:
+    """Noise of a robot that stands teaches nothing: it would look like brakes."""
+    segments, noise, angles = corridor(), np.random.default_rng(0), fan(181, 180.0)
+    odometry, pose, velocity, steps = LidarOdometry(), np.array((-5.0, 0.0, 0.0)), 0.0, []
+    for k in range(600):
+        velocity = min(velocity + (0.03 if k > 300 else 0.0), 0.5)
+        pose = compose(pose, np.array((0.1 * velocity, 0.0, 0.0)))
+        ranges = cast(segments, pose, angles) + noise.normal(0.0, 0.03, len(angles))
+        ranges[ranges > 6.0] = np.inf
+        steps += fed(odometry, [scan_of(ranges, k, angles, range_max=6.0)], at_end=False)
+    assert steps[-1].odom_xyyaw[0] == pytest.approx(pose[0] + 5.0, abs=2.0)
+    standing = [step.odom_xyyaw for step in steps[:290]]
+    assert np.abs(standing).max() < 0.05
+
+
+def test_silent_wheels_leave_the_detector_at_work() -> None:
+    """Where wheels fall silent, ranges tell at once whether the robot stands."""
+    poses = np.concatenate((way(20, 0.0), np.tile(way(20, 0.0)[-1], (60, 1))))
+    odometry = LidarOdometry()
+    steps = fed(odometry, sorted([*scans(poses), *wheels(poses)[:20]], key=lambda each: each.stamp_ns))
+    assert len(steps) == 79
+    assert np.abs(steps[-1].odom_xyyaw - steps[30].odom_xyyaw).max() < 0.03

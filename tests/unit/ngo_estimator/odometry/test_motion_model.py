@@ -88,3 +88,21 @@ def test_nothing_is_learned_across_steps_that_walls_do_not_tell() -> None:
         model.observe(velocity, PERIOD_S)
         model.interrupt()
     assert model.after(np.zeros(3), PERIOD_S) is None
+
+
+def test_a_robot_that_only_speeded_up_does_not_speed_up_for_ever() -> None:
+    """What is predicted stays within what was seen, or nothing is."""
+    random = np.random.default_rng(0)
+    speeding = np.stack((0.2 + 0.014 * np.arange(80), np.zeros(80), np.zeros(80)), axis=1)
+    model = learned(speeding + 0.002 * random.standard_normal((80, 3)))
+    velocity = speeding[-1]
+    for _ in range(100):
+        following = model.after(velocity, PERIOD_S)
+        velocity = velocity if following is None else following.mean
+    assert velocity[0] < speeding[-1, 0] + 0.05
+
+
+def test_nothing_is_said_of_times_longer_than_those_it_learned_from() -> None:
+    model = learned(turning_and_driving(400))
+    assert model.after(np.zeros(3), 2.0 * PERIOD_S) is not None
+    assert model.after(np.zeros(3), 5.0 * PERIOD_S) is None

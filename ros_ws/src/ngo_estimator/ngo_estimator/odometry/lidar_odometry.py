@@ -220,8 +220,7 @@ class LidarOdometry:
             )
         last = self._last
         again = None if self._wheels is None or sweep is None else partial(self._swept_otherwise, scan, sweep)
-        stands = self._wheels is None and self._standstill.stands(scan)
-        estimate = self._core.update(swept, self._wheels, again, stands)
+        estimate = self._core.update(swept, self._wheels, again, self._standstill.stands(scan))
         key = estimate.swept.scan
         self._last = key
         if last is None:

@@ -24,8 +24,11 @@ _FEWEST = 50
 _GAIN = 0.05
 """Nats a step, by which it must tell the next velocity better than a constant one does."""
 
+_LONGEST = 3.0
+"""Mean steps, after which it is not known what follows."""
+
 _RIDGE = 1e-3
-"""Weight of no change."""
+"""Of the least squares: without motion nothing changes."""
 
 _WIDER = 1.5
 """Factor on its deviations: it was learned where walls tell the motion, and is used where they do not."""
@@ -60,16 +63,24 @@ class MotionModel:
         self._weights: Array = np.zeros((4, 3))  # of velocity and one, on the change in one second
         self._errors: Array = _FIRST_DEVIATION**2 * np.eye(3)  # squared: of the model
         self._changes: Array = _FIRST_DEVIATION**2 * np.eye(3)  # of a constant velocity
-        self._gain, self._steps = 0.0, 0
+        self._least: Array = np.zeros(3)  # of the velocities that walls told, and the largest
+        self._largest: Array = np.zeros(3)
+        self._gain, self._steps, self._period_s = 0.0, 0, 0.0
         self._last: Array | None = None
 
     def after(self, velocity: Array, elapsed: float) -> NextVelocity | None:
-        """The velocity ``elapsed`` seconds later; None where it is not known to tell more than a constant one."""
-        if self._steps < _FEWEST or self._gain < _GAIN:
+        """The velocity ``elapsed`` seconds later, within what was seen before.
+
+        None where the model is not known to tell more than a constant velocity, or would grow without limit.
+        """
+        if self._steps < _FEWEST or self._gain < _GAIN or elapsed > _LONGEST * self._period_s:
             return None
         side = _side(velocity)
-        mean = velocity + elapsed * side * (np.append(side * velocity, 1.0) @ self._weights)
         by_velocity = np.eye(3) + elapsed * side[:, None] * self._weights[:3].T * side
+        if float(np.abs(np.linalg.eigvals(by_velocity)).max()) > 1.0:
+            return None
+        mean = side * velocity + elapsed * (np.append(side * velocity, 1.0) @ self._weights)
+        mean = side * np.clip(mean, self._least, self._largest)
         return NextVelocity(mean, by_velocity, _WIDER**2 * elapsed * self._errors * np.outer(side, side))
 
     def observe(self, velocity: Array, elapsed: float) -> None:
@@ -83,7 +94,11 @@ class MotionModel:
         change = side * (velocity - last) / root_s
         error = change - given @ self._weights
         unlike, usual = _squared(change, self._changes), _squared(error, self._errors)
+        if usual <= _FARTHEST**2:
+            self._least = np.minimum(self._least, side * velocity)
+            self._largest = np.maximum(self._largest, side * velocity)
         self._steps += 1
+        self._period_s += (elapsed - self._period_s) / min(self._steps, _MEMORY)
         weight = 1.0 / min(self._steps + 1, _MEMORY)
         if self._steps > _FIRST_STEPS:
             gain = _nats(unlike, self._changes) - _nats(usual, self._errors)

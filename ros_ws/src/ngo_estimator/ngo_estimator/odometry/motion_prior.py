@@ -59,7 +59,7 @@ class Prediction:
     ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``by_wheels`` says that wheels made it, and
     ``measured`` that they are not doubted. Where these moved, ``step_covariance`` ``(3, 3)`` is that of their motion
     since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen. Where no wheels
-    lead, ``standing`` says that the ranges look as if the robot stands."""
+    lead, ``standing`` says that the robot is believed to stand."""
 
     mean: Array
     covariance: Array
@@ -82,6 +82,7 @@ class MotionPrior:
         self._model = MotionModel()
         self._standstill = StandstillBelief(config.acceleration_m_s2)
         self._expected: Array | None = None  # by the velocity alone
+        self._standing = False  # as it was predicted last
         self._anchor = np.zeros(3)
         self._anchor_wheels: Array | None = None
         self._last_wheels: Array | None = None
@@ -185,6 +186,7 @@ class MotionPrior:
         following = self._model.after(self._motion.velocity, elapsed) if known else None
         total = self._motion.predict(last[2], elapsed, still, changes, following)
         self._expected = mean = compose(last, self._motion.velocity * elapsed)
+        self._standing = stands
         return Prediction(mean, total, inverted(total), (mean,), standing=stands)
 
     def accept(
@@ -210,6 +212,8 @@ class MotionPrior:
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
         if self._expected is None:
             self._motion.measure(step / elapsed, step_covariance / elapsed**2, self._changes(elapsed))
+            self._usual.interrupt()
+            self._model.interrupt()
         else:
             change = pose - self._expected
             change[2] = wrap(change[2])
@@ -219,9 +223,10 @@ class MotionPrior:
                 self._model.interrupt()
             else:
                 self._usual.observe(step, elapsed)
-                if elapsed > self.config.longest_s:
+                if self._standing or elapsed > self.config.longest_s:
                     self._model.interrupt()
-                self._model.observe(step / elapsed, elapsed)
+                if not self._standing:
+                    self._model.observe(step / elapsed, elapsed)
                 self._standstill.observe(stamp_ns, math.hypot(step[0], step[1]) / elapsed)
             if unsure:
                 self._motion.velocity = 0.5 * self._motion.velocity

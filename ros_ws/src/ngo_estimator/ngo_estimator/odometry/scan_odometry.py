@@ -348,11 +348,9 @@ class ScanOdometry:
         distance_m, turn_rad = self.config.key_distance_m, math.radians(self.config.key_turn_deg)
         passed = between(self._passed, pose)
         passes = math.hypot(passed[0], passed[1]) >= distance_m or abs(passed[2]) >= turn_rad
-        if not prediction.by_wheels and found.share < self.config.known_share:
+        if not (prediction.by_wheels or prediction.standing) and found.share < self.config.known_share:
             # It may have come as far along a corridor, where only the next key scan holds what comes into view.
             passes = passes or math.sqrt(max(covariance[0, 0], covariance[1, 1])) >= distance_m
-        if prediction.standing:
-            passes = False  # it would show nothing new, and hold the robot to where it is believed to be
         # Where the robot may be elsewhere, nobody knows what it would see.
         certain = float(max(covariance[0, 0], covariance[1, 1])) < self.config.poor_m**2
         is_key = passes and not (certain and self._submap.knows(scan, pose, self.config.known_m, turn_rad))

@@ -42,7 +42,7 @@ class StandstillDetector:
     def stands(self, scan: LidarScan) -> bool:
         """Take the newest scan: does it show what one showed a second ago, or more where there was none since?"""
         largest = 0.99 * scan.range_max if scan.range_max > 0.0 else math.inf
-        usable = (scan.ranges > scan.range_min) & (scan.ranges < largest)
+        usable = (scan.ranges > max(scan.range_min, 0.0)) & (scan.ranges < largest)
         ranges = np.where(usable, scan.ranges, np.nan).astype(np.float64)
         self._scans.append((scan.stamp_ns, ranges))
         until_ns = scan.stamp_ns - _AGO_NS
