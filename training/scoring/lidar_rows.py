@@ -245,7 +245,7 @@ class Row:
 
     ``code`` are the modules that its numbers follow from, beside those that they import. ``missing`` says in a few
     words what it lacks on this machine, or nothing. Of several estimates, one a seed, the mean error counts. Rows of
-    the ``ablation`` are measured on some drives of a table alone; one that ``needs_truth`` changes covariances alone.
+    the ``ablation``, and ``slow`` ones, are measured on some drives of a table alone; one that ``needs_truth`` changes covariances alone.
     """
 
     estimate: Callable[[DriveRuns], Estimate | list[Estimate]]
@@ -254,6 +254,7 @@ class Row:
     code: tuple[ModuleType, ...] = _PIPELINE
     missing: Callable[[], str] = lambda: ""
     ablation: bool = False
+    slow: bool = False
     needs_truth: bool = False
 
 
@@ -282,7 +283,7 @@ def _fed(solve: Solver, percent: float, **changes: Any) -> Row:
 def _mrpt(program: mrpt_slam.Program) -> Row:
     config = mrpt_slam.MrptConfig()
     missing = partial(mrpt_slam.missing, program)
-    return Row(partial(mrpt, program=program), config, True, (mrpt_slam,), missing, ablation=True)
+    return Row(partial(mrpt, program=program), config, True, (mrpt_slam,), missing, slow=True)
 
 
 def _kiss_missing() -> str:
