@@ -64,7 +64,7 @@ class Arguments:
     length_m: float = 500.0
     """Way that the robot drives in a building."""
     ablation: int = 5
-    """Of these, how many the rows of the ablation and MRPT are measured on; and buildings with slipping wheels."""
+    """How many of these get the rows of the ablation and of MRPT; and how many buildings have slipping wheels."""
     mazes: int = 8
     """Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0."""
     frames: int = 2000
