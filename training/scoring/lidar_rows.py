@@ -245,7 +245,8 @@ class Row:
 
     ``code`` are the modules that its numbers follow from, beside those that they import. ``missing`` says in a few
     words what it lacks on this machine, or nothing. Of several estimates, one a seed, the mean error counts. Rows of
-    the ``ablation``, and ``slow`` ones, are measured on some drives of a table alone; one that ``needs_truth`` changes covariances alone.
+    the ``ablation``, and ``slow`` ones, are measured on some drives of a table alone. One that ``needs_truth`` changes
+    covariances alone.
     """
 
     estimate: Callable[[DriveRuns], Estimate | list[Estimate]]
