@@ -51,11 +51,12 @@ def test_one_step_in_numpy_equals_many_in_torch() -> None:
     assert np.ptp(expected[:, 0]) > 0.5
 
 
-def test_factors_stay_within_their_limit() -> None:
-    network = trained()
-    network.head.bias += 100.0
-    factors = in_numpy(network).factors(evidence(1)[0])
-    np.testing.assert_allclose(factors, network.config.largest, rtol=1e-6)
+def test_factors_stay_within_their_limits() -> None:
+    network, steps = trained(), evidence(1)
+    for change, limit in ((100.0, network.config.largest), (-200.0, network.config.least)):
+        network.head.bias += change
+        np.testing.assert_allclose(in_numpy(network).factors(steps[0]), limit, rtol=1e-6)
+        np.testing.assert_allclose(network(torch.from_numpy(steps).float()).exp().numpy(), limit, rtol=1e-6)
 
 
 def test_an_unsure_step_keeps_its_deviations() -> None:
@@ -84,7 +85,7 @@ def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
         StepScaling.load(tmp_path)
 
 
-@pytest.mark.parametrize("settings", [{"hidden": 0}, {"largest": 1.0}, {"largest": float("inf")}])
+@pytest.mark.parametrize("settings", [{"hidden": 0}, {"largest": 1.0}, {"largest": float("inf")}, {"least": 1.5}])
 def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="hidden, largest"):
+    with pytest.raises(ValueError, match="hidden, least, largest"):
         StepDeviationConfig(**settings)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -110,12 +111,12 @@ def followed(counted: list[np.ndarray], measured: list[np.ndarray]) -> list[Pred
     return predictions
 
 
-def test_wheels_that_freeze_and_catch_up_are_doubted_meanwhile() -> None:
+def test_wheels_that_freeze_count_for_nothing_until_they_catch_up() -> None:
     """On the spot at 1.5 rad/s, so that the turns alone tell it."""
     measured = [np.array((0.0, 0.0, 0.15 * k)) for k in range(20)]
     counted = [measured[8] if 8 <= k < 13 else pose for k, pose in enumerate(measured)]
     trusted = [prediction.measured for prediction in followed(counted, measured)]
-    assert trusted == [k < 9 or k > 13 for k in range(1, 20)]
+    assert trusted == [k < 9 or k > 12 for k in range(1, 20)]  # their whole way counts from the first scan on
     caught_up = followed(counted, measured)[12]
     assert any(start[2] == pytest.approx(measured[13][2], abs=0.02) for start in caught_up.starts)
     again = followed(counted, measured)[14]
@@ -150,3 +151,38 @@ def test_a_robot_drives_on_as_it_did_unless_it_stands() -> None:
     assert stands.standing and not drives.standing
     constant, sped_up = (np.hypot(*between(pose, each.mean)[:2]) for each in (stands, drives))
     assert constant + 0.001 < sped_up < 1.2 * step[0]
+
+
+def along_a_corridor(counted: Callable[[float], float], seconds: float) -> tuple[np.ndarray, list[Prediction]]:
+    """The last pose and all predictions in a corridor that tells no motion along it: each pose is as predicted.
+
+    Wheels ``counted`` so many metres by a time (s).
+    """
+    prior, pose, wheels, found = MotionPrior(MotionPriorConfig()), np.zeros(3), WheelOdometry(), []
+    wheels.add(0, np.zeros(3))
+    prior.begin(0, pose, wheels)
+    for k in range(1, round(10 * seconds) + 1):
+        wheels.add(k * PERIOD_NS, np.array((counted(0.1 * k), 0.0, 0.0)))
+        prediction = prior.predict(k * PERIOD_NS, pose, SURE, wheels)
+        covariance = np.diag((prediction.covariance[0, 0], 1e-6, 1e-8))
+        step, pose = between(pose, prediction.mean), prediction.mean
+        passes = k % 4 == 0
+        prior.accept(k * PERIOD_NS, pose, covariance, step, covariance, passes, passes, False)
+        found.append(prediction)
+    return pose, found
+
+
+def test_wheels_that_freeze_are_carried_on_and_count_again() -> None:
+    pose, found = along_a_corridor(lambda t: 0.7 * (min(t, 2.0) if t < 3.0 else t), 2.9)
+    assert pose[0] == pytest.approx(0.7 * 2.9, abs=0.02)
+    assert not any(prediction.by_wheels for prediction in found[20:])
+    pose, found = along_a_corridor(lambda t: 0.7 * min(t, 2.0) if t < 3.0 else 0.7 * t + 0.1, 3.0)
+    assert pose[0] == pytest.approx(0.7 * 3.0 + 0.1, abs=1e-6)  # by their whole way, slip or not
+    assert found[-1].measured and math.sqrt(found[-1].covariance[0, 0]) < 0.4
+
+
+def test_wheels_that_begin_anew_after_a_freeze_do_not_count() -> None:
+    """The robot's base was started again: its pose is zero."""
+    pose, found = along_a_corridor(lambda t: 0.7 * min(t, 12.0) if t < 12.5 else 0.7 * (t - 12.5), 13.0)
+    assert pose[0] == pytest.approx(0.7 * 13.0, abs=0.1)
+    assert not found[124].measured

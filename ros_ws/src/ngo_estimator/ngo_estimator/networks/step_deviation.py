@@ -35,5 +35,5 @@ class StepDeviation(nn.Module):
         """
         limit = math.log(self.config.largest)
         out = self.head(self.layers((evidence - self.middle) / self.scale))
-        log_factors: Tensor = limit * (out / limit).tanh() * (1.0 - evidence[..., UNSURE, None])
-        return log_factors
+        log_factors = (limit * (out / limit).tanh()).clamp(min=math.log(self.config.least))
+        return log_factors * (1.0 - evidence[..., UNSURE, None])

@@ -34,14 +34,22 @@ SCALE = (0.06, 0.3, 0.12, 0.25, 0.1, 0.12, 0.25, 0.3, 0.3, 0.3, 0.12, 0.15)
 
 @dataclass(frozen=True)
 class StepDeviationConfig:
-    """Shape of the network: ``hidden`` units; factors lie within ``largest`` and its inverse."""
+    """Shape of the network: ``hidden`` units; factors lie between ``least`` and ``largest``.
+
+    Errors of usual scanners grow more slowly than independent steps would, and the network learns that. Scanners with a
+    narrow view turn their map a little with each key scan: their errors do not.
+    """
 
     hidden: int = 16
     largest: float = 20.0
+    least: float = 0.6
 
     def __post_init__(self) -> None:
-        if self.hidden < 1 or not 1.0 < self.largest < math.inf:
-            raise ValueError(f"hidden, largest are {self.hidden}, {self.largest}; expected at least 1, and over 1")
+        if self.hidden < 1 or not (0.0 < self.least <= 1.0 < self.largest < math.inf):
+            raise ValueError(
+                f"hidden, least, largest are {self.hidden}, {self.least}, {self.largest}; expected at least 1, over 0 "
+                "to 1, and over 1"
+            )
 
 
 class StepScaling:
@@ -66,7 +74,7 @@ class StepScaling:
         if given != shapes:
             raise ValueError(f"the weights are {given}; expected {shapes}")
         self._first, self._offset, self._head, self._bias = (arrays[name].astype(np.float64) for name in shapes)
-        self._limit = math.log(config.largest)
+        self._limit, self._least = math.log(config.largest), config.least
 
     @classmethod
     def load(cls, weights: Path, world: str | None = None) -> "StepScaling":
@@ -87,5 +95,6 @@ class StepScaling:
         if evidence[UNSURE] > 0.0:
             return np.ones(3)
         hidden = np.tanh(self._first @ ((evidence - MIDDLE) / SCALE) + self._offset)
-        position, heading = np.exp(self._limit * np.tanh((self._head @ hidden + self._bias) / self._limit))
+        found = np.exp(self._limit * np.tanh((self._head @ hidden + self._bias) / self._limit))
+        position, heading = np.maximum(found, self._least)
         return np.array((position, position, heading))

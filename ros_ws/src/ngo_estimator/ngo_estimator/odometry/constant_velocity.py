@@ -75,6 +75,12 @@ class ConstantVelocity:
         self._joint[_V, :] = self._joint[:, _V] = 0.0
         self._drift[:, _V] = 0.0
 
+    def begin(self, velocity: Array, covariance: Array) -> None:
+        """The ``velocity`` ``(3,)`` has this covariance ``(3, 3)``, whatever was known before."""
+        self.velocity = velocity
+        self._joint, self._drift = np.zeros((6, 6)), np.zeros((3, 6))
+        self._joint[_V, _V] = covariance
+
     def measure(self, velocity: Array, covariance: Array, noise: Array) -> None:
         """Another source measured a ``velocity`` ``(3,)``, after changes of the deviations ``noise`` ``(3,)``."""
         self.velocity, self._joint = _measured(self._joint, self.velocity, velocity, covariance, noise)

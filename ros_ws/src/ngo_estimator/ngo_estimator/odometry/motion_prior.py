@@ -1,9 +1,10 @@
 """Where the next scan is expected: by the wheels, and by the velocity that the scans measured last.
 
 The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
-Wheels that stopped at once while the scans moved (frozen), or that run away from them (a jump), are doubted: for that
-scan the prior widens by the disagreement, and both predictions are tried. The next prior counts from that scan. So it
-does where the walls say that the velocity is right and the wheels are not (a slip).
+Wheels that stand while the scans moved, or that run away from them (a jump), are doubted: for that scan the prior
+widens by the disagreement, and both predictions are tried. The next prior counts from that scan. So it does where the
+walls say that the velocity is right and the wheels are not (a slip). Wheels that froze (``WheelFreezes``) count for
+nothing. Once they count again, so does their whole way since before.
 """
 
 import math
@@ -18,6 +19,9 @@ from ngo_estimator.odometry.standstill import StandstillBelief
 from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
+_COVERED = 0.5
+"""Share of the time since the last scan that wheels must have counted to tell the motion."""
+
 
 @dataclass(frozen=True)
 class MotionPriorConfig:
@@ -29,7 +33,8 @@ class MotionPriorConfig:
     grows to ``largest_m_s`` and ``largest_rad_s``. Robots that were seen to change their speed by more get more of both
     (``UsualMotion``). Wheels are doubted where they differ from constant velocity by more than ``doubt_m`` and
     ``doubt_m_s2``, or ``doubt_deg`` and ``acceleration_rad_s2``, allow, or where they stand exactly still, for at most
-    ``longest_freeze_s``, while constant velocity moves by ``frozen_m``.
+    ``longest_freeze_s``, while constant velocity moves by ``frozen_m``. Wheels that did not count for up to
+    ``longest_silence_s`` tell the whole way since then.
     """
 
     still_m: float = 0.03
@@ -46,6 +51,7 @@ class MotionPriorConfig:
     doubt_deg: float = 10.0
     frozen_m: float = 0.01
     longest_freeze_s: float = 2.0
+    longest_silence_s: float = 3.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -90,10 +96,12 @@ class MotionPrior:
         self._anchor_covariance = np.zeros((3, 3))
         self._doubted = False
         self._moved_ns = 0  # when the wheels moved last
+        self._counted_ns = 0  # when they told the motion last
 
     def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
         """The first scan is a key scan at this pose."""
-        self._stamp_ns, self._anchor, self._moved_ns = stamp_ns, pose, stamp_ns
+        self._stamp_ns, self._anchor = stamp_ns, pose
+        self._moved_ns = self._counted_ns = stamp_ns
         self._last_wheels = self._anchor_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
 
     def predict(
@@ -107,8 +115,15 @@ class MotionPrior:
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
         if elapsed > self.config.longest_s:
             self._motion.forget()
-        constant = self._motion.velocity * elapsed
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
+        if wheels is not None and wheels.frozen_s(stamp_ns) > (1.0 - _COVERED) * elapsed:
+            self._now_wheels = None
+            self._begin_silence(stamp_ns, last, covariance, wheels)
+        constant = self._motion.velocity * elapsed
+        if wheels is not None and self._now_wheels is not None and self._last_wheels is None:
+            again = self._counting_again(stamp_ns, compose(last, constant), wheels)
+            if again is not None:
+                return again
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
             return self._without_wheels(last, elapsed, self._standstill.stands(stamp_ns, stands))
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
@@ -138,13 +153,40 @@ class MotionPrior:
             step_covariance=np.diag(step_deviations**2) if not doubted and step.any() else None,
         )
 
+    def _begin_silence(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> None:
+        """Wheels that froze since the last scan leave their velocity, and the pose from which they will count again."""
+        before = wheels.velocity_before_freeze(stamp_ns)
+        if self._last_wheels is None or before is None:
+            return
+        velocity, deviations = before
+        self._motion.begin(velocity, np.diag(deviations**2))
+        if self._doubted:
+            self._anchor, self._anchor_wheels, self._anchor_covariance = last, self._last_wheels, covariance
+
+    def _counting_again(self, stamp_ns: int, carried: Array, wheels: WheelOdometry) -> Prediction | None:
+        """The prior by the wheels' way since they counted last; None where it is none of this robot's.
+
+        ``carried`` ``(3,)`` is where the velocity carried it meanwhile.
+        """
+        if self._anchor_wheels is None or self._now_wheels is None:
+            return None
+        moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
+        mean, silent_s = compose(self._anchor, moved), (stamp_ns - self._counted_ns) * 1e-9
+        if math.dist(mean[:2], carried[:2]) > self.config.doubt_m + self.config.doubt_m_s2 * silent_s**2:
+            self._anchor_wheels = None
+            return None
+        self._expected, self._doubted = None, False
+        total = np.diag(deviations**2) + self._anchor_covariance
+        return Prediction(mean, total, inverted(total), (mean, carried), by_wheels=True, measured=True)
+
     def without_slip(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
         """Another prior of the scan that ``predict`` was asked for: that of wheels that slipped.
 
         It begins at the velocity's place and is as wide as both disagree. It is None where nothing else is known: the
-        velocity is forgotten, or agrees with the wheels within their deviations.
+        velocity is forgotten, or agrees with the wheels within their deviations, or these just count again.
         """
-        assert self._last_wheels is not None and self._now_wheels is not None
+        if self._last_wheels is None or self._now_wheels is None:
+            return None
         elapsed = (stamp_ns - self._stamp_ns) * 1e-9
         constant = self._motion.velocity * elapsed
         step, deviations = wheels.motion(self._last_wheels, self._now_wheels)
@@ -232,7 +274,15 @@ class MotionPrior:
                 self._motion.velocity = 0.5 * self._motion.velocity
         shared = self._motion.shared()
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
-        if passes or is_key:
+        if self._now_wheels is not None:
+            self._counted_ns = stamp_ns
+        elif (stamp_ns - self._counted_ns) * 1e-9 > self.config.longest_silence_s:
+            self._anchor_wheels = None
+        if self._now_wheels is None and self._anchor_wheels is not None:
+            # The wheels will count from before. The covariances will count from a key scan that may be elsewhere.
+            if is_key:
+                self._anchor_covariance = self._anchor_covariance + covariance
+        elif passes or is_key:
             self._anchor, self._anchor_wheels = pose, self._now_wheels
             self._anchor_covariance = np.zeros((3, 3)) if is_key else covariance
             self._doubted = False

@@ -1,7 +1,7 @@
 """Wheel odometry as the action of the local estimator: motion between two scans, and how far it may be wrong.
 
 The wheels need no calibration: their deviations allow for it. Their stamps may be late or early against the scans',
-which ``WheelLag`` finds out. They may freeze and jump.
+which ``WheelLag`` finds out. They may freeze (``WheelFreezes``) and jump.
 """
 
 import math
@@ -11,7 +11,11 @@ import numpy as np
 from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array, between, wrap
+from ngo_estimator.odometry.wheel_freezes import WheelFreezes, WheelFreezesConfig
 from ngo_estimator.odometry.wheel_lag import WheelLag, WheelLagConfig
+
+_STILL_RAD = 1e-9
+"""Headings that differ by less are one: they were wrapped."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class WheelOdometryConfig:
     kept: int = 1024
     extrapolated_s: float = 0.5
     lag: WheelLagConfig = field(default_factory=WheelLagConfig)
+    freezes: WheelFreezesConfig = field(default_factory=WheelFreezesConfig)
 
     def __post_init__(self) -> None:
         if not (self.still_m > 0.0 and self.still_deg > 0.0):
@@ -57,6 +62,7 @@ class WheelOdometry:
     def __init__(self, config: WheelOdometryConfig | None = None) -> None:
         self.config = config or WheelOdometryConfig()
         self.lag = WheelLag(self.config.lag)
+        self._freezes = WheelFreezes(self.config.freezes)
         self._rows = np.empty((2 * self.config.kept, 4))  # stamp in s since the first pose, x, y, unwrapped yaw
         self._count = 0
         self._origin_ns: int | None = None
@@ -84,6 +90,10 @@ class WheelOdometry:
             if stamp_s <= last[0]:
                 return
             yaw = last[3] + wrap(yaw - last[3])
+            if last[1] == pose[0] and last[2] == pose[1] and abs(last[3] - yaw) < _STILL_RAD:
+                self._freezes.stood(float(last[0]), stamp_s, *self._moved_before(float(last[0])))
+            else:
+                self._freezes.moved(float(last[0]), stamp_s)
         if self._count == len(self._rows):
             self._rows[: self.config.kept] = self._rows[self.config.kept :].copy()
             self._count = self.config.kept
@@ -96,6 +106,36 @@ class WheelOdometry:
             return None
         at = (stamp_ns - self._origin_ns) * 1e-9 - self.lag_s
         return _pose_at(self._rows, self._count, at, self.config.extrapolated_s)
+
+    def frozen_s(self, stamp_ns: int) -> float:
+        """For how long (s) the wheels had not counted when a scan of this stamp was taken; 0 where they counted."""
+        at_s, since_s = self._frozen_since(stamp_ns)
+        return 0.0 if since_s is None else at_s - since_s
+
+    def velocity_before_freeze(self, stamp_ns: int) -> tuple[Array, Array] | None:
+        """Velocity ``(3,)`` (m/s, m/s, rad/s) of the wheels before they froze, and its deviations ``(3,)``; None where
+        they counted when a scan of this stamp was taken."""
+        _, since_s = self._frozen_since(stamp_ns)
+        if since_s is None:
+            return None
+        moved, elapsed_s = self._moved_before(since_s)
+        if elapsed_s <= 0.0:  # so many readings came since then that none before is kept
+            return None
+        return moved / elapsed_s, self.config.deviations(moved) / elapsed_s
+
+    def _frozen_since(self, stamp_ns: int) -> tuple[float, float | None]:
+        """When a scan of this stamp was taken, and since when the wheels had not counted then."""
+        if self._origin_ns is None:
+            return 0.0, None
+        at_s = (stamp_ns - self._origin_ns) * 1e-9 - self.lag_s
+        return at_s, self._freezes.since(at_s)
+
+    def _moved_before(self, at_s: float) -> tuple[Array, float]:
+        """What the wheels counted before the reading of a time, and in which time (s): at least ``braking_s``."""
+        stamps_s = self._rows[: self._count, 0]
+        last = int(np.searchsorted(stamps_s, at_s))
+        first = max(int(np.searchsorted(stamps_s, at_s - self.config.freezes.braking_s, side="right")) - 1, 0)
+        return between(self._rows[first, 1:], self._rows[last, 1:]), float(stamps_s[last] - stamps_s[first])
 
     def observe_turn(self, start_ns: int, end_ns: int, turn: float) -> None:
         """Take a turn (rad) that scans measured between their stamps: it tells the lag."""
