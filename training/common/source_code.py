@@ -18,11 +18,12 @@ def code_digest(modules: tuple[ModuleType, ...]) -> str:
 
     The files are read once in a process, as modules are.
     """
-    files = sorted({path for module in modules for path in _files(module.__name__)})
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    files = {name: path for module in modules for name, path in _files(module.__name__)}
+    return hashlib.sha256(b"".join(files[name].read_bytes() for name in sorted(files))).hexdigest()
 
 
-def _files(module: str) -> Iterator[Path]:
+def _files(module: str) -> Iterator[tuple[str, Path]]:
+    """The files, each with its path below the folder of the package: wherever that lies, the order is the same."""
     package = module.partition(".")[0]
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
@@ -34,7 +35,7 @@ def _files(module: str) -> Iterator[Path]:
         path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
         if not path.is_file():  # a name within a module
             continue
-        yield path
+        yield str(path.relative_to(folder)), path
         names = {name for name in _imported(path.read_bytes()) if name.partition(".")[0] == package}
         todo += sorted(names - seen - {*_READS})
         seen |= names
