@@ -186,3 +186,50 @@ def test_wheels_that_begin_anew_after_a_freeze_do_not_count() -> None:
     pose, found = along_a_corridor(lambda t: 0.7 * min(t, 12.0) if t < 12.5 else 0.7 * (t - 12.5), 13.0)
     assert pose[0] == pytest.approx(0.7 * 13.0, abs=0.1)
     assert not found[124].measured
+
+
+def test_wheels_that_begin_anew_with_another_heading_do_not_count() -> None:
+    """It turns on the spot; the wheels are silent for a second, and begin anew at zero. Walls tell every pose."""
+    prior, pose, wheels = MotionPrior(MotionPriorConfig()), np.zeros(3), WheelOdometry()
+    wheels.add(0, np.zeros(3))
+    prior.begin(0, pose, wheels)
+    for k in range(1, 41):
+        if k <= 20 or k >= 30:
+            wheels.add(k * PERIOD_NS, np.array((0.0, 0.0, 0.1 * (k if k <= 20 else k - 30))))
+        prediction = prior.predict(k * PERIOD_NS, pose, SURE, wheels)
+        assert abs(between(pose, prediction.mean)[2] - 0.1) < 0.06
+        step, pose = np.array((0.0, 0.0, 0.1)), np.array((0.0, 0.0, 0.1 * k))
+        prior.accept(k * PERIOD_NS, pose, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
+
+
+def test_a_freeze_of_many_seconds_moves_no_robot_back_that_walls_hold() -> None:
+    """Wheels are believed to freeze for 2 s at most. These freeze for 3 s, and for one scan both may be right."""
+    wheels, prior = WheelOdometry(), MotionPrior(MotionPriorConfig())
+    wheels.add(0, np.zeros(3))
+    prior.begin(0, np.zeros(3), wheels)
+    step = np.array((0.07, 0.0, 0.0))
+    for k in range(1, 42):
+        wheels.add(k * PERIOD_NS, min(k, 20) * step)
+        prediction = prior.predict(k * PERIOD_NS, (k - 1) * step, SURE, wheels)
+        off = (prediction.mean - k * step)[0]
+        assert abs(off) < 3.0 * math.sqrt(prediction.covariance[0, 0])
+        assert any(abs(start[0] - k * step[0]) < 0.1 for start in prediction.starts)
+        prior.accept(k * PERIOD_NS, k * step, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
+    assert not prediction.measured
+
+
+def test_silent_wheels_that_were_doubted_count_from_the_scan_after_their_slip() -> None:
+    """They are extrapolated for half a second before they count as silent."""
+    wheels, prior, step = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.array((0.07, 0.0, 0.0))
+    wheels.add(0, np.zeros(3))
+    prior.begin(0, np.zeros(3), wheels)
+    for k in range(1, 41):
+        if k <= 20 or k > 30:
+            wheels.add(k * PERIOD_NS, k * step + np.array((0.5 if k > 15 else 0.0, 0.0, 0.0)))
+        prediction = prior.predict(k * PERIOD_NS, (k - 1) * step, SURE, wheels)
+        assert prediction.by_wheels == (k <= 25 or k > 30)
+        if k == 25:
+            prior.doubt()
+        if k > 30:
+            assert prediction.measured and prediction.mean[0] == pytest.approx(k * step[0], abs=0.05)
+        prior.accept(k * PERIOD_NS, k * step, SURE, step, SURE, False, False, False)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.odometry.wheel_freezes import WheelFreezesConfig
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
@@ -72,3 +73,29 @@ def test_the_lag_counts() -> None:
 def test_settings_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError, match="braking_s is 0"):
         WheelFreezesConfig(braking_s=0.0)
+
+
+def test_drivers_that_repeat_each_pose_froze_never() -> None:
+    """An encoder of 10 Hz, published at 20 Hz."""
+    wheels = wheels_that([SPEED * 2 * PERIOD_S, 0.0] * 20)
+    assert not any(frozen_s(wheels, 0.01 * k) for k in range(200))
+
+
+def test_a_jump_of_wheels_that_stand_is_no_freeze() -> None:
+    wheels = wheels_that([0.0] * 20 + [5.0] + [0.0] * 20)
+    assert not any(frozen_s(wheels, 0.01 * k) for k in range(210))
+
+
+def test_wheels_that_catch_up_and_stand_froze_once() -> None:
+    wheels = wheels_that([SPEED * PERIOD_S] * 20 + [0.0] * 19 + [0.5] + [0.0] * 20)
+    assert frozen_s(wheels, 1.9) > 0.0 and frozen_s(wheels, 2.5) == 0.0
+
+
+def test_the_velocity_before_a_freeze_is_that_at_the_end_of_an_arc() -> None:
+    wheels, pose = WheelOdometry(), np.zeros(3)
+    for k in range(30):
+        wheels.add(round(k * PERIOD_S * 1e9), pose)
+        if k < 20:
+            pose = compose(pose, np.array((SPEED * PERIOD_S, 0.0, 1.2 * PERIOD_S)))
+    velocity, _ = wheels.velocity_before_freeze(round(1.3e9)) or (None, None)
+    assert velocity == pytest.approx((SPEED, 0.0, 1.2), abs=0.03)

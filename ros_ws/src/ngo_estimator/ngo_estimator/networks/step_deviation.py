@@ -31,9 +31,9 @@ class StepDeviation(nn.Module):
     def forward(self, evidence: Tensor) -> Tensor:
         """Logarithms ``(..., 2)`` of the factors (position, heading), for evidence ``(..., 12)``.
 
-        An unsure step keeps its deviations: they are the prediction's.
+        An unsure step keeps its deviations: they are the prediction's. ``least`` does not limit these.
         """
         limit = math.log(self.config.largest)
         out = self.head(self.layers((evidence - self.middle) / self.scale))
-        log_factors = (limit * (out / limit).tanh()).clamp(min=math.log(self.config.least))
-        return log_factors * (1.0 - evidence[..., UNSURE, None])
+        log_factors: Tensor = limit * (out / limit).tanh() * (1.0 - evidence[..., UNSURE, None])
+        return log_factors

@@ -34,10 +34,10 @@ SCALE = (0.06, 0.3, 0.12, 0.25, 0.1, 0.12, 0.25, 0.3, 0.3, 0.3, 0.12, 0.15)
 
 @dataclass(frozen=True)
 class StepDeviationConfig:
-    """Shape of the network: ``hidden`` units; factors lie between ``least`` and ``largest``.
+    """Shape of the network: ``hidden`` units; factors lie within ``largest`` and its inverse.
 
-    Errors of usual scanners grow more slowly than independent steps would, and the network learns that. Scanners with a
-    narrow view turn their map a little with each key scan: their errors do not.
+    In use they are at least ``least``. Errors of usual scanners grow more slowly than those of independent steps, and
+    the network learned that. Scanners with a narrow view turn their map with each key scan: their errors do not.
     """
 
     hidden: int = 16

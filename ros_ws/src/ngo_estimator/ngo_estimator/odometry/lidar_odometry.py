@@ -314,8 +314,8 @@ class LidarOdometry:
         if self._wheels is not None:
             end_ns = scan.stamp_ns + int(sweep_s * 1e9)
             ends = self._wheels.pose_at(scan.stamp_ns), self._wheels.pose_at(end_ns)
-            counted = self._wheels.frozen_s(end_ns) <= 0.5 * sweep_s
-            if counted and ends[0] is not None and ends[1] is not None:
+            froze = self._wheels.frozen_s(scan.stamp_ns) > 0.0 or self._wheels.frozen_s(end_ns) > 0.0
+            if not froze and ends[0] is not None and ends[1] is not None:
                 twist = between(ends[0], ends[1]) / sweep_s
         return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)
 

@@ -12,12 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_motion import Array, compose, inverted, wrap
+from ngo_estimator.geometry.planar_motion import Array, compose, inverted, squared_deviations, wrap
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
 from ngo_estimator.odometry.motion_model import MotionModel
 from ngo_estimator.odometry.standstill import StandstillBelief
 from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
+
+_FARTHEST = 5.0
+"""Deviations from the velocity's place, from which on wheels that were silent began anew."""
 
 _COVERED = 0.5
 """Share of the time since the last scan that wheels must have counted to tell the motion."""
@@ -63,9 +66,9 @@ class MotionPriorConfig:
 class Prediction:
     """The prior of a scan's pose in the odometry's frame: ``mean`` ``(3,)`` with ``covariance`` and ``information``
     ``(3, 3)``. Registrations begin at ``starts``, the likeliest first. ``by_wheels`` says that wheels made it, and
-    ``measured`` that they are not doubted. Where these moved, ``step_covariance`` ``(3, 3)`` is that of their motion
-    since the last scan, along the odometry's axes. Wheels that stand exactly still may be frozen. Where no wheels
-    lead, ``standing`` says that the robot is believed to stand."""
+    ``measured`` that they are not doubted, ``moved`` that they count a motion as well: wheels that stand exactly still
+    may be frozen. Where they moved since the last scan, ``step_covariance`` ``(3, 3)`` is that of this motion, along
+    the odometry's axes. Where no wheels lead, ``standing`` says that the robot is believed to stand."""
 
     mean: Array
     covariance: Array
@@ -73,6 +76,7 @@ class Prediction:
     starts: tuple[Array, ...]
     by_wheels: bool = False
     measured: bool = False
+    moved: bool = False
     step_covariance: Array | None = None
     standing: bool = False
 
@@ -118,14 +122,13 @@ class MotionPrior:
         self._now_wheels = None if wheels is None else wheels.pose_at(stamp_ns)
         if wheels is not None and wheels.frozen_s(stamp_ns) > (1.0 - _COVERED) * elapsed:
             self._now_wheels = None
+        if wheels is not None and self._now_wheels is None and self._last_wheels is not None:
             self._begin_silence(stamp_ns, last, covariance, wheels)
-        constant = self._motion.velocity * elapsed
-        if wheels is not None and self._now_wheels is not None and self._last_wheels is None:
-            again = self._counting_again(stamp_ns, compose(last, constant), wheels)
-            if again is not None:
-                return again
         if wheels is None or self._now_wheels is None or self._last_wheels is None:
-            return self._without_wheels(last, elapsed, self._standstill.stands(stamp_ns, stands))
+            carried = self._without_wheels(last, elapsed, self._standstill.stands(stamp_ns, stands))
+            again = None if wheels is None else self._counting_again(carried, wheels)
+            return again or carried
+        constant = self._motion.velocity * elapsed
         step, step_deviations = wheels.motion(self._last_wheels, self._now_wheels)
         self._expected = None
         starts = [compose(last, step)]
@@ -150,34 +153,39 @@ class MotionPrior:
             tuple(starts),
             by_wheels=True,
             measured=not doubted,
+            moved=not doubted and bool(step.any()),
             step_covariance=np.diag(step_deviations**2) if not doubted and step.any() else None,
         )
 
     def _begin_silence(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> None:
-        """Wheels that froze since the last scan leave their velocity, and the pose from which they will count again."""
-        before = wheels.velocity_before_freeze(stamp_ns)
-        if self._last_wheels is None or before is None:
-            return
-        velocity, deviations = before
-        self._motion.begin(velocity, np.diag(deviations**2))
+        """Silent wheels leave the pose from which they will count again, and their velocity if they froze."""
         if self._doubted:
             self._anchor, self._anchor_wheels, self._anchor_covariance = last, self._last_wheels, covariance
+        before = wheels.velocity_before_freeze(stamp_ns)
+        if before is not None:
+            velocity, deviations = before
+            self._motion.begin(velocity, np.diag(deviations**2))
 
-    def _counting_again(self, stamp_ns: int, carried: Array, wheels: WheelOdometry) -> Prediction | None:
-        """The prior by the wheels' way since they counted last; None where it is none of this robot's.
+    def _counting_again(self, carried: Prediction, wheels: WheelOdometry) -> Prediction | None:
+        """The prior by the wheels' whole way since before they fell silent, beside that of the velocity.
 
-        ``carried`` ``(3,)`` is where the velocity carried it meanwhile.
+        None where they are silent, or began anew: their way does not fit the other prior.
         """
         if self._anchor_wheels is None or self._now_wheels is None:
             return None
         moved, deviations = wheels.motion(self._anchor_wheels, self._now_wheels)
-        mean, silent_s = compose(self._anchor, moved), (stamp_ns - self._counted_ns) * 1e-9
-        if math.dist(mean[:2], carried[:2]) > self.config.doubt_m + self.config.doubt_m_s2 * silent_s**2:
+        mean, total = compose(self._anchor, moved), np.diag(deviations**2) + self._anchor_covariance
+        if squared_deviations(mean, carried.mean, inverted(total + carried.covariance)) > _FARTHEST**2:
             self._anchor_wheels = None
             return None
-        self._expected, self._doubted = None, False
-        total = np.diag(deviations**2) + self._anchor_covariance
-        return Prediction(mean, total, inverted(total), (mean, carried), by_wheels=True, measured=True)
+        # Wheels that stand ever since: the robot stopped at once, or they freeze for longer than others.
+        self._expected, self._doubted = None, wheels.freeze_lasts
+        if self._doubted:
+            off = mean - carried.mean
+            off[2] = wrap(off[2])
+            total = total + np.outer(off, off)
+        starts, counted = (mean, *carried.starts), not self._doubted
+        return Prediction(mean, total, inverted(total), starts, by_wheels=True, measured=counted, moved=counted)
 
     def without_slip(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
         """Another prior of the scan that ``predict`` was asked for: that of wheels that slipped.
@@ -270,7 +278,7 @@ class MotionPrior:
                 if not self._standing:
                     self._model.observe(step / elapsed, elapsed)
                 self._standstill.observe(stamp_ns, math.hypot(step[0], step[1]) / elapsed)
-            if unsure:
+            if unsure and not self._silent:
                 self._motion.velocity = 0.5 * self._motion.velocity
         shared = self._motion.shared()
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
@@ -278,10 +286,10 @@ class MotionPrior:
             self._counted_ns = stamp_ns
         elif (stamp_ns - self._counted_ns) * 1e-9 > self.config.longest_silence_s:
             self._anchor_wheels = None
-        if self._now_wheels is None and self._anchor_wheels is not None:
+        if self._silent:
             # The wheels will count from before. The covariances will count from a key scan that may be elsewhere.
             if is_key:
-                self._anchor_covariance = self._anchor_covariance + covariance
+                self._anchor_covariance = self._anchor_covariance + covariance + shared
         elif passes or is_key:
             self._anchor, self._anchor_wheels = pose, self._now_wheels
             self._anchor_covariance = np.zeros((3, 3)) if is_key else covariance
@@ -289,6 +297,11 @@ class MotionPrior:
         if is_key:
             self._motion.begin_at_key()
         return shared
+
+    @property
+    def _silent(self) -> bool:
+        """Wheels that do not count now will count again from where they fell silent."""
+        return self._now_wheels is None and self._anchor_wheels is not None
 
     def _changes(self, elapsed: float) -> Array:
         """Deviations ``(3,)`` of the change of a velocity."""

@@ -281,7 +281,7 @@ class ScanOdometry:
         if place is None:
             return best, None, lost or poor
         if place.better:
-            if prediction.step_covariance is None:
+            if not prediction.moved:
                 # Nothing measured this motion, and it led to no fit.
                 prior = (place.pose, np.diag((1.0, 1.0, 1.0)))
             again = self._best(scan, [place.pose], prior, open_share)

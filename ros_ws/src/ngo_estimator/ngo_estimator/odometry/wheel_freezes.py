@@ -18,7 +18,7 @@ _KEPT = 16
 @dataclass(frozen=True)
 class WheelFreezesConfig:
     """Wheels froze where the robot would have had to brake harder than ``acceleration_m_s2`` or ``acceleration_rad_s2``
-    over its last ``braking_s``. After ``longest_s`` it stands."""
+    over its last ``braking_s``, in which every reading moved. After ``longest_s`` they count again, as they are."""
 
     acceleration_m_s2: float = 2.0
     acceleration_rad_s2: float = 4.0
@@ -38,7 +38,7 @@ class WheelFreezes:
         self.config = config
         self._stopped_s: float | None = None  # the last reading that moved, of wheels that stand
         self._froze = False
-        self._newest_s = 0.0
+        self._stood_s = -math.inf  # the newest reading that stood
         self._ended: deque[tuple[float, float]] = deque(maxlen=_KEPT)
 
     def moved(self, last_s: float, stamp_s: float) -> None:
@@ -58,12 +58,18 @@ class WheelFreezes:
             way_m = 0.5 * self.config.acceleration_m_s2 * elapsed_s**2
             turn_rad = 0.5 * self.config.acceleration_rad_s2 * elapsed_s**2
             farther = math.hypot(motion[0], motion[1]) > way_m or abs(motion[2]) > turn_rad
-            self._froze = farther and elapsed_s > 0.99 * self.config.braking_s
+            # Drivers that repeat each pose, and jumps of wheels that stand, have readings that stood just before.
+            self._froze = farther and min(elapsed_s, last_s - self._stood_s) > 0.99 * self.config.braking_s
             self._stopped_s = last_s
-        self._newest_s = stamp_s
+        self._stood_s = stamp_s
+
+    @property
+    def lasts(self) -> bool:
+        """The wheels froze and stand still, however long ago."""
+        return self._froze
 
     def since(self, at_s: float) -> float | None:
         """When the wheels froze that did not count at a time; None where they counted, or the robot stood."""
         if self._froze and self._stopped_s is not None and at_s > self._stopped_s:
-            return self._stopped_s if self._newest_s - self._stopped_s <= self.config.longest_s else None
+            return self._stopped_s if self._stood_s - self._stopped_s <= self.config.longest_s else None
         return next((start for start, end in reversed(self._ended) if start < at_s < end), None)
