@@ -7,6 +7,7 @@ they count again, their way since they froze is right as a whole.
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ngo_estimator.geometry.planar_motion import Array
@@ -47,13 +48,14 @@ class WheelFreezes:
             self._ended.append((self._stopped_s, stamp_s))
         self._stopped_s, self._froze = None, False
 
-    def stood(self, last_s: float, stamp_s: float, motion: Array, elapsed_s: float) -> None:
+    def stood(self, last_s: float, stamp_s: float, moved_before: Callable[[float], tuple[Array, float]]) -> None:
         """The reading of ``stamp_s`` is that of ``last_s`` again.
 
-        ``motion`` ``(3,)`` is what the wheels counted in ``elapsed_s``, ``braking_s`` or a little more, before
-        ``last_s``.
+        ``moved_before`` gives what the wheels counted ``(3,)`` before a time, and in how many seconds: ``braking_s`` or
+        a little more.
         """
         if self._stopped_s is None:
+            motion, elapsed_s = moved_before(last_s)
             # The way of a robot that brakes until it stands.
             way_m = 0.5 * self.config.acceleration_m_s2 * elapsed_s**2
             turn_rad = 0.5 * self.config.acceleration_rad_s2 * elapsed_s**2

@@ -91,7 +91,7 @@ class WheelOdometry:
                 return
             yaw = last[3] + wrap(yaw - last[3])
             if last[1] == pose[0] and last[2] == pose[1] and abs(last[3] - yaw) < _STILL_RAD:
-                self._freezes.stood(float(last[0]), stamp_s, *self._moved_before(float(last[0])))
+                self._freezes.stood(float(last[0]), stamp_s, self._moved_before)
             else:
                 self._freezes.moved(float(last[0]), stamp_s)
         if self._count == len(self._rows):
