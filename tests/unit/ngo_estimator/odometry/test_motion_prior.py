@@ -233,3 +233,39 @@ def test_silent_wheels_that_were_doubted_count_from_the_scan_after_their_slip() 
         if k > 30:
             assert prediction.measured and prediction.mean[0] == pytest.approx(k * step[0], abs=0.05)
         prior.accept(k * PERIOD_NS, k * step, SURE, step, SURE, False, False, False)
+
+
+def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it() -> None:
+    """Scans that follow slipping wheels measure their turn as the velocity. The robot cannot have begun it at once."""
+    wheels, prior, pose = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
+    wheels.add(0, pose)
+    prior.begin(0, pose, wheels)
+    for k in range(1, 25):
+        slips = k > 20
+        step = np.array((0.05, 0.0, 0.12 if slips else 0.0))
+        counted = compose(pose, step)
+        wheels.add(k * PERIOD_NS, counted)
+        prior.predict(k * PERIOD_NS, pose, SURE, wheels)
+        other = prior.without_slip(k * PERIOD_NS, pose, SURE, wheels)
+        assert (other is not None) == slips
+        if other is not None:
+            assert other.starts[0] == pytest.approx((0.05 * k, 0.0, 0.0), abs=0.01)
+            assert math.sqrt(other.covariance[2, 2]) > 0.12 * (k - 20)
+        prior.accept(k * PERIOD_NS, counted, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
+        pose = counted
+
+
+def test_a_turn_that_a_robot_can_begin_is_trusted() -> None:
+    """Wheels that agree with its velocity, which grows by 3 rad/s in each second, have not slipped."""
+    wheels, prior, pose = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
+    wheels.add(0, pose)
+    prior.begin(0, pose, wheels)
+    for k in range(1, 25):
+        step = np.array((0.05, 0.0, 0.03 * min(max(k - 20, 0), 3)))
+        pose, last = compose(pose, step), pose
+        wheels.add(k * PERIOD_NS, pose)
+        prior.predict(k * PERIOD_NS, last, SURE, wheels)
+        prior.accept(k * PERIOD_NS, pose, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
+    wheels.add(25 * PERIOD_NS, compose(pose, step))
+    prior.predict(25 * PERIOD_NS, pose, SURE, wheels)
+    assert prior.without_slip(25 * PERIOD_NS, pose, SURE, wheels) is None
