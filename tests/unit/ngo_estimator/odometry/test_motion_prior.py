@@ -229,43 +229,62 @@ def test_silent_wheels_that_were_doubted_count_from_the_scan_after_their_slip() 
         prediction = prior.predict(k * PERIOD_NS, (k - 1) * step, SURE, wheels)
         assert prediction.by_wheels == (k <= 25 or k > 30)
         if k == 25:
-            prior.doubt()
+            prior.judge(slips=True)
         if k > 30:
             assert prediction.measured and prediction.mean[0] == pytest.approx(k * step[0], abs=0.05)
         prior.accept(k * PERIOD_NS, k * step, SURE, step, SURE, False, False, False)
 
 
-def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it() -> None:
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it(heading: float) -> None:
     """Scans that follow slipping wheels measure their turn as the velocity. The robot cannot have begun it at once."""
-    wheels, prior, pose = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
+    start, straight = np.array((1.0, -2.0, heading)), np.array((0.05, 0.0, 0.0))
+    wheels, prior, pose, truth = WheelOdometry(), MotionPrior(MotionPriorConfig()), start, start
     wheels.add(0, pose)
     prior.begin(0, pose, wheels)
     for k in range(1, 25):
         slips = k > 20
         step = np.array((0.05, 0.0, 0.12 if slips else 0.0))
-        counted = compose(pose, step)
+        counted, truth = compose(pose, step), compose(truth, straight)
         wheels.add(k * PERIOD_NS, counted)
         prior.predict(k * PERIOD_NS, pose, SURE, wheels)
         other = prior.without_slip(k * PERIOD_NS, pose, SURE, wheels)
         assert (other is not None) == slips
         if other is not None:
-            assert other.starts[0] == pytest.approx((0.05 * k, 0.0, 0.0), abs=0.01)
+            assert other.starts[0] == pytest.approx(truth, abs=0.01)
             assert math.sqrt(other.covariance[2, 2]) > 0.12 * (k - 20)
         prior.accept(k * PERIOD_NS, counted, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
         pose = counted
 
 
-def test_a_turn_that_a_robot_can_begin_is_trusted() -> None:
-    """Wheels that agree with its velocity, which grows by 3 rad/s in each second, have not slipped."""
-    wheels, prior, pose = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
-    wheels.add(0, pose)
-    prior.begin(0, pose, wheels)
-    for k in range(1, 25):
-        step = np.array((0.05, 0.0, 0.03 * min(max(k - 20, 0), 3)))
-        pose, last = compose(pose, step), pose
-        wheels.add(k * PERIOD_NS, pose)
-        prior.predict(k * PERIOD_NS, last, SURE, wheels)
-        prior.accept(k * PERIOD_NS, pose, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
-    wheels.add(25 * PERIOD_NS, compose(pose, step))
-    prior.predict(25 * PERIOD_NS, pose, SURE, wheels)
-    assert prior.without_slip(25 * PERIOD_NS, pose, SURE, wheels) is None
+def test_a_slip_goes_on_until_the_wheels_agree_with_the_velocity() -> None:
+    wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
+    wheels.add(0, truth)
+    prior.begin(0, truth, wheels)
+    step, slip = np.array((0.05, 0.0, 0.0)), np.array((0.05, 0.0, 0.1))
+    for k in range(1, 31):
+        counted = compose(counted, slip if 20 < k <= 24 else step)
+        wheels.add(k * PERIOD_NS, counted)
+        prediction = prior.predict(k * PERIOD_NS, truth, SURE, wheels)
+        truth = compose(truth, step)
+        other = prior.without_slip(k * PERIOD_NS, compose(truth, -step), SURE, wheels) if prediction.measured else None
+        assert prior.slips == (21 < k <= 24)
+        if other is not None:
+            prior.judge(slips=True)
+        prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
+
+
+def test_wheels_that_count_again_are_compared_with_no_velocity_that_nothing_measured() -> None:
+    """They froze for 1.2 s, in which the robot sped up from 0.5 to 1.7 m/s."""
+    wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
+    wheels.add(0, truth)
+    prior.begin(0, truth, wheels)
+    for k in range(1, 40):
+        step = np.array((0.05 + 0.01 * min(max(k - 20, 0), 12), 0.0, 0.0))
+        last, truth = truth, truth + step
+        counted = counted if 20 < k <= 32 else truth
+        wheels.add(k * PERIOD_NS, counted)
+        prediction = prior.predict(k * PERIOD_NS, last, SURE, wheels)
+        if k > 20 and prediction.measured:
+            assert prior.without_slip(k * PERIOD_NS, last, SURE, wheels) is None
+        prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)

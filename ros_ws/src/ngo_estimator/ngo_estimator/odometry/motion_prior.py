@@ -3,9 +3,9 @@
 The prior counts from the last key scan and not from the last scan, so that its deviations do not add up scan by scan.
 Wheels that stand while the scans moved, or that run away from them (a jump), are doubted: for that scan the prior
 widens by the disagreement, and both predictions are tried. The next prior counts from that scan. So it does where the
-walls say that the velocity is right and the wheels are not (a slip). A slip that lasts leads the scans away one by one:
-this velocity is that of the last scan to which the robot can have accelerated. Wheels that froze (``WheelFreezes``)
-count for nothing. Once they count again, so does their whole way since before.
+walls say that the velocity is right and the wheels are not (a slip). A slip that lasts leads the scans away one by one.
+Therefore the velocity is that of the last scan which the robot can have reached by accelerating (``TrustedMotion``).
+Wheels that froze (``WheelFreezes``) count for nothing. Once they count again, so does their whole way since before.
 """
 
 import math
@@ -17,6 +17,7 @@ from ngo_estimator.geometry.planar_motion import Array, between, compose, invert
 from ngo_estimator.odometry.constant_velocity import ConstantVelocity
 from ngo_estimator.odometry.motion_model import MotionModel
 from ngo_estimator.odometry.standstill import StandstillBelief
+from ngo_estimator.odometry.trusted_motion import TrustedMotion
 from ngo_estimator.odometry.usual_motion import UsualMotion
 from ngo_estimator.odometry.wheel_odometry import WheelOdometry
 
@@ -102,7 +103,14 @@ class MotionPrior:
         self._doubted = False
         self._moved_ns = 0  # when the wheels moved last
         self._counted_ns = 0  # when they told the motion last
-        self._trusted: tuple[int, Array, Array] | None = None  # stamp, pose and velocity of a scan
+        self._trusted = TrustedMotion(
+            config.still_m,
+            math.radians(config.still_deg),
+            config.acceleration_m_s2,
+            config.acceleration_rad_s2,
+            config.longest_s,
+        )
+        self._slips = False
 
     def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
         """The first scan is a key scan at this pose."""
@@ -193,36 +201,31 @@ class MotionPrior:
         """Another prior of the scan that ``predict`` was asked for: that of wheels that slipped.
 
         It begins where the velocity leads from the last trusted scan, and is as wide as both disagree. It is None where
-        nothing else is known: the velocity is forgotten, or agrees with the wheels within their deviations, or these
+        nothing else is known: no velocity is trusted, or it agrees with the wheels within their deviations, or these
         just count again.
         """
-        if self._last_wheels is None or self._now_wheels is None or self._trusted is None:
+        carried = self._trusted.carried(stamp_ns)
+        if self._last_wheels is None or self._now_wheels is None or carried is None:
             return None
-        elapsed = (stamp_ns - self._stamp_ns) * 1e-9
-        carried = _carried(self._trusted, stamp_ns)
         step, deviations = wheels.motion(self._last_wheels, self._now_wheels)
         mean = compose(last, step)
         off = between(mean, carried)
-        if elapsed > self.config.longest_s or (np.abs(off) <= deviations).all():
+        if (np.abs(off) <= deviations).all():
+            self._slips = False
             return None
         off_m = math.hypot(off[0], off[1])
         total = np.diag((deviations + np.array((off_m, off_m, abs(off[2])))) ** 2) + covariance
         return Prediction(mean, total, inverted(total), (carried,), by_wheels=True)
 
-    def _trust(self, stamp_ns: int, pose: Array, unsure: bool) -> None:
-        """Trust a scan if the robot can have accelerated to it from the last that was trusted."""
-        if self._trusted is not None:
-            config, elapsed = self.config, (stamp_ns - self._trusted[0]) * 1e-9
-            off = between(_carried(self._trusted, stamp_ns), pose)
-            far = math.hypot(off[0], off[1]) > config.still_m + 0.5 * config.acceleration_m_s2 * elapsed**2
-            turned = abs(off[2]) > math.radians(config.still_deg) + 0.5 * config.acceleration_rad_s2 * elapsed**2
-            if (unsure or far or turned) and elapsed <= config.longest_s:
-                return
-        self._trusted = (stamp_ns, pose, self._motion.velocity.copy())
+    @property
+    def slips(self) -> bool:
+        """The walls told a slip, and the wheels have not agreed with the velocity since."""
+        return self._slips
 
-    def doubt(self) -> None:
-        """The wheels' way to the newest scan is wrong: the next prior counts from that scan."""
-        self._doubted = True
+    def judge(self, slips: bool) -> None:
+        """The walls told whether the wheels slip. If they do, the next prior counts from the newest scan."""
+        self._slips = slips
+        self._doubted = self._doubted or slips
 
     def _is_frozen(self, stamp_ns: int, step: Array, constant: Array) -> bool:
         """Whether wheels that stand exactly still may have stopped counting."""
@@ -292,7 +295,10 @@ class MotionPrior:
                 self._standstill.observe(stamp_ns, math.hypot(step[0], step[1]) / elapsed)
             if unsure and not self._silent:
                 self._motion.velocity = 0.5 * self._motion.velocity
-        self._trust(stamp_ns, pose, unsure)
+        if self._now_wheels is None or self._last_wheels is None:
+            self._trusted.forget()
+        else:
+            self._trusted.observe(stamp_ns, pose, self._motion.velocity, unsure)
         shared = self._motion.shared()
         self._stamp_ns, self._last_wheels = stamp_ns, self._now_wheels
         if self._now_wheels is not None:
@@ -320,9 +326,3 @@ class MotionPrior:
         """Deviations ``(3,)`` of the change of a velocity."""
         config = self.config
         return elapsed * np.array((config.acceleration_m_s2, config.acceleration_m_s2, config.acceleration_rad_s2))
-
-
-def _carried(trusted: tuple[int, Array, Array], stamp_ns: int) -> Array:
-    """Where the velocity of a scan leads until a stamp."""
-    since_ns, pose, velocity = trusted
-    return compose(pose, velocity * (stamp_ns - since_ns) * 1e-9)

@@ -210,17 +210,17 @@ class ScanOdometry:
         again = self._best(swept.scan, list(other.starts), (other.mean, other.information), 0.0)
         if again.share < self.config.good_share:
             return prediction, found, np.zeros((3, 3))
-        stands, rare = found, _RARE
+        stands, rare = found, 0.0 if self._prior.slips else _RARE  # a slip that was told goes on as likely as not
         if self._is_unsure(found, prediction):
             stands = replace(found, pose=prediction.mean)
             if found.share >= self.config.good_share:
                 rare = 0.0  # so far from the wheels that these are as rare
         (_, likely), doubt = likelier(self._submap.lines, self.config.icp, (swept, stands), (swept, again), rare)
+        self._prior.judge(slips=likely is again)
         if likely is stands:
             if prediction.step_covariance is not None:
                 prediction = replace(prediction, step_covariance=prediction.step_covariance + doubt)
             return prediction, found, doubt
-        self._prior.doubt()
         return other, again, doubt
 
     def _swept_again(
