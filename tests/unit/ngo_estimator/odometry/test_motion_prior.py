@@ -257,6 +257,22 @@ def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it(heading: floa
         pose = counted
 
 
+def test_a_slip_since_the_last_key_scan_is_noticed_after_its_end() -> None:
+    """Walls told the right turn of each scan, and the wheels count right again. Since the key scan they are wrong."""
+    wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
+    wheels.add(0, truth)
+    prior.begin(0, truth, wheels)
+    step, slip = np.array((0.05, 0.0, 0.0)), np.array((0.05, 0.0, 0.1))
+    for k in range(1, 25):
+        counted, last, truth = compose(counted, slip if 20 < k < 24 else step), truth, compose(truth, step)
+        wheels.add(k * PERIOD_NS, counted)
+        prediction = prior.predict(k * PERIOD_NS, last, SURE, wheels)
+        other = prior.without_slip(k * PERIOD_NS, last, SURE, wheels)
+        prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k == 20, k == 20, False)
+    assert prediction.measured and prediction.mean[2] == pytest.approx(0.3)
+    assert other is not None and other.mean == pytest.approx(truth, abs=1e-6)
+
+
 def test_a_slip_goes_on_until_the_wheels_agree_with_the_velocity() -> None:
     wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
     wheels.add(0, truth)

@@ -110,6 +110,7 @@ class MotionPrior:
             config.acceleration_rad_s2,
             config.longest_s,
         )
+        self._led = np.zeros(3), np.zeros(3)  # where the wheels lead from the last key scan, and its deviations
         self._slips = False
 
     def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
@@ -156,8 +157,9 @@ class MotionPrior:
         if doubted:
             deviations = deviations + np.array((off, off, off_rad))
         total = np.diag(deviations**2) + self._anchor_covariance
+        self._led = mean, _ = compose(self._anchor, moved), np.sqrt(total.diagonal())
         return Prediction(
-            compose(self._anchor, moved),
+            mean,
             total,
             inverted(total),
             tuple(starts),
@@ -210,7 +212,9 @@ class MotionPrior:
         step, deviations = wheels.motion(self._last_wheels, self._now_wheels)
         mean = compose(last, step)
         off = between(mean, carried)
-        if (np.abs(off) <= deviations).all():
+        led, led_deviations = self._led
+        # A slip since the last key scan leads astray as well.
+        if (np.abs(off) <= deviations).all() and (np.abs(between(led, carried)) <= led_deviations).all():
             self._slips = False
             return None
         off_m = math.hypot(off[0], off[1])
@@ -297,6 +301,7 @@ class MotionPrior:
                 self._motion.velocity = 0.5 * self._motion.velocity
         if self._now_wheels is None or self._last_wheels is None:
             self._trusted.forget()
+            self._slips = False
         else:
             self._trusted.observe(stamp_ns, pose, self._motion.velocity, unsure)
         shared = self._motion.shared()
