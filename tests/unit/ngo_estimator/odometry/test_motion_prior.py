@@ -290,6 +290,24 @@ def test_a_slip_goes_on_until_the_wheels_agree_with_the_velocity() -> None:
         prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
 
 
+def test_walls_judge_whether_wheels_slip() -> None:
+    """After a slip the next prior counts from the scan before. Wheels that are right slip no longer."""
+    wheels, prior, truth = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
+    wheels.add(0, truth)
+    prior.begin(0, truth, wheels)
+    for k, off in ((1, 0.0), (2, 0.1), (3, 0.1)):
+        wheels.add(k * PERIOD_NS, np.array((0.05 * k, 0.0, off)))
+        prediction = prior.predict(k * PERIOD_NS, truth, SURE, wheels)
+        assert prediction.mean[2] == pytest.approx(0.1 if k == 2 else 0.0)
+        if k == 2:
+            prior.judge(slips=True)
+            assert prior.slips
+        truth = np.array((0.05 * k, 0.0, 0.0))
+        prior.accept(k * PERIOD_NS, truth, SURE, np.array((0.05, 0.0, 0.0)), SURE, False, False, False)
+    prior.judge(slips=False)
+    assert not prior.slips
+
+
 def test_wheels_that_count_again_are_compared_with_no_velocity_that_nothing_measured() -> None:
     """They froze for 1.2 s, in which the robot sped up from 0.5 to 1.7 m/s."""
     wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
