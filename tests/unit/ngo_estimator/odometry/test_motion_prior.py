@@ -16,6 +16,14 @@ STEP = np.array((0.05, 0.0, 0.02))
 SURE = np.diag((1e-6, 1e-6, 1e-8))
 
 
+def begun(start: np.ndarray) -> tuple[WheelOdometry, MotionPrior]:
+    """Wheels whose first reading is where the first scan was taken, and the prior of the next scan."""
+    wheels, prior = WheelOdometry(), MotionPrior(MotionPriorConfig())
+    wheels.add(0, start)
+    prior.begin(0, start, wheels)
+    return wheels, prior
+
+
 def driven(steps: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """The motion that is expected next, after steps with covariances."""
     prior, pose = MotionPrior(MotionPriorConfig()), np.zeros(3)
@@ -204,9 +212,7 @@ def test_wheels_that_begin_anew_with_another_heading_do_not_count() -> None:
 
 def test_a_freeze_of_many_seconds_moves_no_robot_back_that_walls_hold() -> None:
     """Wheels are believed to freeze for 2 s at most. These freeze for 3 s, and for one scan both may be right."""
-    wheels, prior = WheelOdometry(), MotionPrior(MotionPriorConfig())
-    wheels.add(0, np.zeros(3))
-    prior.begin(0, np.zeros(3), wheels)
+    wheels, prior = begun(np.zeros(3))
     step = np.array((0.07, 0.0, 0.0))
     for k in range(1, 42):
         wheels.add(k * PERIOD_NS, min(k, 20) * step)
@@ -220,9 +226,7 @@ def test_a_freeze_of_many_seconds_moves_no_robot_back_that_walls_hold() -> None:
 
 def test_silent_wheels_that_were_doubted_count_from_the_scan_after_their_slip() -> None:
     """They are extrapolated for half a second before they count as silent."""
-    wheels, prior, step = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.array((0.07, 0.0, 0.0))
-    wheels.add(0, np.zeros(3))
-    prior.begin(0, np.zeros(3), wheels)
+    (wheels, prior), step = begun(np.zeros(3)), np.array((0.07, 0.0, 0.0))
     for k in range(1, 41):
         if k <= 20 or k > 30:
             wheels.add(k * PERIOD_NS, k * step + np.array((0.5 if k > 15 else 0.0, 0.0, 0.0)))
@@ -239,16 +243,14 @@ def test_silent_wheels_that_were_doubted_count_from_the_scan_after_their_slip() 
 def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it(heading: float) -> None:
     """Scans that follow slipping wheels measure their turn as the velocity. The robot cannot have begun it at once."""
     start, straight = np.array((1.0, -2.0, heading)), np.array((0.05, 0.0, 0.0))
-    wheels, prior, pose, truth = WheelOdometry(), MotionPrior(MotionPriorConfig()), start, start
-    wheels.add(0, pose)
-    prior.begin(0, pose, wheels)
+    (wheels, prior), pose, truth = begun(start), start, start
     for k in range(1, 25):
         slips = k > 20
         step = np.array((0.05, 0.0, 0.12 if slips else 0.0))
         counted, truth = compose(pose, step), compose(truth, straight)
         wheels.add(k * PERIOD_NS, counted)
-        prior.predict(k * PERIOD_NS, pose, SURE, wheels)
-        other = prior.without_slip(k * PERIOD_NS, pose, SURE, wheels)
+        prediction = prior.predict(k * PERIOD_NS, pose, SURE, wheels)
+        other = prior.without_slip(k * PERIOD_NS, pose, SURE, wheels, prediction)
         assert (other is not None) == slips
         if other is not None:
             assert other.starts[0] == pytest.approx(truth, abs=0.01)
@@ -259,31 +261,27 @@ def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it(heading: floa
 
 def test_a_slip_since_the_last_key_scan_is_noticed_after_its_end() -> None:
     """Walls told the right turn of each scan, and the wheels count right again. Since the key scan they are wrong."""
-    wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
-    wheels.add(0, truth)
-    prior.begin(0, truth, wheels)
+    (wheels, prior), truth, counted = begun(np.zeros(3)), np.zeros(3), np.zeros(3)
     step, slip = np.array((0.05, 0.0, 0.0)), np.array((0.05, 0.0, 0.1))
     for k in range(1, 25):
         counted, last, truth = compose(counted, slip if 20 < k < 24 else step), truth, compose(truth, step)
         wheels.add(k * PERIOD_NS, counted)
         prediction = prior.predict(k * PERIOD_NS, last, SURE, wheels)
-        other = prior.without_slip(k * PERIOD_NS, last, SURE, wheels)
+        other = prior.without_slip(k * PERIOD_NS, last, SURE, wheels, prediction)
         prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k == 20, k == 20, False)
     assert prediction.measured and prediction.mean[2] == pytest.approx(0.3)
     assert other is not None and other.mean == pytest.approx(truth, abs=1e-6)
 
 
 def test_a_slip_goes_on_until_the_wheels_agree_with_the_velocity() -> None:
-    wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
-    wheels.add(0, truth)
-    prior.begin(0, truth, wheels)
+    (wheels, prior), truth, counted = begun(np.zeros(3)), np.zeros(3), np.zeros(3)
     step, slip = np.array((0.05, 0.0, 0.0)), np.array((0.05, 0.0, 0.1))
     for k in range(1, 31):
         counted = compose(counted, slip if 20 < k <= 24 else step)
         wheels.add(k * PERIOD_NS, counted)
         prediction = prior.predict(k * PERIOD_NS, truth, SURE, wheels)
-        truth = compose(truth, step)
-        other = prior.without_slip(k * PERIOD_NS, compose(truth, -step), SURE, wheels) if prediction.measured else None
+        last, truth = truth, compose(truth, step)
+        other = prior.without_slip(k * PERIOD_NS, last, SURE, wheels, prediction) if prediction.measured else None
         assert prior.slips == (21 < k <= 24)
         if other is not None:
             prior.judge(slips=True)
@@ -292,9 +290,7 @@ def test_a_slip_goes_on_until_the_wheels_agree_with_the_velocity() -> None:
 
 def test_walls_judge_whether_wheels_slip() -> None:
     """After a slip the next prior counts from the scan before. Wheels that are right slip no longer."""
-    wheels, prior, truth = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3)
-    wheels.add(0, truth)
-    prior.begin(0, truth, wheels)
+    (wheels, prior), truth = begun(np.zeros(3)), np.zeros(3)
     for k, off in ((1, 0.0), (2, 0.1), (3, 0.1)):
         wheels.add(k * PERIOD_NS, np.array((0.05 * k, 0.0, off)))
         prediction = prior.predict(k * PERIOD_NS, truth, SURE, wheels)
@@ -310,9 +306,7 @@ def test_walls_judge_whether_wheels_slip() -> None:
 
 def test_wheels_that_count_again_are_compared_with_no_velocity_that_nothing_measured() -> None:
     """They froze for 1.2 s, in which the robot sped up from 0.5 to 1.7 m/s."""
-    wheels, prior, truth, counted = WheelOdometry(), MotionPrior(MotionPriorConfig()), np.zeros(3), np.zeros(3)
-    wheels.add(0, truth)
-    prior.begin(0, truth, wheels)
+    (wheels, prior), truth, counted = begun(np.zeros(3)), np.zeros(3), np.zeros(3)
     for k in range(1, 40):
         step = np.array((0.05 + 0.01 * min(max(k - 20, 0), 12), 0.0, 0.0))
         last, truth = truth, truth + step
@@ -320,5 +314,5 @@ def test_wheels_that_count_again_are_compared_with_no_velocity_that_nothing_meas
         wheels.add(k * PERIOD_NS, counted)
         prediction = prior.predict(k * PERIOD_NS, last, SURE, wheels)
         if k > 20 and prediction.measured:
-            assert prior.without_slip(k * PERIOD_NS, last, SURE, wheels) is None
+            assert prior.without_slip(k * PERIOD_NS, last, SURE, wheels, prediction) is None
         prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)

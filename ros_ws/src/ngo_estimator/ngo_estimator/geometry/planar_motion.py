@@ -34,6 +34,22 @@ def between(a: Array, b: Array) -> Array:
     return np.array((cos * x + sin * y, -sin * x + cos * y, wrap(b[2] - a[2])))
 
 
+def arc_velocity(motion: Array, elapsed_s: float) -> Array:
+    """The constant velocity ``(3,)`` (m/s, m/s, rad/s) along the robot's axes of a motion ``(3,)`` along an arc.
+
+    The arc's chord is turned by half of its turn; that it is shorter is left out.
+    """
+    along = compose(np.array((0.0, 0.0, -0.5 * motion[2])), motion)
+    return np.array((along[0], along[1], motion[2])) / elapsed_s
+
+
+def arc_motion(velocity: Array, elapsed_s: float) -> Array:
+    """The motion ``(3,)`` of a constant velocity ``(3,)``: the inverse of ``arc_velocity``."""
+    motion = velocity * elapsed_s
+    chord = compose(np.array((0.0, 0.0, 0.5 * motion[2])), motion)
+    return np.array((chord[0], chord[1], motion[2]))
+
+
 @njit(cache=True)
 def all_between(a: Array, b: Array) -> Array:
     """``between`` of poses ``(n, 3)``, row by row; either may be a single one ``(1, 3)`` for all rows of the other."""

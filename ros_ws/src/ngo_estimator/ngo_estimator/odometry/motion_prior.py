@@ -110,8 +110,8 @@ class MotionPrior:
             config.acceleration_rad_s2,
             config.longest_s,
         )
-        self._led = np.zeros(3), np.zeros(3)  # where the wheels lead from the last key scan, and its deviations
-        self._slips = False
+        self.slips = False
+        """The walls told a slip, and the wheels have not agreed with the velocity since."""
 
     def begin(self, stamp_ns: int, pose: Array, wheels: WheelOdometry | None) -> None:
         """The first scan is a key scan at this pose."""
@@ -157,9 +157,8 @@ class MotionPrior:
         if doubted:
             deviations = deviations + np.array((off, off, off_rad))
         total = np.diag(deviations**2) + self._anchor_covariance
-        self._led = mean, _ = compose(self._anchor, moved), np.sqrt(total.diagonal())
         return Prediction(
-            mean,
+            compose(self._anchor, moved),
             total,
             inverted(total),
             tuple(starts),
@@ -199,8 +198,10 @@ class MotionPrior:
         starts, counted = (mean, *carried.starts), not self._doubted
         return Prediction(mean, total, inverted(total), starts, by_wheels=True, measured=counted, moved=counted)
 
-    def without_slip(self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry) -> Prediction | None:
-        """Another prior of the scan that ``predict`` was asked for: that of wheels that slipped.
+    def without_slip(
+        self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry, prediction: Prediction
+    ) -> Prediction | None:
+        """Another prior of the scan whose ``prediction`` wheels made: that of wheels that slipped.
 
         It begins where the velocity leads from the last trusted scan, and is as wide as both disagree. It is None where
         nothing else is known: no velocity is trusted, or it agrees with the wheels within their deviations, or these
@@ -211,24 +212,19 @@ class MotionPrior:
             return None
         step, deviations = wheels.motion(self._last_wheels, self._now_wheels)
         mean = compose(last, step)
-        off = between(mean, carried)
-        led, led_deviations = self._led
+        off, off_prediction = between(mean, carried), between(prediction.mean, carried)
         # A slip since the last key scan leads astray as well.
-        if (np.abs(off) <= deviations).all() and (np.abs(between(led, carried)) <= led_deviations).all():
-            self._slips = False
+        agree = (off_prediction**2 <= prediction.covariance.diagonal()).all()
+        if agree and (np.abs(off) <= deviations).all():
+            self.slips = False
             return None
         off_m = math.hypot(off[0], off[1])
         total = np.diag((deviations + np.array((off_m, off_m, abs(off[2])))) ** 2) + covariance
         return Prediction(mean, total, inverted(total), (carried,), by_wheels=True)
 
-    @property
-    def slips(self) -> bool:
-        """The walls told a slip, and the wheels have not agreed with the velocity since."""
-        return self._slips
-
     def judge(self, slips: bool) -> None:
         """The walls told whether the wheels slip. If they do, the next prior counts from the newest scan."""
-        self._slips = slips
+        self.slips = slips
         self._doubted = self._doubted or slips
 
     def _is_frozen(self, stamp_ns: int, step: Array, constant: Array) -> bool:
@@ -301,7 +297,7 @@ class MotionPrior:
                 self._motion.velocity = 0.5 * self._motion.velocity
         if self._now_wheels is None or self._last_wheels is None:
             self._trusted.forget()
-            self._slips = False
+            self.slips = False
         else:
             self._trusted.observe(stamp_ns, pose, self._motion.velocity, unsure)
         shared = self._motion.shared()

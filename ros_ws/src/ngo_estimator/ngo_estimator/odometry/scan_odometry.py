@@ -204,7 +204,7 @@ class ScanOdometry:
     ) -> tuple[Prediction, Registration, Array]:
         """The prediction and its registration, by the velocity where the walls say that the wheels slipped; and the
         covariance ``(3, 3)`` by which the other may be right."""
-        other = self._prior.without_slip(swept.scan.stamp_ns, self._pose, self._covariance, wheels)
+        other = self._prior.without_slip(swept.scan.stamp_ns, self._pose, self._covariance, wheels, prediction)
         if other is None:
             return prediction, found, np.zeros((3, 3))
         again = self._best(swept.scan, list(other.starts), (other.mean, other.information), 0.0)

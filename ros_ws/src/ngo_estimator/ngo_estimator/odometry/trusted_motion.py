@@ -7,9 +7,7 @@ once, so that the velocity before it is still known.
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from ngo_estimator.geometry.planar_motion import Array, between, compose
+from ngo_estimator.geometry.planar_motion import Array, arc_motion, arc_velocity, between, compose
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,47 +40,31 @@ class TrustedMotion:
         Of an ``unsure`` scan neither is known.
         """
         last = self._last
-        carried = self.carried(stamp_ns, proven=False)
-        reached = last is not None and carried is not None and self._reaches(last, carried, stamp_ns, pose)
-        if last is not None and reached and not unsure:
+        carried = None if last is None else self._led(last, stamp_ns)
+        if last is not None and carried is not None and not unsure and self._reaches(last, carried, stamp_ns, pose):
             if self._skipped:  # the step from the scan before leads back from a slip as well
-                velocity = _velocity(between(last.pose, pose), (stamp_ns - last.stamp_ns) * 1e-9)
+                velocity = arc_velocity(between(last.pose, pose), (stamp_ns - last.stamp_ns) * 1e-9)
             self._last, self._skipped = _Trusted(stamp_ns, pose, velocity, True), False
         elif carried is None or last is None or not last.proven:
             self._last, self._skipped = None if unsure else _Trusted(stamp_ns, pose, velocity, False), False
         else:
             self._skipped = True
 
-    def carried(self, stamp_ns: int, proven: bool = True) -> Array | None:
-        """Pose ``(3,)`` at a stamp by the trusted velocity; None where it is not known.
-
-        A ``proven`` one has led to a scan before.
-        """
-        last = self._last
-        if last is None or (proven and not last.proven):
-            return None
-        elapsed_s = (stamp_ns - last.stamp_ns) * 1e-9
-        return None if elapsed_s > self._longest_s else compose(last.pose, _moved(last.velocity, elapsed_s))
+    def carried(self, stamp_ns: int) -> Array | None:
+        """Pose ``(3,)`` at a stamp by the trusted velocity; None where none is known that has led to a scan before."""
+        return self._led(self._last, stamp_ns) if self._last is not None and self._last.proven else None
 
     def forget(self) -> None:
         """Nothing measured the robot's motion."""
         self._last, self._skipped = None, False
+
+    def _led(self, last: _Trusted, stamp_ns: int) -> Array | None:
+        """Where the velocity of a scan leads until a stamp; None after ``longest_s``."""
+        elapsed_s = (stamp_ns - last.stamp_ns) * 1e-9
+        return None if elapsed_s > self._longest_s else compose(last.pose, arc_motion(last.velocity, elapsed_s))
 
     def _reaches(self, last: _Trusted, carried: Array, stamp_ns: int, pose: Array) -> bool:
         """Whether a robot can have accelerated from the last scan to a pose."""
         off, half = between(carried, pose), 0.5 * ((stamp_ns - last.stamp_ns) * 1e-9) ** 2
         near = math.hypot(off[0], off[1]) <= self._still_m + half * self._acceleration_m_s2
         return near and abs(off[2]) <= self._still_rad + half * self._acceleration_rad_s2
-
-
-def _moved(velocity: Array, elapsed_s: float) -> Array:
-    """Motion ``(3,)`` of a constant velocity, along an arc: its chord is turned by half of its turn."""
-    motion = velocity * elapsed_s
-    chord = compose(np.array((0.0, 0.0, 0.5 * motion[2])), motion)
-    return np.array((chord[0], chord[1], motion[2]))
-
-
-def _velocity(motion: Array, elapsed_s: float) -> Array:
-    """The constant velocity ``(3,)`` of a motion ``(3,)``."""
-    along = compose(np.array((0.0, 0.0, -0.5 * motion[2])), motion)
-    return np.array((along[0], along[1], motion[2])) / elapsed_s

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
+from ngo_estimator.geometry.planar_motion import Array, arc_velocity, between, wrap
 from ngo_estimator.odometry.wheel_freezes import WheelFreezes, WheelFreezesConfig
 from ngo_estimator.odometry.wheel_lag import WheelLag, WheelLagConfig
 
@@ -121,9 +121,7 @@ class WheelOdometry:
         moved, elapsed_s = self._moved_before(since_s)
         if elapsed_s <= 0.0:  # so many readings came since then that none before is kept
             return None
-        deviations = self.config.deviations(moved)
-        middle = compose(np.array((0.0, 0.0, -0.5 * moved[2])), moved)  # along the robot's axes at the end of an arc
-        return np.array((middle[0], middle[1], moved[2])) / elapsed_s, deviations / elapsed_s
+        return arc_velocity(moved, elapsed_s), self.config.deviations(moved) / elapsed_s
 
     @property
     def freeze_lasts(self) -> bool:
