@@ -48,6 +48,7 @@ _PAIRED = ("ate_m", "within_three_deviations", "negative_log_likelihood")
 _SLIPS_PER_KM = 300.0  # of the table of slip; the buildings have up to 60
 _ABLATED = ("buildings", "aliased")
 _SLIP_ROWS = ("wheels", "ours")
+_SETTINGS = ("buildings", "first_building", "ablation", "length_m", "mazes", "frames")
 _SCANNER_ROWS = ("ours_without_wheels",)
 
 
@@ -61,6 +62,8 @@ class Arguments:
     """Folder of real logs (.bag, .log, .clf, gzipped or not), with relations as NAME.relations; none: left out."""
     buildings: int = 20
     """Simulated buildings of each of the two tables."""
+    first_building: int = 0
+    """Number of the first one among the test seeds: others than those of the tables that are published."""
     length_m: float = 500.0
     """Way that the robot drives in a building."""
     ablation: int = 5
@@ -91,6 +94,15 @@ class Arguments:
                 f"buildings, ablation, mazes, frames, length_m are {counts}, {self.length_m}; expected at least 2 of "
                 "each, and a positive way"
             )
+        if (
+            not 0
+            <= self.first_building
+            <= len(BUILDING_TEST_SEEDS) - _ALIASED_FIRST - max(self.buildings, self.ablation)
+        ):
+            raise ValueError(
+                f"first_building is {self.first_building}; expected one of the {len(BUILDING_TEST_SEEDS)} test seeds "
+                f"that {_ALIASED_FIRST} and as many as are measured follow"
+            )
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -112,9 +124,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     result = {
         "command": _command(record["command"], bool(logs)),
         "revision": record["revision"],
-        "settings": {
-            name: getattr(arguments, name) for name in ("buildings", "ablation", "length_m", "mazes", "frames")
-        },
+        "settings": {name: getattr(arguments, name) for name in _SETTINGS},
         "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
         "tables": {name: _table_numbers(table) for name, table in tables.items()},
         "scanners": {name: _table_numbers(table) for name, table in scanners.items()},
@@ -147,11 +157,12 @@ def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
 
 def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSource]]:
     """The drives of each table; what is not there is added to what is skipped."""
-    aliased = BUILDING_TEST_SEEDS[_ALIASED_FIRST:]
+    seeds = BUILDING_TEST_SEEDS[arguments.first_building :]
+    aliased = seeds[_ALIASED_FIRST:]
     sources = {
-        "buildings": [_building(arguments, "buildings", seed) for seed in BUILDING_TEST_SEEDS[: arguments.buildings]],
+        "buildings": [_building(arguments, "buildings", seed) for seed in seeds[: arguments.buildings]],
         "aliased": [_building(arguments, "aliased", seed) for seed in aliased[: arguments.buildings]],
-        "slip": [_building(arguments, "slip", seed) for seed in BUILDING_TEST_SEEDS[: arguments.ablation]],
+        "slip": [_building(arguments, "slip", seed) for seed in seeds[: arguments.ablation]],
     }
     mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
     sources["maze2d"] = [

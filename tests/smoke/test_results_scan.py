@@ -68,10 +68,22 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert known["tables"]["buildings"]["ours"]["ate_m"]["drives"] == 1
     assert known["tables"]["aliased"] == result["tables"]["aliased"]
 
+    shifted = results_scan.main(replace(arguments, known=True, first_building=1))
+    assert shifted["settings"]["first_building"] == 1
+    assert shifted["tables"]["buildings"] == {}
+    assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1
+
 
 def test_a_row_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ValueError, match="gtsam_lm"):
         results_scan.Arguments(rows=("gtsam",))
+
+
+@pytest.mark.parametrize("first", [-1, 9481])
+def test_buildings_that_are_not_for_tests_are_refused(first: int) -> None:
+    with pytest.raises(ValueError, match=f"first_building is {first}"):
+        results_scan.Arguments(first_building=first)
+    results_scan.Arguments(first_building=9480)
 
 
 @pytest.mark.parametrize("world", [("--world", "scan"), ("--world=scan",)])
