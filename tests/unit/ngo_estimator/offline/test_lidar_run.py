@@ -1,12 +1,16 @@
 """A run over recorded scans and wheels is what both cores give when they are fed by hand."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig
+from ngo_estimator.odometry.mounting_yaw import MountingYawConfig
+from ngo_estimator.odometry.wheel_odometry import WheelOdometryConfig
 from ngo_estimator.offline.lidar_run import LidarRun
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
@@ -19,10 +23,12 @@ STEP_NS = 100_000_000
 Record = LidarScan | WheelPose
 
 
-def recorded(count: int, begin_ns: int = 10**12) -> list[Record]:
+def recorded(count: int, begin_ns: int = 10**12, further_left_rad: float = 0.0) -> list[Record]:
+    """Wheels and scans, of a scanner that looks so much further to the left than ``MOUNTING`` says."""
+    sensor = MOUNTING.sensor_xyyaw + (0.0, 0.0, further_left_rad)
     noise, pose, records = np.random.default_rng(0), np.array((1.0, 1.0, 0.2)), []
     for k in range(count):
-        ranges = cast(ROOM, compose(pose, MOUNTING.sensor_xyyaw), ANGLES) + noise.normal(0.0, 0.005, len(ANGLES))
+        ranges = cast(ROOM, compose(pose, sensor), ANGLES) + noise.normal(0.0, 0.005, len(ANGLES))
         stamp_ns, increment = begin_ns + k * STEP_NS, float(ANGLES[1] - ANGLES[0])
         single = ranges.astype(np.float32)
         records += [
@@ -33,8 +39,10 @@ def recorded(count: int, begin_ns: int = 10**12) -> list[Record]:
     return records
 
 
-def run_over(records: Sequence[Record]) -> tuple[LidarRun, list[RecordedStep], list[RecordedRun]]:
-    run = LidarRun(LidarOdometry(), ScanTrajectory(iterations_per_step=1), MOUNTING)
+def run_over(
+    records: Sequence[Record], config: LidarOdometryConfig | None = None
+) -> tuple[LidarRun, list[RecordedStep], list[RecordedRun]]:
+    run = LidarRun(LidarOdometry(config), ScanTrajectory(iterations_per_step=1), MOUNTING)
     events = list(run.run(records))
     steps = [event for event in events if isinstance(event, RecordedStep)]
     return run, steps, [event for event in events if isinstance(event, RecordedRun)]
@@ -88,6 +96,15 @@ def test_stamps_that_jump_back_begin_another_trajectory() -> None:
     _, _, alone = run_over(recorded(30, 10**11))
     assert runs[1].trajectory.poses_xyyaw.tobytes() == alone[0].trajectory.poses_xyyaw.tobytes()
     assert run.frames == 70
+
+
+@pytest.mark.parametrize(("yaw", "side"), [(0.05, "left"), (-0.05, "right")])
+def test_a_scanner_that_looks_elsewhere_than_its_mounting_says_is_told(yaw: float, side: str) -> None:
+    config = WheelOdometryConfig(mounting_yaw=MountingYawConfig(stretch_m=0.2, fewest=10))
+    run, _, _ = run_over(recorded(60, further_left_rad=yaw), LidarOdometryConfig(wheels=config))
+    assert run.facts["mounting_yaw_deg"] == pytest.approx(math.degrees(yaw), abs=0.6)
+    (remark,) = run.remarks()
+    assert f"{abs(run.facts['mounting_yaw_deg']):.1f} deg further to the {side}" in remark
 
 
 def test_faults_inside_are_told() -> None:

@@ -179,6 +179,7 @@ class LidarInput:
             "scans waiting for odometry": str(self._core.waiting + len(self._held)),
             "robot odometry": "heard" if self._core.has_wheels else "none",
             "age of scans against odometry (s)": f"{self._core.lag_s:.3f}",
+            "yaw of the scanner against its mounting (deg)": f"{math.degrees(self._core.mounting_yaw_rad):.1f}",
             "scans that did not say where they were taken": str(self._unsure),
             "restarts": str(self._core.restarts),
         }

@@ -145,6 +145,11 @@ class LidarOdometry:
         """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
         return 0.0 if self._wheels is None else self._wheels.lag_s
 
+    @property
+    def mounting_yaw_rad(self) -> float:
+        """How much further to the left the scanner looks than its mounting says, by the wheels; 0 until it is known."""
+        return 0.0 if self._wheels is None else self._wheels.mounting_yaw.yaw_rad
+
     def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
         """Take the wheels' pose ``(3,)`` in their own frame.
 

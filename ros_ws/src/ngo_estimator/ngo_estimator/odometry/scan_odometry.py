@@ -161,8 +161,8 @@ class ScanOdometry:
 
         Args:
             swept: newer than the last one.
-            wheels: the wheels' poses so far, where the robot has wheels. The turns that the scans measure are given to
-                it, from which it learns its lag.
+            wheels: the wheels' poses so far, where the robot has wheels. Turns and poses that the scans measure are
+                given to it, from which it learns its lag and how the scanner is mounted.
             again: gives the scan without a sweep of another velocity ``(3,)``.
             stands: the ranges look as if the robot stands.
 
@@ -196,6 +196,8 @@ class ScanOdometry:
             (before_ns, before), (after_ns, after) = self._middle, swept.middle
             turn = float(estimate.step[2]) + after - before
             wheels.observe_turn(last_ns + before_ns, scan.stamp_ns + after_ns, turn)
+        if wheels is not None:
+            wheels.observe_pose(scan.stamp_ns, None if unsure else estimate.pose)
         self._middle = swept.middle
         return estimate
 
@@ -248,6 +250,8 @@ class ScanOdometry:
         self._submap.add(scan, self._pose)
         self._stamp_ns = scan.stamp_ns
         self._prior.begin(scan.stamp_ns, self._pose, wheels)
+        if wheels is not None:
+            wheels.observe_pose(scan.stamp_ns, self._pose)
         zero, none = np.zeros(3), np.zeros((3, 3))
         nothing = np.zeros(len(STEP_EVIDENCE))
         return ScanEstimate(

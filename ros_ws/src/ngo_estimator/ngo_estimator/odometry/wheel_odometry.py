@@ -1,7 +1,8 @@
 """Wheel odometry as the action of the local estimator: motion between two scans, and how far it may be wrong.
 
 The wheels need no calibration: their deviations allow for it. Their stamps may be late or early against the scans',
-which ``WheelLag`` finds out. They may freeze (``WheelFreezes``) and jump.
+which ``WheelLag`` finds out. They may freeze (``WheelFreezes``) and jump. Their direction tells how the scanner is
+mounted (``MountingYaw``).
 """
 
 import math
@@ -11,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array, arc_velocity, between, wrap
+from ngo_estimator.odometry.mounting_yaw import MountingYaw, MountingYawConfig
 from ngo_estimator.odometry.wheel_freezes import WheelFreezes, WheelFreezesConfig
 from ngo_estimator.odometry.wheel_lag import WheelLag, WheelLagConfig
 
@@ -37,6 +39,7 @@ class WheelOdometryConfig:
     extrapolated_s: float = 0.5
     lag: WheelLagConfig = field(default_factory=WheelLagConfig)
     freezes: WheelFreezesConfig = field(default_factory=WheelFreezesConfig)
+    mounting_yaw: MountingYawConfig = field(default_factory=MountingYawConfig)
 
     def __post_init__(self) -> None:
         if not (self.still_m > 0.0 and self.still_deg > 0.0):
@@ -62,6 +65,7 @@ class WheelOdometry:
     def __init__(self, config: WheelOdometryConfig | None = None) -> None:
         self.config = config or WheelOdometryConfig()
         self.lag = WheelLag(self.config.lag)
+        self.mounting_yaw = MountingYaw(self.config.mounting_yaw)
         self._freezes = WheelFreezes(self.config.freezes)
         self._rows = np.empty((2 * self.config.kept, 4))  # stamp in s since the first pose, x, y, unwrapped yaw
         self._count = 0
@@ -149,6 +153,14 @@ class WheelOdometry:
         self.lag.observe((start_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9, turn)
         rows = self._rows[: self._count]
         self.lag.update(rows[:, 0], rows[:, 3])
+
+    def observe_pose(self, stamp_ns: int, pose: Array | None) -> None:
+        """Take the pose ``(3,)`` of a scan by the scans, None where they are not sure: it tells the mounting's yaw."""
+        wheels = None if pose is None else self.pose_at(stamp_ns)
+        if pose is None or wheels is None or self.frozen_s(stamp_ns) > 0.0:
+            self.mounting_yaw.interrupt()
+        else:
+            self.mounting_yaw.observe(stamp_ns * 1e-9, pose, wheels)
 
     def motion(self, start: Array, end: Array) -> tuple[Array, Array]:
         """Motion ``(3,)`` between two of the wheels' poses, and the deviations ``(3,)`` of it."""

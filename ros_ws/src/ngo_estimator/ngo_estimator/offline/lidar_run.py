@@ -1,5 +1,6 @@
 """A lidar's estimators over the scans and wheels of a recording, as the live nodes compute (no ROS here)."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -50,13 +51,24 @@ class LidarRun:
     @property
     def facts(self) -> dict[str, Any]:
         """What else is worth keeping of the run."""
-        return {"unsure": self.unsure, "lag_s": self._odometry.lag_s, "faults": len(self.faults)}
+        return {
+            "unsure": self.unsure,
+            "lag_s": self._odometry.lag_s,
+            "mounting_yaw_deg": math.degrees(self._odometry.mounting_yaw_rad),
+            "faults": len(self.faults),
+        }
 
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
         lines = []
         if lag_s := self._odometry.lag_s:
             lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
+        if yaw := math.degrees(self._odometry.mounting_yaw_rad):
+            side = "left" if yaw > 0.0 else "right"
+            lines.append(
+                f"the scanner looks {abs(yaw):.1f} deg further to the {side} than its mounting says, by the wheels' "
+                "way: not corrected"
+            )
         if self.unsure:
             lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
         if self.faults:
