@@ -67,7 +67,7 @@ class LidarRun:
             side = "left" if yaw > 0.0 else "right"
             lines.append(
                 f"the scanner looks {abs(yaw):.1f} deg further to the {side} than its mounting says, by the wheels' "
-                "way: not corrected"
+                "way, or its angle increment is wrong: not corrected"
             )
         if self.unsure:
             lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
