@@ -141,10 +141,12 @@ def test_stamps_that_came_already_and_restarts() -> None:
     np.testing.assert_array_equal(again[-1].odom_xyyaw, fed(LidarOdometry(), ours)[-1].odom_xyyaw)
 
 
-def swept_scans(turns: list[float]) -> tuple[np.ndarray, list[LidarScan], list[LidarScan]]:
+def swept_scans(
+    turns: list[float], room: np.ndarray = ROOM, angles: np.ndarray = ANGLES
+) -> tuple[np.ndarray, list[LidarScan], list[LidarScan]]:
     """Poses of a robot that turns by so much (rad) from scan to scan, and scans that sweep for 0.09 s, which do not say
     it and which do."""
-    sweep_s, rays = 0.09, len(ANGLES)
+    sweep_s, rays = 0.09, len(angles)
     steps_xyyaw = [np.array((0.05 if turn else 0.0, 0.0, turn)) for turn in turns]
     poses = [np.array((1.5, 1.2, 0.6))]
     for step in steps_xyyaw:
@@ -153,10 +155,10 @@ def swept_scans(turns: list[float]) -> tuple[np.ndarray, list[LidarScan], list[L
     noise, plain, swept = np.random.default_rng(0), [], []
     for k, (pose, step) in enumerate(zip(poses, steps_xyyaw, strict=False)):
         moved = [compose(pose, step * t / 0.1) for t in offsets]
-        ranges = np.array([cast(ROOM, at, angle[None])[0] for at, angle in zip(moved, ANGLES, strict=True)])
+        ranges = np.array([cast(room, at, angle[None])[0] for at, angle in zip(moved, angles, strict=True)])
         ranges += noise.normal(0.0, 0.005, rays)
-        plain.append(scan_of(ranges, k))
-        swept.append(scan_of(ranges, k, time_increment=sweep_s / rays))
+        plain.append(scan_of(ranges, k, angles))
+        swept.append(scan_of(ranges, k, angles, time_increment=sweep_s / rays))
     return np.array(poses), plain, swept
 
 
@@ -208,6 +210,26 @@ def test_wheels_that_slip_bend_no_scan() -> None:
     ])  # fmt: skip
     assert np.abs(errors[:, 2]).max() < 0.01
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.02
+
+
+@pytest.mark.parametrize("slip_deg", [-16.0, -8.0, 8.0, 12.0])
+def test_wheels_that_slip_so_fast_that_a_scan_fits_nowhere(slip_deg: float) -> None:
+    """In a hall, wheels that slip for half a second bend scans of far walls, which then fit nowhere near where the
+    wheels lead. By the velocity that the robot had before they are straight."""
+    turns = [math.radians(math.sin(0.2 * k)) for k in range(1, 60)]
+    poses, _, swept = swept_scans(turns, 3.0 * ROOM, fan(481, 340.0))
+    steps = [between(before, after) for before, after in zip(poses[:-1], poses[1:], strict=True)]
+    slipped = [poses[0]]
+    for k, step in enumerate(steps):
+        slipped.append(compose(slipped[-1], step + (0.0, 0.0, math.radians(slip_deg) if 20 <= k % 30 < 25 else 0.0)))
+    records = [record for pair in zip(wheels(np.array(slipped)), swept, strict=False) for record in pair]
+    found = fed(LidarOdometry(), records)
+    errors = np.array([
+        between(between(poses[0], pose), step.odom_xyyaw) for pose, step in zip(poses[1:], found, strict=False)
+    ])  # fmt: skip
+    assert np.abs(errors[:, 2]).max() < 0.02
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.1
+    assert not any(step.unsure for step in found)
 
 
 def hostile_scans() -> dict[str, LidarScan]:

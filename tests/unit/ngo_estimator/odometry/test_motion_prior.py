@@ -250,9 +250,11 @@ def test_a_slip_that_lasts_is_compared_with_the_velocity_before_it(heading: floa
         counted, truth = compose(pose, step), compose(truth, straight)
         wheels.add(k * PERIOD_NS, counted)
         prediction = prior.predict(k * PERIOD_NS, pose, SURE, wheels)
-        other = prior.without_slip(k * PERIOD_NS, pose, SURE, wheels, prediction)
-        assert (other is not None) == slips
-        if other is not None:
+        by_velocity = prior.without_slip(k * PERIOD_NS, pose, SURE, wheels, prediction)
+        assert (by_velocity is not None) == slips
+        if by_velocity is not None:
+            other, velocity = by_velocity
+            assert velocity == pytest.approx(straight / (PERIOD_NS * 1e-9), abs=0.01)
             assert other.starts[0] == pytest.approx(truth, abs=0.01)
             assert math.sqrt(other.covariance[2, 2]) > 0.12 * (k - 20)
         prior.accept(k * PERIOD_NS, counted, SURE, step, SURE, k % 4 == 0, k % 4 == 0, False)
@@ -270,7 +272,7 @@ def test_a_slip_since_the_last_key_scan_is_noticed_after_its_end() -> None:
         other = prior.without_slip(k * PERIOD_NS, last, SURE, wheels, prediction)
         prior.accept(k * PERIOD_NS, truth, SURE, step, SURE, k == 20, k == 20, False)
     assert prediction.measured and prediction.mean[2] == pytest.approx(0.3)
-    assert other is not None and other.mean == pytest.approx(truth, abs=1e-6)
+    assert other is not None and other[0].mean == pytest.approx(truth, abs=1e-6)
 
 
 def test_a_slip_goes_on_until_the_wheels_agree_with_the_velocity() -> None:

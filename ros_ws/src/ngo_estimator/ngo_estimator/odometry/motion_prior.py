@@ -200,8 +200,9 @@ class MotionPrior:
 
     def without_slip(
         self, stamp_ns: int, last: Array, covariance: Array, wheels: WheelOdometry, prediction: Prediction
-    ) -> Prediction | None:
-        """Another prior of the scan whose ``prediction`` wheels made: that of wheels that slipped.
+    ) -> tuple[Prediction, Array] | None:
+        """Another prior of the scan whose ``prediction`` wheels made: that of wheels that slipped. And its velocity
+        ``(3,)`` (m/s, m/s, rad/s).
 
         It begins where the velocity leads from the last trusted scan, and is as wide as both disagree. It is None where
         nothing else is known: no velocity is trusted, or it agrees with the wheels within their deviations, or these
@@ -220,7 +221,7 @@ class MotionPrior:
             return None
         off_m = math.hypot(off[0], off[1])
         total = np.diag((deviations + np.array((off_m, off_m, abs(off[2])))) ** 2) + covariance
-        return Prediction(mean, total, inverted(total), (carried,), by_wheels=True)
+        return Prediction(mean, total, inverted(total), (carried,), by_wheels=True), self._trusted.velocity
 
     def judge(self, slips: bool) -> None:
         """The walls told whether the wheels slip. If they do, the next prior counts from the newest scan."""

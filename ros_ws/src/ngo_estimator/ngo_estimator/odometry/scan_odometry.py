@@ -180,7 +180,7 @@ class ScanOdometry:
         found, doubt, searched = self._register(scan, prediction)
         slip_doubt = np.zeros((3, 3))
         if wheels is not None and prediction.measured:
-            prediction, found, slip_doubt = self._without_slip(swept, prediction, found, wheels)
+            prediction, (swept, found), slip_doubt = self._without_slip(swept, prediction, found, wheels, again)
         sweep_doubt = np.zeros((3, 3))
         if again is not None:
             (swept, found), sweep_doubt = self._swept_again(swept, prediction, found, again)
@@ -202,28 +202,38 @@ class ScanOdometry:
         return estimate
 
     def _without_slip(
-        self, swept: SweptScan, prediction: Prediction, found: Registration, wheels: WheelOdometry
-    ) -> tuple[Prediction, Registration, Array]:
-        """The prediction and its registration, by the velocity where the walls say that the wheels slipped; and the
-        covariance ``(3, 3)`` by which the other may be right."""
-        other = self._prior.without_slip(swept.scan.stamp_ns, self._pose, self._covariance, wheels, prediction)
-        if other is None:
-            return prediction, found, np.zeros((3, 3))
-        again = self._best(swept.scan, list(other.starts), (other.mean, other.information), 0.0)
-        if again.share < self.config.good_share:
-            return prediction, found, np.zeros((3, 3))
+        self,
+        swept: SweptScan,
+        prediction: Prediction,
+        found: Registration,
+        wheels: WheelOdometry,
+        again: Callable[[Array], SweptScan] | None,
+    ) -> tuple[Prediction, Registered, Array]:
+        """The prediction, the scan and its registration, by the velocity where the walls say that the wheels slipped;
+        and the covariance ``(3, 3)`` by which the other may be right.
+
+        Wheels that slip during a sweep bend the scan, which then fits nowhere. So the velocity removes its motion, too.
+        """
+        by_velocity = self._prior.without_slip(swept.scan.stamp_ns, self._pose, self._covariance, wheels, prediction)
+        if by_velocity is None:
+            return prediction, (swept, found), np.zeros((3, 3))
+        other, velocity = by_velocity
+        unbent = swept if again is None else again(velocity)
+        fit = self._best(unbent.scan, list(other.starts), (other.mean, other.information), 0.0)
+        if fit.share < self.config.good_share:
+            return prediction, (swept, found), np.zeros((3, 3))
         stands, rare = found, 0.0 if self._prior.slips else _RARE  # a slip that was told goes on as likely as not
         if self._is_unsure(found, prediction):
             stands = replace(found, pose=prediction.mean)
             if found.share >= self.config.good_share:
                 rare = 0.0  # so far from the wheels that these are as rare
-        (_, likely), doubt = likelier(self._submap.lines, self.config.icp, (swept, stands), (swept, again), rare)
-        self._prior.judge(slips=likely is again)
+        (_, likely), doubt = likelier(self._submap.lines, self.config.icp, (swept, stands), (unbent, fit), rare)
+        self._prior.judge(slips=likely is fit)
         if likely is stands:
             if prediction.step_covariance is not None:
                 prediction = replace(prediction, step_covariance=prediction.step_covariance + doubt)
-            return prediction, found, doubt
-        return other, again, doubt
+            return prediction, (swept, found), doubt
+        return other, (unbent, fit), doubt
 
     def _swept_again(
         self, swept: SweptScan, prediction: Prediction, found: Registration, again: Callable[[Array], SweptScan]

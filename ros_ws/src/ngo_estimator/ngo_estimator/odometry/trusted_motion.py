@@ -54,6 +54,12 @@ class TrustedMotion:
         """Pose ``(3,)`` at a stamp by the trusted velocity; None where none is known that has led to a scan before."""
         return self._led(self._last, stamp_ns) if self._last is not None and self._last.proven else None
 
+    @property
+    def velocity(self) -> Array:
+        """The trusted velocity ``(3,)`` along the robot's axes (m/s, m/s, rad/s), where ``carried`` knows a pose."""
+        assert self._last is not None
+        return self._last.velocity
+
     def forget(self) -> None:
         """Nothing measured the robot's motion."""
         self._last, self._skipped = None, False
