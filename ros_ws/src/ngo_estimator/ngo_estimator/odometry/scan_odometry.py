@@ -212,14 +212,17 @@ class ScanOdometry:
         """The prediction, the scan and its registration, by the velocity where the walls say that the wheels slipped;
         and the covariance ``(3, 3)`` by which the other may be right.
 
-        Wheels that slip during a sweep bend the scan, which then fits nowhere. So the velocity removes its motion, too.
+        Wheels that slip during a sweep bend the scan. Where it fits nowhere, the velocity removes its motion, too.
         """
         by_velocity = self._prior.without_slip(swept.scan.stamp_ns, self._pose, self._covariance, wheels, prediction)
         if by_velocity is None:
             return prediction, (swept, found), np.zeros((3, 3))
         other, velocity = by_velocity
-        unbent = swept if again is None else again(velocity)
-        fit = self._best(unbent.scan, list(other.starts), (other.mean, other.information), 0.0)
+        starts, prior = list(other.starts), (other.mean, other.information)
+        unbent, fit = swept, self._best(swept.scan, starts, prior, 0.0)
+        if fit.share < self.config.good_share and again is not None:
+            unbent = again(velocity)
+            fit = self._best(unbent.scan, starts, prior, 0.0)
         if fit.share < self.config.good_share:
             return prediction, (swept, found), np.zeros((3, 3))
         stands, rare = found, 0.0 if self._prior.slips else _RARE  # a slip that was told goes on as likely as not
