@@ -39,6 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("results")
     with pytest.MonkeyPatch.context() as patch:
         toy.shrink(patch, STEPS + 1, 300)
+        toy.draw_coarsely(patch)
         patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
         tables = {"perfect": Table(MazeSize(2, 0)), "cycles": Table(MazeSize(2, 1), stretch=1)}
         world = dataclasses.replace(worlds.WORLDS["maze2d"], tables=tables)

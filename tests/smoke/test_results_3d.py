@@ -22,7 +22,9 @@ from training import (
 )
 from training.common.records import RunError
 from training.data.feature_store import open_store
-from training.data.worlds import world_named
+from training.data.worlds import World, world_named
+from training.report import attention_map, figures
+from training.report.maze_views import maze_and_start
 from training.scoring.network_odometry import open_odometry
 from training.scoring.oracle_rows import LIMITS
 from training.scoring.table_rows import Sources, rows_of
@@ -52,6 +54,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
     (folder / "weights" / "maze3d" / "neural_graph_optimizer.safetensors").unlink()
     with pytest.MonkeyPatch.context() as patch:
         toy.shrink(patch, STEPS + 1, 300)
+        toy.draw_coarsely(patch)
+        mazes: dict[tuple[str, str, int], Any] = {}
+
+        def drawn_once(world: World, table: str, split: str, index: int) -> Any:
+            """Each maze needs an engine of its own."""
+            if (table, split, index) not in mazes:
+                mazes[table, split, index] = maze_and_start(world, table, split, index)
+            return mazes[table, split, index]
+
+        for module in (figures, attention_map):
+            patch.setattr(module, "maze_and_start", drawn_once)
         patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
         speed = sources(folder).speed_file
         speed.parent.mkdir(parents=True)

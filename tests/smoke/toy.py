@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from training import (
     evaluate,
@@ -22,7 +23,11 @@ from training import (
     train_smoother,
     tune_pose_graph,
 )
+from training.common.precision import Precision
 from training.data import episodes, streams, worlds
+
+PRECISION: Precision = "32-true"
+"""With "auto" each training would first measure which one is faster."""
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:
@@ -35,6 +40,12 @@ def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> N
     monkeypatch.setattr(streams.PlaceStream, "FRAMES", place_frames)
     for name, world in worlds.WORLDS.items():
         monkeypatch.setitem(worlds.WORLDS, name, dataclasses.replace(world, episode_frames=frames - 1, rows=(4, 4)))
+
+
+def draw_coarsely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let figures be files of few pixels."""
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **given: save(figure, path, **{**given, "dpi": 40}))
 
 
 def refuse(monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType], *others: str) -> None:
@@ -60,7 +71,7 @@ def local(world: str, folder: Path, epochs: int = 1, **changes: Any) -> train_lo
         workers=0,
         out=folder / "weights",
         runs=folder / "runs",
-        **changes,
+        **{"precision": PRECISION, **changes},
     )
 
 
@@ -77,6 +88,7 @@ def deepvo(world: Any, folder: Path, epochs: int = 1) -> train_deepvo.Arguments:
         workers=0,
         out=folder / "weights",
         runs=folder / "runs",
+        precision=PRECISION,
     )
 
 
@@ -91,6 +103,7 @@ def place(world: str, folder: Path, epochs: int = 1) -> train_place.Arguments:
         workers=0,
         out=folder / "weights",
         runs=folder / "runs",
+        precision=PRECISION,
     )
 
 
@@ -108,6 +121,7 @@ def _of_features(folder: Path) -> dict[str, Any]:
         "weights": folder / "weights",
         "out": folder / "weights",
         "runs": folder / "runs",
+        "precision": PRECISION,
     }
 
 
@@ -143,6 +157,7 @@ def end_to_end(world: str, folder: Path, epochs: int = 1) -> train_end_to_end.Ar
         weights=folder / "weights",
         out=folder / "end_to_end",
         runs=folder / "runs",
+        precision=PRECISION,
     )
 
 
