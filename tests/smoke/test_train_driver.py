@@ -152,7 +152,8 @@ def test_lessons_make_it_drive_as_the_teacher_would(tmp_path: Path) -> None:
 
     def agreement(lessons: int) -> float:
         folder = tmp_path / str(lessons)
-        main(arguments(folder, decisions=8, lessons=lessons, lesson_decisions=200, lesson_updates=60, batch_size=64))
+        learned: dict[str, Any] = {"lesson_decisions": 200, "lesson_updates": 60, "batch_size": 64}
+        main(arguments(folder, decisions=8, mazes=25, lessons=lessons, **learned))
         network, config = load_policy(folder / "driver.safetensors"), PolicyConfig()
         task = DrivingTask(world_named("maze3d"), config, (9,), frames=300, mazes=1)
         look, info = task.reset()
