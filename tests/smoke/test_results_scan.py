@@ -4,12 +4,15 @@ import json
 import runpy
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from ngo_sim.floor_plans import FloorPlanConfig
 from training import results, results_scan
 from training.common import command_line
+from training.data import building_drives
 from training.data.scans import CONDITIONS
 from training.scoring import lidar_rows
 from training.scoring.lidar_rows import ROWS
@@ -18,6 +21,7 @@ from training.scoring.lidar_rows import ROWS
 @pytest.mark.timeout(600)
 def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results_scan, "CONDITIONS", dict(list(CONDITIONS.items())[:2]))
+    monkeypatch.setattr(building_drives, "FloorPlanConfig", partial(FloorPlanConfig, scale=0.3))
     arguments = results_scan.Arguments(
         buildings=2,
         ablation=2,
