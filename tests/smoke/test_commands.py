@@ -13,8 +13,8 @@ pytestmark = [pytest.mark.processes, pytest.mark.timeout(180)]
 
 
 def test_a_training_in_any_folder_prints_its_own_lines_alone(tmp_path: Path) -> None:
-    small = "--width 0.03 --epochs 1 --datapoints 1 --batch-size 32 --validation-mazes 1 --accelerator cpu"
-    command = f"python -m training.train_local --world maze2d {small} --out weights --runs runs"
+    small = "--width 0.03 --epochs 1 --batches 1 --pairs-a-maze 4 --validation-batches 1 --accelerator cpu"
+    command = f"python -m training.train_place --world maze2d {small} --out weights --runs runs"
     # A shell that opens the environment and knows nothing else of the project.
     known = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "COLCON_CURRENT_PREFIX")}
     done = subprocess.run(
