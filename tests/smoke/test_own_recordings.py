@@ -32,14 +32,14 @@ def record(world: str, path: Path, **parameters: Any) -> None:
     ("world", "drives", "settings", "shape"),
     [
         # One drive, whose end is held out.
-        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 6}, (1, 241, 4)),
+        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 3}, (1, 241, 4)),
         # The same as a lidar sees it, without actions.
-        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 6, "topics": LIDAR}, (1, 241, 1)),
+        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 3, "topics": LIDAR}, (1, 241, 1)),
         # Several, of which the last is.
         (
             "maze3d",
-            [{"seed": seed, "frames": 1000} for seed in (1001, 1002, 1003)],
-            {"rate": 4e-3, "epochs": 4},
+            [{"seed": seed, "frames": 800} for seed in (1001, 1002, 1003)],
+            {"rate": 4e-3, "epochs": 3},
             (60, 80, 3),
         ),
     ],

@@ -61,7 +61,7 @@ def main(settings: dict[str, Any]) -> dict[str, Any]:
     train_place.main(
         train_place.Arguments(
             width=width,
-            epochs=4,
+            epochs=2,
             batches=24,
             pairs_a_maze=8,
             learning_rate=3e-3,
