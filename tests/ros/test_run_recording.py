@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,7 @@ TOPICS: dict[str, type] = {"/image": Image, "/scan": LaserScan, "/action": Discr
 SEED = 1000
 ROUNDING = 2e-5
 """Networks run over several frames at once round otherwise than over one, in single precision (m, rad)."""
+PLAY_AGAIN_S = 0.3
 AHEAD = 8
 """Frames that the nodes may be behind: images that run far ahead of their actions would be given up."""
 
@@ -140,13 +142,17 @@ class LiveNodes:
         """Play the first frames, always later in time, until all answers come: then everybody is connected."""
         first = [entry for entry in entries if entry[0] in self._topics][:5]
         begin_ns = header_ns(first[0][2])
-        turn = 0
+        turn, sent_s = 0, 0.0
+        listeners = self._publishers.values()
+        self._probe.spin_until(lambda: all(one.get_subscription_count() for one in listeners), "subscribers")
+        self._probe.meet("local_node", "ngo_node")
 
         def answered() -> bool:
-            nonlocal turn
-            turn += 1
-            for topic, _, message in first:
-                self._send(topic, shifted(message, WARM_UP_NS + turn * 10**9 + header_ns(message) - begin_ns))
+            nonlocal turn, sent_s
+            if time.monotonic() - sent_s > PLAY_AGAIN_S:
+                turn, sent_s = turn + 1, time.monotonic()
+                for topic, _, message in first:
+                    self._send(topic, shifted(message, WARM_UP_NS + turn * 10**9 + header_ns(message) - begin_ns))
             return all((self.out.odometry, self.out.poses, self.out.trajectories))
 
         self._probe.spin_until(answered, "the first answers")
