@@ -71,7 +71,8 @@ def main(folder: Path, lost: bool, astray: bool) -> None:
         with pytest.raises(RunError) as error:
             train(folder / "other" if rank else folder)
         (folder / f"astray{rank}.txt").write_text(str(error.value))
-        at_first.clear(), mazes.clear()
+        at_first.clear()
+        mazes.clear()
     train(folder)
 
 
