@@ -24,6 +24,7 @@ def stored(world: str) -> SensedDrive:
     return SensedDrive(torch.from_numpy(drive.frames), drive.truth, drive.actions.astype(np.int64))
 
 
+@functools.cache
 def estimates(world: str, fault: str | None) -> list[LocalEstimate]:
     torch.set_num_threads(1)
     drive = stored(world) if fault is None else faulted(stored(world), fault, BEGIN, 0)

@@ -1,5 +1,6 @@
 """The graph leaves the odometry of unfamiliar frames as it is, and closes no loops with them."""
 
+import functools
 import json
 import shutil
 from collections.abc import Iterator
@@ -11,16 +12,23 @@ import numpy as np
 import pytest
 import torch
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.planar_motion import all_between, between, chained
 from ngo_estimator.odometry.local_odometry import LocalOdometry
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive, corrected, estimates
 
 
+@functools.cache
+def golden(world: str) -> list[RelativeStep]:
+    """The odometry that the shipped local network makes of a stored drive."""
+    return estimates(GoldenDrive.load(world), LocalOdometry.load(WEIGHTS / world))
+
+
 @pytest.mark.parametrize("world", WORLDS)
 def test_what_is_unfamiliar_is_left_to_the_odometry(world: str) -> None:
     torch.set_num_threads(1)
-    steps = estimates(GoldenDrive.load(world), LocalOdometry.load(WEIGHTS / world))
+    steps = golden(world)
     core = OnlineTrajectory.load(WEIGHTS / world, world=world)
     unfamiliar = [replace(step, unlikeness=2.0) for step in steps]
     trajectory, update = corrected(unfamiliar, core)
@@ -34,7 +42,7 @@ def test_what_is_unfamiliar_is_left_to_the_odometry(world: str) -> None:
 
 def test_a_session_with_unfamiliar_frames_goes_on_to_the_last_bit() -> None:
     torch.set_num_threads(1)
-    steps = estimates(GoldenDrive.load("maze3d"), LocalOdometry.load(WEIGHTS / "maze3d"))
+    steps = golden("maze3d")
     steps = [replace(step, unlikeness=2.0 if 90 < k < 110 else 0.0) for k, step in enumerate(steps)]
     original = OnlineTrajectory.load(WEIGHTS / "maze3d", 200, "maze3d", 8, 1)
     for step in steps[:120]:
@@ -47,7 +55,7 @@ def test_a_session_with_unfamiliar_frames_goes_on_to_the_last_bit() -> None:
 def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back() -> None:
     """A mean over 16 frames tells: until then their loops and registrations were taken."""
     torch.set_num_threads(1)
-    steps = estimates(GoldenDrive.load("maze2d"), LocalOdometry.load(WEIGHTS / "maze2d"))
+    steps = golden("maze2d")
     told = len(steps) // 8 * 8 - 8
     late = [replace(step, unlikeness=2.0 if k >= told else 0.0) for k, step in enumerate(steps)]
     core = OnlineTrajectory.load(WEIGHTS / "maze2d", world="maze2d")
@@ -61,7 +69,7 @@ def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back(
 @pytest.mark.parametrize("world", WORLDS)
 def test_behind_a_blind_stretch_a_small_correction_gives_way_to_the_odometry(world: str) -> None:
     torch.set_num_threads(1)
-    steps = estimates(GoldenDrive.load(world), LocalOdometry.load(WEIGHTS / world))
+    steps = golden(world)
     half = len(steps) // 2
     unknown = np.diag([4.0, 4.0, 0.04])
     blind = [replace(step, unlikeness=2.0, covariance=unknown) if k >= half else step for k, step in enumerate(steps)]
@@ -77,7 +85,7 @@ def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_lef
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     torch.set_num_threads(1)
-    steps = estimates(GoldenDrive.load("maze3d"), LocalOdometry.load(WEIGHTS / "maze3d"))
+    steps = golden("maze3d")
     unknown = np.diag([4.0, 4.0, 0.04])
     blind = [replace(s, unlikeness=2.0, covariance=unknown) if 80 <= k < 88 else s for k, s in enumerate(steps)]
     core = OnlineTrajectory.load(WEIGHTS / "maze3d", 96, "maze3d", 16, 1)
@@ -103,7 +111,7 @@ def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_lef
 def test_place_codes_alone_close_no_loop_across_a_blind_stretch(tmp_path: Path) -> None:
     """Nothing limits the motion within it: each place that looks alike would do."""
     torch.set_num_threads(1)
-    steps = estimates(GoldenDrive.load("maze2d"), LocalOdometry.load(WEIGHTS / "maze2d"))
+    steps = golden("maze2d")
     folder = shutil.copytree(WEIGHTS / "maze2d", tmp_path / "maze2d")
     described = json.loads((folder / "neural_graph_optimizer.json").read_text())
     described["config"]["search"]["registrations"] = 0
