@@ -94,11 +94,8 @@ class Arguments:
                 f"buildings, ablation, mazes, frames, length_m are {counts}, {self.length_m}; expected at least 2 of "
                 "each, and a positive way"
             )
-        if (
-            not 0
-            <= self.first_building
-            <= len(BUILDING_TEST_SEEDS) - _ALIASED_FIRST - max(self.buildings, self.ablation)
-        ):
+        last = len(BUILDING_TEST_SEEDS) - _ALIASED_FIRST - max(self.buildings, self.ablation)
+        if not 0 <= self.first_building <= last:
             raise ValueError(
                 f"first_building is {self.first_building}; expected one of the {len(BUILDING_TEST_SEEDS)} test seeds "
                 f"that {_ALIASED_FIRST} and as many as are measured follow"

@@ -195,19 +195,24 @@ def test_a_turn_that_begins_within_a_sweep_is_in_the_covariance_where_no_wheels_
     assert math.degrees(deviations[3 : begins - 2].max()) < 0.5
 
 
+def errors_of_slipping_wheels(poses: np.ndarray, scans: list[LidarScan], slips_rad: list[float]) -> np.ndarray:
+    """Errors ``(steps, 3)`` of the poses that scans get whose wheels turn by so much more from each to the next."""
+    slipped = [poses[0]]
+    for before, after, slip in zip(poses[:-1], poses[1:], slips_rad, strict=True):
+        slipped.append(compose(slipped[-1], between(before, after) + (0.0, 0.0, slip)))
+    records = [record for pair in zip(wheels(np.array(slipped)), scans, strict=False) for record in pair]
+    found = fed(LidarOdometry(), records)
+    assert not any(step.unsure for step in found)
+    return np.array([
+        between(between(poses[0], pose), step.odom_xyyaw) for pose, step in zip(poses[1:], found, strict=False)
+    ])  # fmt: skip
+
+
 def test_wheels_that_slip_bend_no_scan() -> None:
     """A wheel slips in bursts, which turns the wheels by up to 4 degrees a sweep that the robot does not turn."""
     poses, _, swept = swept_scans([0.0] * 5 + [math.radians(3.0 if k // 8 % 2 else -3.0) for k in range(64)])
-    steps = [between(before, after) for before, after in zip(poses[:-1], poses[1:], strict=True)]
-    slipped = [poses[0]]
-    for k, step in enumerate(steps):
-        turn = math.radians(4.0 * (-1) ** (k // 24)) if k % 24 > 15 and k % 24 < 21 else 0.0
-        slipped.append(compose(slipped[-1], step + np.array((0.0, 0.0, turn))))
-    records = [record for pair in zip(wheels(np.array(slipped)), swept, strict=False) for record in pair]
-    found = fed(LidarOdometry(), records)
-    errors = np.array([
-        between(between(poses[0], pose), step.odom_xyyaw) for pose, step in zip(poses[1:], found, strict=False)
-    ])  # fmt: skip
+    slips = [math.radians(4.0 * (-1) ** (k // 24)) if 15 < k % 24 < 21 else 0.0 for k in range(len(poses) - 1)]
+    errors = errors_of_slipping_wheels(poses, swept, slips)
     assert np.abs(errors[:, 2]).max() < 0.01
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.02
 
@@ -218,18 +223,10 @@ def test_wheels_that_slip_so_fast_that_a_scan_fits_nowhere(slip_deg: float) -> N
     wheels lead. By the velocity that the robot had before they are straight."""
     turns = [math.radians(math.sin(0.2 * k)) for k in range(1, 60)]
     poses, _, swept = swept_scans(turns, 3.0 * ROOM, fan(481, 340.0))
-    steps = [between(before, after) for before, after in zip(poses[:-1], poses[1:], strict=True)]
-    slipped = [poses[0]]
-    for k, step in enumerate(steps):
-        slipped.append(compose(slipped[-1], step + (0.0, 0.0, math.radians(slip_deg) if 20 <= k % 30 < 25 else 0.0)))
-    records = [record for pair in zip(wheels(np.array(slipped)), swept, strict=False) for record in pair]
-    found = fed(LidarOdometry(), records)
-    errors = np.array([
-        between(between(poses[0], pose), step.odom_xyyaw) for pose, step in zip(poses[1:], found, strict=False)
-    ])  # fmt: skip
+    slips = [math.radians(slip_deg) if 20 <= k % 30 < 25 else 0.0 for k in range(len(poses) - 1)]
+    errors = errors_of_slipping_wheels(poses, swept, slips)
     assert np.abs(errors[:, 2]).max() < 0.02
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.1
-    assert not any(step.unsure for step in found)
 
 
 def hostile_scans() -> dict[str, LidarScan]:
