@@ -141,7 +141,7 @@ def test_the_round_trip_of_a_lidar_is_exact(tmp_path: Path, when: str, monkeypat
     for count, step in enumerate(steps, start=1):
         original.update(step)
         graph = original.graph
-        forgotten = len(graph._finder._forgotten)
+        forgotten = len(graph._finder.views.forgotten)
         reached = {
             "while nothing runs": count == len(steps) // 2,
             "while it optimises": graph.running,

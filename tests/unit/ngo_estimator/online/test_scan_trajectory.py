@@ -17,7 +17,7 @@ from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.online import scan_graph
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.optimizer.normal_equations import NormalEquations
-from ngo_estimator.optimizer.scan_loops import ScanLoopFinder
+from ngo_estimator.optimizer.scan_loop_finder import ScanLoopFinder
 from tests.unit.ngo_estimator.lidar_steps import HOUSE, STEP_COVARIANCE, STEP_NS, drifted, lidar_steps, loop_way
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, fan, scan_at
 

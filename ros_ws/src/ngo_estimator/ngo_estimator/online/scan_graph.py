@@ -21,8 +21,10 @@ from ngo_estimator.online.key_scan_store import KeyScanStore
 from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_matcher import ScanMatcher
 from ngo_estimator.optimizer.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
+from ngo_estimator.optimizer.scan_loop_config import ScanLoopConfig
+from ngo_estimator.optimizer.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.optimizer.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
-from ngo_estimator.optimizer.scan_loops import ScanLoopConfig, ScanLoopFinder, ScanLoops
+from ngo_estimator.optimizer.scan_loops import ScanLoops
 from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
 from ngo_estimator.optimizer.ways_through_graph import way_covariances
 
@@ -266,7 +268,9 @@ class ScanGraph:
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
-        return ScanMatcher(self._scans[:], origin.poses(self._nodes.values.copy()), self._finder)
+        return ScanMatcher(
+            self._scans[:], origin.poses(self._nodes.values.copy()), self._finder.views, self.config.loops
+        )
 
     @property
     def used_loops(self) -> ScanLoops:

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.geometry.planar_motion import between
+from ngo_estimator.optimizer.key_scan_views import KeyScanViews
+from ngo_estimator.optimizer.scan_loop_config import ScanLoopConfig
 from ngo_estimator.optimizer.shortest_ways import shortest_ways
 
 
@@ -42,6 +45,17 @@ class WindowConfig:
             )
 
 
+@dataclass(frozen=True)
+class LoopCandidate:
+    """A place, and where in it the last key is searched: ``centre`` plus and minus ``window``, both ``(3,)``. The last
+    key is ``likely`` that near to its pose in the graph."""
+
+    place: int
+    centre: np.ndarray
+    window: np.ndarray
+    likely: np.ndarray
+
+
 def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarray:
     """Length ``(keys,)`` of the shortest way through the graph from a key to each other (m).
 
@@ -60,6 +74,35 @@ def distance_windows(config: WindowConfig, distances: np.ndarray) -> np.ndarray:
     metres = np.minimum(config.least_m + config.share * distances, config.most_m)
     degrees = np.minimum(config.least_deg + config.deg_per_m * distances, config.most_deg)
     return np.stack((metres, metres, np.radians(degrees)), axis=-1)
+
+
+def loop_candidates(
+    config: ScanLoopConfig, views: KeyScanViews, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]
+) -> list[LoopCandidate]:
+    """Where to look for loops of the last key, best first; see ``ScanLoopFinder.find`` for what is given."""
+    key, forgotten = len(poses) - 1, views.forgotten
+    path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))))
+    last = int(np.searchsorted(path, path[-1] - config.least_gap_m)) - config.submap_keys // 2
+    last = min(last, key - config.source_keys - config.submap_keys // 2)
+    steps = range(0, max(0, last), config.place_step)
+    places = [place for place in steps if place not in forgotten]
+    if len(places) == 0:
+        return []
+    seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)
+    around = np.array((config.match_m, config.match_m, math.pi))
+    chosen = [LoopCandidate(p, np.zeros(3), around, windows[p]) for p in seen if p not in forgotten]
+    near = nearest_places(
+        views.at(poses), poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys,
+        most=config.most_per_key,
+    )  # fmt: skip
+    taken = [candidate.place for candidate in chosen]
+    wider = windows * (config.search_factor, config.search_factor, 1.0)
+    chosen += [
+        LoopCandidate(place, between(poses[place], poses[key]), wider[place], windows[place])
+        for place in near
+        if place not in taken
+    ]
+    return chosen[: config.most_per_key]
 
 
 def nearest_places(
