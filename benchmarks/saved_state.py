@@ -33,7 +33,7 @@ from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.saved_state import read_state, write_state
-from ngo_estimator.online.scan_graph import ScanGraphConfig
+from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from training.common.records import WEIGHTS
 

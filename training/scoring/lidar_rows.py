@@ -20,7 +20,7 @@ from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.odometry import lidar_odometry
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
 from ngo_estimator.online import scan_trajectory
-from ngo_estimator.online.scan_graph import ScanGraphConfig
+from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.online.trajectory_update import Trajectory
 from ngo_recordings.scan_stream import WheelPose

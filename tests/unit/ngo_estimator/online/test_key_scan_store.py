@@ -7,7 +7,7 @@ import pytest
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.online.key_scan_store import KeyScanStore
-from ngo_estimator.online.scan_graph import ScanGraphConfig
+from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_estimator.optimizer.scan_loop_config import ScanLoopConfig
 from tests.unit.ngo_estimator.lidar_steps import HOUSE, drifted, lidar_steps, loop_way

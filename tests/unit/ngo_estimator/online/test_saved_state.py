@@ -21,7 +21,7 @@ from ngo_estimator.online import key_frames, saved_state
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.saved_state import read_state, write_state
-from ngo_estimator.online.scan_graph import ScanGraphConfig
+from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from tests.unit.ngo_estimator.lidar_steps import HOUSE, drifted, lidar_steps, loop_way
 from tests.unit.ngo_estimator.online.test_online_trajectory import make_steps

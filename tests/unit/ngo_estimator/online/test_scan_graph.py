@@ -7,7 +7,8 @@ import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
-from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
+from ngo_estimator.online.scan_graph import ScanGraph
+from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from tests.unit.ngo_estimator.optimizer.buildings import HALLWAY, TWICE, between, scan_at
 
 STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))

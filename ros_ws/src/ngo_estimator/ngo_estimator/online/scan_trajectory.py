@@ -13,7 +13,8 @@ from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.online.localisation import Localiser
 from ngo_estimator.online.map_localisation import MapLocalisation
 from ngo_estimator.online.map_origin import MapOrigin
-from ngo_estimator.online.scan_graph import ScanGraph, ScanGraphConfig
+from ngo_estimator.online.scan_graph import ScanGraph
+from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from ngo_estimator.online.step_log import TakenStep
 
 
