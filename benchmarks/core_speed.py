@@ -72,8 +72,8 @@ class Watched:
             self._given = (steps, loops)
             return iterate(steps, loops, *others)
 
-        def searching(part: Any) -> None:
-            self._searched.take(do, part)
+        def searching() -> None:
+            self._searched.take(do)
 
         def advancing(iterations: int) -> bool:
             done = self._spent.take(advance, iterations)

@@ -10,7 +10,7 @@ import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.online import meta_graph
+from ngo_estimator.online import odometry_blocks
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
 from ngo_estimator.online.trajectory_update import TrajectoryUpdate
@@ -76,7 +76,7 @@ def test_huge_variances_and_unusual_codes_break_nothing(
 @pytest.mark.parametrize(
     ("owner", "name", "complaint"),
     [
-        (meta_graph, "registered_steps", "the registration of steps failed, LinAlgError: singular"),
+        (odometry_blocks, "registered_steps", "the registration of steps failed, LinAlgError: singular"),
         (OnlineLoops, "look", "the search for loops failed, LinAlgError: singular"),
         (OnlineLoops, "measure", "the search for loops failed, LinAlgError: singular"),
         (OnlineLoops, "find_overlaps", "the search for loops failed, LinAlgError: singular"),

@@ -138,7 +138,7 @@ def test_each_step_does_one_part_of_an_update_where_that_is_in_time(monkeypatch:
     spread = OnlineTrajectory(robust_graph(6), SeesPoses(), 160, 16, iterations_per_step=1)
     graph, parts = spread._graph, [0]
     do, iterate = graph._do, graph._iterate
-    monkeypatch.setattr(graph, "_do", lambda part: (do(part), parts.append(parts.pop() + 1)))
+    monkeypatch.setattr(graph, "_do", lambda: (do(), parts.append(parts.pop() + 1)))
     monkeypatch.setattr(graph, "_iterate", lambda: (iterate(), parts.append(parts.pop() + 1)))
     assert graph.work == 8  # steps in a block
     for count, step in enumerate(drive(LAP)[0], start=1):
@@ -205,7 +205,7 @@ def test_what_is_kept_does_not_grow() -> None:
         if count % LAP == 0:
             graph = core._graph
             assert graph._loops is not None
-            sizes.append((len(graph._keys), len(graph._loops), graph._loops._codes._buffer.size))
+            sizes.append((len(graph._nodes.keys), len(graph._loops), graph._loops._codes._buffer.size))
     assert max(size[0] for size in sizes) <= 16 + 32
     assert sizes[-1][1] <= 1.3 * sizes[1][1] and sizes[-1][2] == sizes[0][2]
 

@@ -185,11 +185,11 @@ def test_meta_steps_and_features_are_those_of_all_steps_however_far_the_networks
         if count % 8 == 0:
             whole = core._optimizer.aggregate(*(value[:, :count] for value in inputs))
             assert whole.features is not None
-            graph, first = core._graph, max(0, count - window_frames) // 8
+            odometry, first = core._graph._odometry, max(0, count - window_frames) // 8
             for rows, expected in (
-                (graph._steps, whole.relative),
-                (graph._std, whole.std),
-                (graph._features, whole.features),
+                (odometry.relative, whole.relative),
+                (odometry.std, whole.std),
+                (odometry.features, whole.features),
             ):
                 np.testing.assert_allclose(rows.slice(first), expected[0, first:].numpy(), rtol=1e-4, atol=1e-5)
 

@@ -107,7 +107,8 @@ def test_saved_and_loaded_at_any_step_it_goes_on_as_if_never_stopped(tmp_path: P
 def test_the_round_trip_holds_where_an_optimisation_is_in_progress_and_key_frames_have_gone() -> None:
     core, steps, running = networks("loops", 1), make_steps(160), 0
     drive(core, steps[:145], range(0))
-    assert core._graph.running and len(core._graph._gone) and core._graph._information is not None
+    graph = core._graph
+    assert graph.running and len(graph._nodes._gone) and graph._intake.solved.information is not None
     loaded = networks("loops", 1).restored(core.state())
     assert loaded._graph.running
     for step in steps[145:]:
