@@ -104,6 +104,16 @@ def test_saved_and_loaded_at_any_step_it_goes_on_as_if_never_stopped(tmp_path: P
     assert_same(original, loaded)
 
 
+def test_a_session_that_was_paused_for_longer_than_its_window_is_loaded() -> None:
+    core, steps = networks("loops", 1), make_steps(200)
+    drive(core, steps[:160], range(100, 160))
+    assert core._graph._corrections is not None and core._graph._corrections.last <= core._graph._nodes.first
+    loaded = networks("loops", 1).restored(core.state())
+    for step in steps[160:]:
+        core.update(step), loaded.update(step)
+    assert_same(core, loaded)
+
+
 def test_the_round_trip_holds_where_an_optimisation_is_in_progress_and_key_frames_have_gone() -> None:
     core, steps, running = networks("loops", 1), make_steps(160), 0
     drive(core, steps[:145], range(0))

@@ -406,7 +406,8 @@ class MetaGraph:
             "parts_left": np.array(self._intake.left),
             "iterated": np.array(0 if self._running is None else self._running.parts),
         }
-        if self._corrections is not None:
+        # The window may have left them behind while nothing was optimised: then the network is due.
+        if self._corrections is not None and self._corrections.last > self._nodes.first:
             arrays |= under("corrections", self._corrections.state())
         return arrays if self._loops is None else arrays | under("loops", self._loops.state())
 
