@@ -18,8 +18,9 @@ from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
-from ngo_estimator.nodes.weights import compiling, load_core
+from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
+from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
 from ngo_recordings.association import ros_pose
 from ngo_recordings.mounting import mounting_in
@@ -43,7 +44,7 @@ class LidarInput:
     def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
         self._node, self._settings, self._publish = node, settings, publish
         self._core = load_core(LidarOdometry.load, settings)
-        with compiling(node.get_logger()):
+        with compiling(node.get_logger().info):
             warm_up_odometry()
         self._base_frame = settings.framed(settings.base_frame)
         self._odom_frame = settings.framed(settings.odom_frame)

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +32,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ngo_common.files import folder_whole
 from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
+from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
 from ngo_recordings.images import SCAN_TYPE
@@ -236,6 +238,7 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
 
     from ngo_estimator.odometry.local_odometry import LocalOdometry
     from ngo_estimator.offline.recording_run import RecordingRun
+    from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
     from ngo_estimator.online.online_trajectory import OnlineTrajectory
     from ngo_recordings.frames import frames as frames_of
 
@@ -246,6 +249,8 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
     topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
     _check_side_information(topics, local)
     console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
+    with compiling(partial(console.print, highlight=False)):
+        warm_up_networks(online)
     core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
     frames = frames_of(recording, topics, core.rejected, local.image_format.largest_picture)
     return local.world, topics, core, core.run(frames)
@@ -257,6 +262,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     from ngo_estimator.odometry.lidar_odometry import LidarOdometry
     from ngo_estimator.offline.lidar_run import LidarRun
     from ngo_estimator.offline.recorded import Truth
+    from ngo_estimator.offline.warm_up_scans import warm_up_scans
     from ngo_estimator.online.scan_trajectory import ScanTrajectory
     from ngo_recordings.frames import frames as frames_of
     from ngo_recordings.lidar_description import describe_lidar
@@ -279,6 +285,8 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     if topics.ground_truth is not None:
         for frame in frames_of(recording, topics):
             truth.add(frame)
+    with compiling(partial(console.print, highlight=False)):
+        warm_up_scans()
     core = LidarRun(odometry, online, mounting)
     return LIDAR_WORLD, topics, core, core.run(scan_stream(recording, topics, skipped=core.rejected), truth)
 

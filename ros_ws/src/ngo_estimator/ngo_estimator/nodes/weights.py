@@ -1,8 +1,6 @@
 """Loading the weights that a node's parameters name."""
 
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -12,27 +10,12 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.nodes.settings import EstimatorSettings, NgoNodeSettings, StepSettings
+from ngo_estimator.offline.compiling import compiling
 
 if TYPE_CHECKING:
     from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
 
 Core = TypeVar("Core")
-
-_SILENT_S = 5.0
-
-
-@contextmanager
-def compiling(logger: RcutilsLogger) -> Iterator[None]:
-    """Around a warm-up: says what takes so long where it takes long, which is once after an installation."""
-    said = threading.Timer(
-        _SILENT_S, logger.info, ("compiles, once after an installation: this takes from ten seconds to two minutes",)
-    )
-    said.daemon = True
-    said.start()
-    try:
-        yield
-    finally:
-        said.cancel()
 
 
 def weights_folder(settings: StepSettings) -> Path:
@@ -68,7 +51,7 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
             from ngo_estimator.offline.warm_up_scans import warm_up_scans
             from ngo_estimator.online.scan_trajectory import ScanTrajectory
 
-            with compiling(logger):
+            with compiling(logger.info):
                 warm_up_scans()
             return ScanTrajectory.load(folder, world, settings.iterations_per_step)
         from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
@@ -77,7 +60,7 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
         online = OnlineTrajectory.load(
             folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step
         )
-        with compiling(logger):
+        with compiling(logger.info):
             warm_up_networks(online)
         return online
 
