@@ -36,9 +36,11 @@ from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.online.key_scan_chain import KeyScanChain
 from ngo_estimator.online.meta_nodes import MetaNodes
 from ngo_estimator.online.odometry_blocks import OdometryBlocks
 from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.online.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.online.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from training.common.records import ROOT, WEIGHTS
@@ -198,9 +200,8 @@ def _scans(drive: LidarDrive, odometry: LidarOdometry, core: ScanTrajectory) -> 
 
 def stored_path_mb(core: CorrectedTrajectory) -> float:
     """What of the trajectory has to be kept for every frame."""
-    graph = core._graph
-    owners = (owner for owner in vars(graph).values() if isinstance(owner, MetaNodes | OdometryBlocks))
-    parts = (core, core._log, graph, *owners)
+    owners = MetaNodes | OdometryBlocks | KeyScanChain | ScanLoopSelection
+    parts = (core, core._log, *(part for part in vars(core._graph).values() if isinstance(part, owners)))
     rows = [value for part in parts for value in vars(part).values() if isinstance(value, GrowingRows)]
     return sum(each.values.nbytes for each in rows) / 2**20
 
