@@ -7,6 +7,7 @@ from ngo_estimator.online.meta_nodes import MetaNodes
 from ngo_estimator.online.odometry_blocks import OdometryBlocks
 from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.solved_graph import SolvedGraph
+from ngo_estimator.online.trajectory_update import fault_of
 
 _FRESH = 2
 """Blocks since the last optimisation up to which poses say what frames share."""
@@ -81,7 +82,7 @@ class BlockIntake:
             try:
                 work(self._nodes.blocks - 1)
             except Exception as error:  # numerics of a library, or a fault of ours
-                fault = in_words(error, name)
+                fault = fault_of(error, name)
         return fault
 
     @property
@@ -116,8 +117,3 @@ class BlockIntake:
         if self._loops is not None and len(nodes.keys) and len(found):
             limits = self.solved.most_drift(found.start, nodes.first, nodes.poses, std, self._scale)
             self._loops.limit_drift(found, limits)
-
-
-def in_words(error: Exception, work: str) -> str:
-    """One line about ``work`` that failed."""
-    return f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"

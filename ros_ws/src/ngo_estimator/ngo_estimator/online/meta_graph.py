@@ -16,7 +16,7 @@ from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import chained, compose, frames_between_nodes
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.online.blind_stretches import shrunk_corrections, summed_variances
-from ngo_estimator.online.block_intake import BlockIntake, in_words
+from ngo_estimator.online.block_intake import BlockIntake
 from ngo_estimator.online.key_frames import KeyFrame
 from ngo_estimator.online.meta_nodes import MetaNodes
 from ngo_estimator.online.network_corrections import NetworkCorrections
@@ -25,6 +25,7 @@ from ngo_estimator.online.online_loops import OnlineLoops
 from ngo_estimator.online.place_map import PlaceMap
 from ngo_estimator.online.solved_graph import SolvedGraph
 from ngo_estimator.online.step_log import StepLog
+from ngo_estimator.online.trajectory_update import fault_of
 from ngo_estimator.online.update_schedule import RunningOptimisation, is_due, parts_now
 from ngo_estimator.optimizer.loop_closure import Loops
 from ngo_estimator.optimizer.meta_poses import MetaSteps, OptimizedMetaPoses, Solution
@@ -368,7 +369,7 @@ class MetaGraph:
     def fail(self, error: Exception, work: str = "an optimisation") -> None:
         """Leave undone what has begun, and keep why: every node is where it was."""
         self.abandon()
-        self.fault = in_words(error, work)
+        self.fault = fault_of(error, work)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""

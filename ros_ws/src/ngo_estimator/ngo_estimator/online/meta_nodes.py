@@ -22,10 +22,8 @@ class MetaNodes:
         """Those before it."""
         self._kept = np.zeros((0, 3))  # poses of key frames when some were let go last
         self._gone = np.zeros(0, np.int64)  # nodes between these
-        self._moved, self._before = (
-            np.zeros(0, np.int64),
-            np.zeros((0, 3)),
-        )  # nodes optimised last, and their poses then
+        self._moved = np.zeros(0, np.int64)  # nodes optimised last, with their poses before
+        self._before = np.zeros((0, 3))
 
     @property
     def blocks(self) -> int:

@@ -15,6 +15,7 @@ from ngo_estimator.online.map_origin import MapOrigin
 from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from ngo_estimator.online.scan_loop_selection import ScanLoopSelection, taken_rows
 from ngo_estimator.online.scan_matcher import ScanMatcher
+from ngo_estimator.online.trajectory_update import fault_of
 from ngo_estimator.optimizer.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.optimizer.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.optimizer.scan_loops import ScanLoops
@@ -99,7 +100,7 @@ class ScanGraph:
 
     def fail(self, error: Exception, work: str = "an optimisation") -> None:
         """Leave undone what has begun, and keep why: every node is where it was."""
-        self.fault = f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
+        self.fault = fault_of(error, work)
         self._running, self._waiting = None, 0
 
     def _look_for_loops(self) -> bool:

@@ -33,6 +33,11 @@ class TrajectoryUpdate:
     fault: str
 
 
+def fault_of(error: Exception, work: str) -> str:
+    """One line about ``work`` that failed, as ``TrajectoryUpdate.fault`` has it."""
+    return f"{work} failed, {type(error).__name__}: {' '.join(str(error).split())}"
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """The whole trajectory: ``n`` frames, the first at the origin of ``map``.

@@ -41,7 +41,7 @@ class KeyScanViews:
 
     def forget(self, keys: Iterable[int]) -> None:
         """Drop what is kept of these keys, whose scans are gone."""
-        nothing = np.zeros_like(self._profiles[0]) if self._profiles else np.zeros(0, np.float32)
+        nothing = np.zeros(PROFILE_BINS, np.float32)
         for key in keys:
             self._profiles[key] = nothing
             self._forgotten.add(key)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from ngo_estimator.geometry.planar_arrays import between, compose, wrap
 from ngo_estimator.optimizer.scan_loop_config import ScanLoopConfig
 from ngo_estimator.optimizer.scan_loops import EVIDENCE, ScanLoops
 
@@ -25,10 +26,10 @@ def with_agreement(config: ScanLoopConfig, loops: ScanLoops, known: int, poses: 
         if len(near) == 0:
             continue
         # The way from the earlier key of this loop over the other loop to this loop's later key.
-        to_earlier = _between(poses[np.full(len(near), pairs[k, 0])], poses[pairs[near, 0]])
-        to_later = _between(poses[pairs[near, 1]], poses[np.full(len(near), pairs[k, 1])])
-        off = _compose(_compose(to_earlier, loops.relative[near]), to_later) - loops.relative[k]
-        turn = np.abs((off[:, 2] + math.pi) % (2.0 * math.pi) - math.pi)
+        to_earlier = between(poses[pairs[k, 0]], poses[pairs[near, 0]])
+        to_later = between(poses[pairs[near, 1]], poses[pairs[k, 1]])
+        off = compose(compose(to_earlier, loops.relative[near]), to_later) - loops.relative[k]
+        turn = np.abs(wrap(off[:, 2]))
         agree = near[
             (np.linalg.norm(off[:, :2], axis=1) <= config.agreement_m) & (turn <= math.radians(config.agreement_deg))
         ]
@@ -37,16 +38,3 @@ def with_agreement(config: ScanLoopConfig, loops: ScanLoops, known: int, poses: 
     needed = np.maximum(config.least_agreeing, config.agreeing_per_deviation * evidence[:, _DISAGREEMENT])
     accepted = evidence[:, _AGREEING] >= needed
     return ScanLoops(pairs, loops.relative, loops.covariance, evidence, accepted)
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    cosine, sine = np.cos(a[:, 2]), np.sin(a[:, 2])
-    x, y = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    turn = (b[:, 2] - a[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
-    return np.stack((cosine * x + sine * y, cosine * y - sine * x, turn), axis=-1)
-
-
-def _compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    cosine, sine = np.cos(a[:, 2]), np.sin(a[:, 2])
-    x, y = a[:, 0] + cosine * b[:, 0] - sine * b[:, 1], a[:, 1] + sine * b[:, 0] + cosine * b[:, 1]
-    return np.stack((x, y, a[:, 2] + b[:, 2]), axis=-1)
