@@ -46,7 +46,7 @@ cd "$ROOT"
 # Without the guard the wheels' Python finds its own libraries, whatever shell this was called from.
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONPATH
 # The files have every package, so that pip has nothing to resolve; it takes no file whose hash is not there. Python
-# compiles what it imports, a small part of all: compiling everything here would be 40 % of the time.
+# compiles what it imports, a small part of all. To compile everything here would take two thirds longer.
 install() {
     "$VENV/bin/python" -m pip install --disable-pip-version-check --no-deps --require-hashes --no-compile "$@"
 }
