@@ -16,11 +16,11 @@ from benchmarks.drives import CACHE, Drive, drive_of, episodes, stamp_ns
 from benchmarks.peers import INCREMENTAL, SETTINGS, Incremental, LevenbergMarquardt, Problem, xyyaw
 from benchmarks.roofline import Work, counted, measured_peak
 from ngo_estimator.checkpoint import load_optimizer, load_place
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.loops.loop_closure import Loops
+from ngo_estimator.ngo.meta_poses import MetaSteps
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.meta_poses import MetaSteps
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common.records import WEIGHTS
 from training.data.episodes import images_of
 from training.data.worlds import world_named

@@ -33,15 +33,15 @@ from benchmarks.drives import CACHE, drive_of, stamp_ns
 from benchmarks.pinned import in_process, two_cores
 from benchmarks.process_use import memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.meta_nodes import MetaNodes
+from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
-from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
-from ngo_estimator.online.key_scan_chain import KeyScanChain
-from ngo_estimator.online.meta_nodes import MetaNodes
-from ngo_estimator.online.odometry_blocks import OdometryBlocks
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.scan_loop_selection import ScanLoopSelection
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.slam.odometry_blocks import OdometryBlocks
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from training.common.records import ROOT, WEIGHTS
 from training.data.batches import seen_from_first

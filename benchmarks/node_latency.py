@@ -26,8 +26,8 @@ from benchmarks.drives import CACHE, drive_of, episodes, stamp_ns
 from benchmarks.pinned import running_on
 from benchmarks.process_use import memory_mb
 from demo.graph import Graph, GraphError, NodeSpec
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate
 from ngo_estimator.nodes.messages import relative_pose_message, to_time
-from ngo_estimator.odometry.local_odometry import LocalEstimate
 from ngo_sim.flow_control import header_stamp_ns
 
 RATE_HZ = 35.0

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.meta_poses import MetaSteps
+from ngo_estimator.loops.loop_closure import Loops
+from ngo_estimator.ngo.meta_poses import MetaSteps
 from training.baselines.pose_graph import PoseGraphSettings
 
 SETTINGS = PoseGraphSettings()

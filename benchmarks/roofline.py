@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from ngo_estimator.optimizer import block_cholesky
+from ngo_estimator.graph import block_cholesky
 
 _SIDE = 1024
 _COPY_BYTES = 2**26

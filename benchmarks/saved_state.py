@@ -30,11 +30,11 @@ from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import compose
-from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.saved_state import read_state, write_state
-from ngo_estimator.online.scan_graph_config import ScanGraphConfig
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.saved_state import read_state, write_state
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from training.common.records import WEIGHTS
 
 MOST_LOAD_S = 5.0

@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from ngo_estimator.ngo.whole_trajectory import optimize_offline
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings
 from training.common import records

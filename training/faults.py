@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import FAMILIARITY, load_local, load_place
 from ngo_estimator.data.weights_file import load_description
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
 from training.common.records import write_at_once

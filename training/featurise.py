@@ -20,7 +20,7 @@ import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_place
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.common import records
 from training.common.command_line import run_command
 from training.data.data_source import MIRRORED_STORE, OTHER_TRAIN_STORE, TRAIN_STORE

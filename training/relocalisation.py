@@ -26,7 +26,7 @@ import ngo_estimator
 import training
 from ngo_common.files import written_whole
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
 from training.common.records import write_at_once
@@ -44,7 +44,7 @@ from training.scoring.statistics import mean_interval
 Numbers = dict[str, dict[str, Any]]
 """``{mean, ci95}`` by the name of a number."""
 
-_OURS = ("online/localisation.py", "online/evidence.py", "online/place_matcher.py")
+_OURS = ("slam/localisation.py", "slam/evidence.py", "slam/place_matcher.py")
 _BASELINES = ("baselines/particle_filter.py", "scoring/relocalisation_rows.py")
 
 

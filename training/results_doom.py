@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import FAMILIARITY, load_familiarity, load_local, load_place
 from ngo_estimator.data.weights_file import load_description
-from ngo_estimator.odometry.familiarity_watch import FamiliarityWatch
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.frontend.camera.familiarity_watch import FamiliarityWatch
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
 from training.common import records

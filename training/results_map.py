@@ -19,12 +19,12 @@ import torch
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.mapping.occupancy_grid import OccupancyConfig, OccupancyMap
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
 from ngo_estimator.mapping.scan_source import KeyScans, ScanSource, scan_source
-from ngo_estimator.odometry.lidar_odometry import LidarStep
-from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from training.common import records
 from training.common.command_line import run_command
 from training.common.records import write_at_once

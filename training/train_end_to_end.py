@@ -29,8 +29,8 @@ from ngo_estimator.checkpoint import (
 from ngo_estimator.data.weights_file import CheckpointError, load_description
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
-from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.ngo.meta_poses import OptimizedTrajectory
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within

@@ -23,6 +23,7 @@ import tyro
 from torch import Tensor
 
 from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load_place, save_checkpoint
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.familiarity import (
     DISTANCES,
@@ -34,7 +35,6 @@ from ngo_estimator.networks.familiarity import (
     look_size,
     told_vector,
 )
-from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from training.common import records
 from training.common.command_line import run_command
 from training.data.batches import action_histories, relative_poses, seen_from_first

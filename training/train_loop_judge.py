@@ -3,7 +3,7 @@
     python -m training.train_loop_judge
 
 It learns from drives on training maps, through levels of rooms and mazes that no other network has seen, by their true
-poses. The command writes an optimizer without a network, with this judge (``ngo_estimator.optimizer.loop_judge``);
+poses. The command writes an optimizer without a network, with this judge (``ngo_estimator.ngo.loop_judge``);
 ``tune_doom`` chooses its settings then.
 """
 
@@ -21,13 +21,13 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_place, save_checkpoint
 from ngo_estimator.geometry import se2
+from ngo_estimator.graph.gauss_newton import pick
+from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.gauss_newton import pick
-from ngo_estimator.optimizer.loop_closure import LoopSearch
-from ngo_estimator.optimizer.loop_judge import LoopJudge, evidence_of
-from ngo_estimator.optimizer.meta_poses import with_origin
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.loop_judge import LoopJudge, evidence_of
+from ngo_estimator.ngo.meta_poses import with_origin
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.common import records
 from training.common.command_line import run_command
 from training.data.doom_drives import doom_episodes

@@ -21,14 +21,14 @@ from torch.nn.functional import huber_loss
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, load_smoother, save_checkpoint
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
+from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.loop_closing import OVERLAPS_AFTER
-from ngo_estimator.optimizer.loop_closure import LoopSearch
-from ngo_estimator.optimizer.neural_graph_optimizer import (
+from ngo_estimator.ngo.loop_closing import OVERLAPS_AFTER
+from ngo_estimator.ngo.neural_graph_optimizer import (
     NeuralGraphOptimizer,
     NeuralGraphOptimizerConfig,
 )
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.precision import Precision

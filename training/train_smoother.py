@@ -23,7 +23,7 @@ from ngo_estimator.checkpoint import LOCAL, SMOOTHER, load_local, load_place, lo
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig, block_variances, poses_in_blocks
 from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.precision import Precision

@@ -19,10 +19,10 @@ import torch
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import save_checkpoint
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.networks.step_deviation import StepDeviation
 from ngo_estimator.networks.step_scaling import STEP_DEVIATION, StepDeviationConfig
-from ngo_estimator.odometry.lidar_odometry import LidarOdometryConfig
-from ngo_estimator.online.scan_graph_config import ScanGraphConfig
 from training.common import records
 from training.common.command_line import run_command
 from training.data.lidar_steps import KeySteps, building_steps, log_steps

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_optimizer, load_place, save_checkpoint
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.optimizer.loop_closure import LoopSearch
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
-from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from ngo_estimator.loops.loop_closure import LoopSearch
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.ngo.whole_trajectory import optimize_offline
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training import results_doom
 from training.baselines.pose_graph import PoseGraphSettings
 from training.common import records

@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_place, load_smoother
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.optimizer.loop_closure import LoopSearch
 from training.baselines.graph_settings import REGISTRATIONS, fit_calibration
 from training.baselines.loop_factors import (
     LoopFactors,

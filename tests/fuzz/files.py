@@ -15,9 +15,9 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.settings import BadParameter
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place, write_untrained
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
 from ngo_estimator.nodes.settings import NgoNodeSettings
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.trajectory.files import read_tum, write_tum
 from ngo_recordings.frames import frames
 from ngo_recordings.poses import read_tum as read_track

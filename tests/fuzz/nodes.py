@@ -27,7 +27,7 @@ from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.ngo_node import NgoNode
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.fuzz.mutants import spoil
 from tests.fuzz.outcomes import Outcomes
 from tests.ros.estimator_graph import image_message, scan

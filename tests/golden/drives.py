@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.odometry.frame_pairing import PairedFrame
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
+from ngo_estimator.frontend.camera.frame_pairing import PairedFrame
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 
 FOLDER = Path(__file__).parent
 WEIGHTS = FOLDER.parents[1] / "ros_ws/src/ngo_estimator/weights"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_recordings.scan_stream import LidarScan
 from tests.golden.drives import FIRST_STAMP_NS, FOLDER
 

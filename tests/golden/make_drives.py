@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import torch
 
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.building2d import Building2d
 from ngo_sim.building_drivers import BuildingDriverConfig
 from ngo_sim.episodes import record_episode

@@ -15,12 +15,12 @@ import torch
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
 from ngo_estimator.geometry import se2
-from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.saved_state import read_state, write_state
-from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
+from ngo_estimator.loops.loop_closure import Loops
+from ngo_estimator.ngo.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.saved_state import read_state, write_state
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive, corrected, estimates, largest_difference, position_rmse
 
 # Processors round differently: with AVX-512, AVX2 and neither, poses differ by up to 4 um and 1 urad. The rest is for

@@ -7,7 +7,7 @@ import torch
 
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.offline import warm_up_scans, warm_up_trajectory
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .relative_poses import WORLD, write_weights
 

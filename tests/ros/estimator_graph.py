@@ -13,8 +13,8 @@ from sensor_msgs.msg import Image
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.nodes.messages import to_ns, to_time
-from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 
 from .processes import Diagnostics, NodeProcess, Probe
 

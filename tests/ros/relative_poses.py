@@ -11,11 +11,11 @@ from ngo_msgs.msg import RelativePose
 from std_srvs.srv import SetBool
 
 from ngo_estimator.checkpoint import OPTIMIZER, PLACE, PlaceNetworks, save_checkpoint
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate
 from ngo_estimator.geometry import se2
 from ngo_estimator.nodes.messages import relative_pose_message, relative_step, to_ns
-from ngo_estimator.odometry.local_odometry import LocalEstimate
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.trajectory_update import TrajectoryUpdate
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 from tests.unit.ngo_estimator.samples import place_config, small_optimizer
 
 from .estimator_graph import FIRST_RUN_NS, RUN_NS, STEP_NS

@@ -25,8 +25,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes.messages import planar_estimate, pose_message, relative_step, to_ns
-from ngo_estimator.online.map_origin import MapOrigin
-from ngo_estimator.online.tf_smoothing import SmoothedCorrection
+from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
 
 from .processes import NodeProcess, Probe
 from .relative_poses import Optimizer, assert_pose_is

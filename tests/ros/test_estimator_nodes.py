@@ -23,10 +23,10 @@ from sensor_msgs.msg import Image
 from visualization_msgs.msg import Marker
 
 from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
 from ngo_estimator.nodes.messages import relative_step, to_ns, to_time
 from ngo_estimator.nodes.path_message import plain_path
-from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .estimator_graph import FIRST_RUN_NS, STEP_NS, Graph, image_message, scan
 from .processes import NodeProcess, Probe, wait_until

@@ -25,10 +25,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from ngo_estimator.checkpoint import write_untrained
+from ngo_estimator.frontend.camera.frame_pairing import FramePairing, PairedFrame
 from ngo_estimator.nodes.image_input import ImageInput
 from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
-from ngo_estimator.odometry.frame_pairing import FramePairing, PairedFrame
 
 from .estimator_graph import RUN_NS, STEP_NS, Graph, image_message, scan
 from .processes import Diagnostics, NodeProcess, Probe

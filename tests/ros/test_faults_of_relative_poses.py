@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.messages import to_ns, to_time
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe
 from .relative_poses import Optimizer, assert_pose_is

@@ -16,11 +16,11 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes.messages import to_ns, to_time, transform_message
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.association import ros_pose
 from ngo_recordings.mounting import mounting_in
 from ngo_recordings.poses import TransformTree

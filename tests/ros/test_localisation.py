@@ -16,9 +16,9 @@ from ngo_msgs.msg import RelativePose, Trajectory
 from ngo_msgs.srv import LoadState, Reset, SaveState
 from tf2_msgs.msg import TFMessage
 
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.nodes.messages import pose_message, relative_pose_message, to_ns
-from ngo_estimator.odometry.local_odometry import LocalOdometry
 from tests.golden.drives import WEIGHTS, GoldenDrive, estimates
 
 from .processes import NodeProcess, Probe

@@ -12,8 +12,8 @@ from ngo_msgs.msg import RelativePose, Trajectory
 from ngo_msgs.srv import LoadState, SaveState
 
 from ngo_estimator.nodes.messages import relative_step, trajectory_message
-from ngo_estimator.online.map_origin import MapOrigin
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe
 from .relative_poses import Drive, Optimizer

@@ -15,10 +15,10 @@ from sensor_msgs.msg import CompressedImage, Image, LaserScan
 
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint, write_untrained
 from ngo_estimator.data.images import ImageFormat, scan_image
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.nodes.messages import to_ns, to_time
-from ngo_estimator.odometry.local_odometry import LocalOdometry
 from tests.unit.ngo_estimator.samples import SCAN
 
 from .processes import NodeProcess, Probe

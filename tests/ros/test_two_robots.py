@@ -12,7 +12,7 @@ from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.nodes.messages import relative_step, to_ns
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, write_untrained
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training import calibrate_covariance
 from training.calibrate_covariance import Arguments, normalized_errors
 from training.data.episodes import simulate

@@ -11,8 +11,8 @@ import pytest
 
 from ngo_estimator.checkpoint import load_local
 from ngo_estimator.data.weights_file import load_description
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.ros.processes import NodeProcess
 from training.common import records
 from training.recordings.recording_source import NO_LOOPS

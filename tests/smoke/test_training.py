@@ -29,8 +29,8 @@ from ngo_estimator.checkpoint import (
     load_smoother,
 )
 from ngo_estimator.data.weights_file import CheckpointError
-from ngo_estimator.odometry.local_odometry import LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.smoke import toy
 from training import (
     evaluate,

@@ -53,16 +53,18 @@ LAYERS = {
     "ngo_estimator": [
         {"geometry", "data"},
         {"networks"},
-        {"optimizer"},
+        {"graph"},
+        {"loops"},
+        {"ngo"},
         {"checkpoint"},
-        {"odometry", "online", "trajectory", "mapping"},
+        {"frontend", "slam", "trajectory", "mapping"},
         {"offline", "view"},
         {"nodes"},
     ],
     "training": [{"common"}, {"data"}, {"recordings", "driver", "baselines"}, {"scoring"}, {"report"}],
 }
 # Of one layer, these do not know each other: the back end takes relative poses, whoever makes them.
-APART = {("ngo_estimator.online", "ngo_estimator.odometry"), ("ngo_estimator.odometry", "ngo_estimator.online")}
+APART = {("ngo_estimator.slam", "ngo_estimator.frontend"), ("ngo_estimator.frontend", "ngo_estimator.slam")}
 
 
 def imported_names(source: str, module: str, is_package: bool = False) -> set[str]:
@@ -190,7 +192,11 @@ def test_no_import_crosses_a_layer() -> None:
         ("ngo_recordings.frames", "from ngo_estimator.geometry import se2", "the packages meet"),
         ("ngo_recordings.frames", "import rclpy", "only nodes know of ROS"),
         ("training.evaluate", "from ngo_estimator.nodes import ngo_node", "nothing imports a node"),
-        ("ngo_estimator.odometry.local_odometry", "from ..nodes.local_node import LocalNode", "nothing imports a node"),
+        (
+            "ngo_estimator.frontend.rejected_frames",
+            "from ..nodes.local_node import LocalNode",
+            "nothing imports a node",
+        ),
         ("benchmarks.online", "from ngo_estimator.nodes.ngo_node import NgoNode", "nothing imports a node"),
         ("ngo_sim.mazes", "from .episodes import Episode", "later layer"),
         ("ngo_sim.lidar", "from ngo_sim.routes import RouteMap", "later layer"),
@@ -210,11 +216,11 @@ def test_a_planted_crossing_is_caught(module: str, source: str, complaint: str) 
 def test_a_crossing_through_other_modules_is_caught() -> None:
     imports = {
         "ngo_estimator.geometry.se2": {"ngo_estimator.helpers"},
-        "ngo_estimator.helpers": {"ngo_estimator.online.online_trajectory"},
-        "ngo_estimator.online.online_trajectory": set[str](),
+        "ngo_estimator.helpers": {"ngo_estimator.slam.online_trajectory"},
+        "ngo_estimator.slam.online_trajectory": set[str](),
     }
     assert list(crossings(imports)) == [
-        "ngo_estimator.geometry.se2 reaches ngo_estimator.online.online_trajectory: it is of a later layer"
+        "ngo_estimator.geometry.se2 reaches ngo_estimator.slam.online_trajectory: it is of a later layer"
     ]
 
 
@@ -226,7 +232,7 @@ def test_a_crossing_through_other_modules_is_caught() -> None:
         ("training.data", "from ngo_sim import episodes\nfrom ngo_estimator.geometry import se2"),
         ("benchmarks.online", "from ngo_estimator.nodes.path_message import PathWriter"),
         ("tests.ros.test_path", "from ngo_estimator.nodes import path_message"),
-        ("ngo_estimator.odometry.local_odometry", "from ngo_estimator.checkpoint import load_checkpoint"),
+        ("ngo_estimator.frontend.camera.local_odometry", "from ngo_estimator.checkpoint import load_checkpoint"),
         ("ngo_sim.nodes.maze2d_node", "from ngo_recordings.writer import RecordingWriter"),
         ("ngo_sim.maze2d", "from ngo_common.settings import setting"),
         ("ngo_sim.nodes.maze2d_node", "from ngo_common.nodes.process import run_node"),

@@ -172,9 +172,9 @@ for package in ("ngo_common", "ngo_recordings", "ngo_estimator"):
 import torch
 torch.set_num_threads(1)
 from ngo_estimator.checkpoint import write_untrained
-from ngo_estimator.odometry.local_odometry import LocalOdometry
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.offline.recording_run import RecordingRun
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_recordings.frames import Frame
 import numpy as np
 

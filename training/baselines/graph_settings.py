@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.loops.loop_closure import LoopSearch
 from training.baselines.pose_graph import PoseGraphSettings
 
 REGISTRATIONS = 5

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import LoopSearch, find_loops, frame_odometry
+from ngo_estimator.loops.overlaps import find_overlaps
+from ngo_estimator.loops.pair_measurement import VIEWS, PairViews, measure_pairs
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import LoopSearch, find_loops, frame_odometry
-from ngo_estimator.optimizer.overlaps import find_overlaps
-from ngo_estimator.optimizer.pair_measurement import VIEWS, PairViews, measure_pairs
-from ngo_estimator.optimizer.registered_odometry import registered_steps
+from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
+from ngo_estimator.ngo.registered_odometry import registered_steps
 
 _TOGETHER = 8  # trajectories that go through the pair head at once
 EXACT_SCALE = (1e-3, 1e-3)
@@ -29,7 +29,7 @@ EXACT_SCALE = (1e-3, 1e-3)
 
 @dataclass(frozen=True)
 class LoopFactors:
-    """Loops of one trajectory, as in ``ngo_estimator.optimizer.loop_closure.Loops`` without the batch and without fill.
+    """Loops of one trajectory, as in ``ngo_estimator.loops.loop_closure.Loops`` without the batch and without fill.
 
     ``start`` (n,) and ``end`` (n,): the measurement starts at the pose before meta-step ``start`` and ends at the pose
     after meta-step ``end``. ``measured`` (n, 3) is the end seen from the start (m, m, rad), ``log_scale`` (n, 2) the

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.networks.pose_aggregation import block_variances, frame_poses, poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.loops.loop_closure import LoopSearch
+from ngo_estimator.ngo.pose_aggregation import block_variances, frame_poses, poses_in_blocks
 from training.baselines.loop_factors import LoopFactors, MoreLoops, exact_revisits
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
-from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.loops.loop_closure import LoopSearch
 
 TRAIN_STORE = "train"
 """The feature store that smoother and optimizer learn from."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarStep
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarStep
 from ngo_recordings.association import header_stamp_ns, ros_pose
 from ngo_recordings.carmen_log import CORRECTED_TOPIC
 from ngo_recordings.errors import RecordingError

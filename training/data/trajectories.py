@@ -13,10 +13,10 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans
+from ngo_estimator.loops.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch, find_loops
-from ngo_estimator.optimizer.registered_odometry import registered_steps
+from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
+from ngo_estimator.ngo.registered_odometry import registered_steps
 from training.data.batches import ALL, Batch, Share
 from training.data.feature_store import open_store
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.ngo.meta_poses import OptimizedTrajectory
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from training.data.worlds import World
 from training.scoring.row_estimators import Arrays
 from training.scoring.statistics import mean_interval

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ngo_estimator.checkpoint import load_optimizer, load_place
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from ngo_sim.mazes import draw_maze
 from training.report.attention import ROWS, Attention, attention_of, revisits
 from training.report.maze_views import in_maze, maze_and_start

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from ngo_estimator.ngo.whole_trajectory import optimize_offline
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.trajectory.plot import TRUTH, save_plot
 from training.data.batches import relative_poses, seen_from_first
 from training.data.features import OPTIMIZER_INPUTS, Networks

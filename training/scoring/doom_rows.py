@@ -11,7 +11,7 @@ import torch
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.baselines.loop_factors import found_loops
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.data.batches import action_histories, relative_poses

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.data.batches import seen_from_first
 from training.data.faults import SensedDrive
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from ngo_estimator.odometry.lidar_odometry import LidarStep
-from ngo_estimator.online.localisation import Localiser
-from ngo_estimator.online.map_origin import MapOrigin
-from ngo_estimator.online.scan_matcher import ScanMatcher
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
+from ngo_estimator.slam.localisation import Localiser
+from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.scan_matcher import ScanMatcher
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from training.data.lidar_drives import LidarDrive
 from training.scoring.kidnapped import MOST_DEG, MOST_M, KnownMap, MapErrors
 from training.scoring.lidar_rows import DriveRuns, Pipeline

@@ -15,14 +15,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.frontend.lidar import lidar_odometry
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
 from ngo_estimator.geometry.planar_motion import chained
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.networks.step_scaling import StepScaling
-from ngo_estimator.odometry import lidar_odometry
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
-from ngo_estimator.online import scan_trajectory
-from ngo_estimator.online.scan_graph_config import ScanGraphConfig
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.slam import scan_trajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_recordings.scan_stream import WheelPose
 from training.baselines import lidar_peers, mrpt_slam
 from training.baselines.lidar_peers import GraphPeerConfig, KissConfig

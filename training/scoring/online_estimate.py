@@ -7,8 +7,8 @@ import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory
 
 
 def run_online(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> Trajectory:

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.loop_closure import Loops
-from ngo_estimator.optimizer.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.loops.loop_closure import Loops
+from ngo_estimator.ngo.meta_poses import Correction, MetaSteps, OptimizedMetaPoses, Solution
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from training.baselines.graph_settings import load_settings
 from training.baselines.loop_factors import LoopFactors, smoothed_odometry
 from training.baselines.pose_graph import PoseGraphSettings

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import LoopSearch
+from ngo_estimator.loops.pair_measurement import VIEWS, PairViews, measure_pairs
+from ngo_estimator.loops.place_map import PlaceMap
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.online.localisation import Localiser
-from ngo_estimator.online.place_map import PlaceMap
-from ngo_estimator.online.place_matcher import PlaceMatcher
-from ngo_estimator.optimizer.loop_closure import LoopSearch
-from ngo_estimator.optimizer.pair_measurement import VIEWS, PairViews, measure_pairs
+from ngo_estimator.slam.localisation import Localiser
+from ngo_estimator.slam.place_matcher import PlaceMatcher
 from training.baselines.particle_filter import ParticleFilter, ParticleFilterConfig, RangeMap
 from training.data.worlds import World
 from training.scoring.kidnapped import FRAMES, Features, KnownMap, Row

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import load_optimizer, load_place, load_smoother
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import Loops, LoopSearch
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.baselines import loop_factors
 from training.baselines.graph_settings import REGISTRATIONS, fit_calibration, load_settings
 from training.baselines.loop_factors import LoopFactors, MoreLoops, Seen

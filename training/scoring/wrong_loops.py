@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.optimizer.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.graph.scan_pose_graph import RelativePoses, ScanPoseGraph
 from training.baselines.lidar_peers import GraphPeerConfig
 
 _GROUP = 5

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.core_speed import Watched, core_speed
 from benchmarks.drives import drive_of
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common.records import WEIGHTS
 
 WINDOW, LIVE = 400, 20

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import drives
 from benchmarks.drives import Drive, drive_of, episodes, stamp_ns
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import record_episode
 from training.common.records import WEIGHTS
 from training.data.worlds import world_named

@@ -3,9 +3,9 @@
 import pytest
 
 from benchmarks.long_run import stored_path_mb
-from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
-from tests.unit.ngo_estimator.online.test_online_trajectory import make_steps
-from tests.unit.ngo_estimator.online.test_saved_state import lidar_drive, networks, scans
+from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
+from tests.unit.ngo_estimator.slam.test_online_trajectory import make_steps
+from tests.unit.ngo_estimator.slam.test_saved_state import lidar_drive, networks, scans
 
 
 @pytest.mark.parametrize("core", [networks(), scans()], ids=["networks", "lidar"])

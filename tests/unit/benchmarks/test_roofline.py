@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks.roofline import Peak, Work, counted, measured_peak
-from ngo_estimator.optimizer.block_cholesky import BlockCholesky, BlockStructure
+from ngo_estimator.graph.block_cholesky import BlockCholesky, BlockStructure
 
 
 def test_products_and_elementwise_operations_are_counted() -> None:

@@ -5,13 +5,13 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.data.images import ImageFormat
+from ngo_estimator.loops.loop_closure import Loops, LoopSearch
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig
 from ngo_estimator.networks.odometry_smoothing import SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.loop_closure import Loops, LoopSearch
-from ngo_estimator.optimizer.meta_poses import OptimizedTrajectory
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.meta_poses import OptimizedTrajectory
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 
 WORLDS = ["maze2d", "maze3d"]
 

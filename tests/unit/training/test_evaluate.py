@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from ngo_estimator.ngo.whole_trajectory import optimize_offline
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.scoring.online_estimate import online_poses
 

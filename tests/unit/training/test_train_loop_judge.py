@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ngo_estimator.optimizer.loop_judge import EVIDENCE
+from ngo_estimator.ngo.loop_judge import EVIDENCE
 from training.train_loop_judge import Arguments, Judged, learn
 
 

@@ -13,8 +13,8 @@ import torch
 
 from ngo_estimator.checkpoint import SMOOTHER, load_local, save_checkpoint
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.samples import small_pair_head
 from training.baselines.graph_settings import fit_calibration, load_settings
 from training.baselines.pose_graph import PoseGraphSettings

@@ -18,8 +18,8 @@ from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 
 LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "local_pose_network",

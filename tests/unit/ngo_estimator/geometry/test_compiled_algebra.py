@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import fused_covariance, inverted, propagated, squared_deviations
-from ngo_estimator.optimizer.shortest_ways import shortest_ways
+from ngo_estimator.graph.shortest_ways import shortest_ways
 
 RANDOM = np.random.default_rng(0)
 

@@ -6,7 +6,7 @@ import torch
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import frames_between_nodes
-from ngo_estimator.networks.pose_aggregation import in_block_poses
+from ngo_estimator.ngo.pose_aggregation import in_block_poses
 
 BLOCK = 8
 

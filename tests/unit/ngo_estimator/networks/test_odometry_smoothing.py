@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.networks.pose_aggregation import PoseAggregationConfig, poses_in_blocks
-from ngo_estimator.optimizer.neural_graph_optimizer import NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizerConfig
+from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig, poses_in_blocks
 from tests.unit.ngo_estimator.samples import small_optimizer, trajectory_inputs
 
 STD = (0.1, 0.02, 0.05)

@@ -7,7 +7,7 @@ import pytest
 from ngo_msgs.msg import KeyScan, RelativePose
 
 from ngo_estimator.nodes.messages import relative_pose_message, relative_step
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from tests.unit.ngo_estimator.lidar_steps import lidar_steps
 from tests.unit.ngo_estimator.ray_casting import ROOM, scan_at
 

@@ -7,7 +7,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_estimator.nodes import loop_message
 from ngo_estimator.nodes.loop_message import LoopMarkerWriter, plain_loops
-from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.slam.trajectory_update import Trajectory
 
 
 def trajectory(loops: int, frames: int = 500) -> Trajectory:

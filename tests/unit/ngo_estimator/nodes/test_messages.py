@@ -9,9 +9,9 @@ from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose, Trajectory
 from rclpy.serialization import deserialize_message, serialize_message
 
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate
 from ngo_estimator.nodes import messages
-from ngo_estimator.odometry.local_odometry import LocalEstimate
-from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory as WholeTrajectory
 
 
 def over_the_wire(message: Any) -> Any:

@@ -6,7 +6,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.nodes.step_messages import TYPES, StepMessages
-from ngo_estimator.online.trajectory_update import TrajectoryUpdate
+from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 
 
 @pytest.mark.parametrize("frames", [("base_link", "odom", "map"), ("b", "my_robot/odom", "käfig")])

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig
+from ngo_estimator.frontend.lidar.mounting_yaw import MountingYawConfig
+from ngo_estimator.frontend.lidar.wheel_odometry import WheelOdometryConfig
 from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarOdometryConfig
-from ngo_estimator.odometry.mounting_yaw import MountingYawConfig
-from ngo_estimator.odometry.wheel_odometry import WheelOdometryConfig
 from ngo_estimator.offline.lidar_run import LidarRun
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan
 

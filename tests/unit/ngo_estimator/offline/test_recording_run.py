@@ -8,12 +8,12 @@ import torch
 
 from ngo_estimator.checkpoint import PlaceNetworks
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
-from ngo_estimator.odometry.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.offline.recording_run import RecordingRun
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_recordings.frames import Frame, ScanGeometry
 from tests.unit.ngo_estimator.samples import local_config, observations, place_config, small_optimizer, small_pair_head
 

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry import branch_and_bound, scan_matching, scan_points, scan_registration_kernels
+from ngo_estimator.graph import block_cholesky
+from ngo_estimator.loops import shared_views_kernel
+from ngo_estimator.ngo import compiled_closing
 from ngo_estimator.offline.warm_up_scans import warm_up_scans
 from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.optimizer import block_cholesky, compiled_closing, shared_views_kernel
-from tests.unit.ngo_estimator.online.test_online_trajectory import make_steps
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
+from tests.unit.ngo_estimator.slam.test_online_trajectory import make_steps
 
 WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 
@@ -31,8 +33,8 @@ warm_up_odometry()
 """
 TRAJECTORY = """
 from ngo_estimator.offline.warm_up_scans import warm_up_scans
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from ngo_estimator.online.session import Session
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.session import Session
 warm_up_scans()
 ScanTrajectory.load(WEIGHTS, "scan")
 """
@@ -50,7 +52,7 @@ def test_the_estimators_of_a_lidar_do_without_torch(estimators: str) -> None:
 
 
 def test_the_odometry_of_networks_does_without_the_compiler() -> None:
-    program = "import sys; from ngo_estimator.odometry import local_odometry; assert 'numba' not in sys.modules"
+    program = "import sys; from ngo_estimator.frontend.camera import local_odometry; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 

@@ -11,7 +11,7 @@ from evo.tools import file_interface
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.trajectory.files import ENDINGS, PoseEdges, SpatialPoses, edges_of, read_tum, write_trajectory
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.networks.pose_aggregation import poses_in_blocks
-from ngo_estimator.optimizer.loop_closure import LoopSearch, find_loops
-from ngo_estimator.optimizer.overlaps import find_overlaps
+from ngo_estimator.loops.loop_closure import LoopSearch, find_loops
+from ngo_estimator.loops.overlaps import find_overlaps
+from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_pair_head, with_origin
 from training.baselines.loop_factors import (

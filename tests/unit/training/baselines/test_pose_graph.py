@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.loops.loop_closure import LoopSearch
 from training.baselines.loop_factors import LoopFactors, exact_revisits
 from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.optimizer.loop_closure import LoopSearch
+from ngo_estimator.loops.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
 from tests.unit.training.stores import SHAPES

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.optimizer.loop_closure import LoopSearch
 from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
 from training.baselines.loop_factors import LoopFactors, exact_revisits, found_loops

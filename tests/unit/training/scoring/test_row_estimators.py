@@ -10,9 +10,9 @@ import torch
 
 from ngo_estimator.checkpoint import PLACE, SMOOTHER, PlaceNetworks, load_local, save_checkpoint, write_untrained
 from ngo_estimator.geometry import se2
+from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.optimizer.loop_closure import LoopSearch
-from ngo_estimator.optimizer.whole_trajectory import optimize_offline
+from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from tests.unit.ngo_estimator.rooms import (
     camera_pair_head,
     drive_in_the_room,

@@ -16,10 +16,10 @@ from ngo_estimator.trajectory.files import edges_of, write_trajectory
 from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.joining import Joining
-    from ngo_estimator.online.map_localisation import MapLocalisation
-    from ngo_estimator.online.session import Session
-    from ngo_estimator.online.trajectory_update import Trajectory
+    from ngo_estimator.slam.joining import Joining
+    from ngo_estimator.slam.map_localisation import MapLocalisation
+    from ngo_estimator.slam.session import Session
+    from ngo_estimator.slam.trajectory_update import Trajectory
 
     Loaded = tuple[Session, MapLocalisation | Joining | None]
 

@@ -15,6 +15,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep
+from ngo_estimator.frontend.camera.familiarity_watch import NOT_FITTED
+from ngo_estimator.frontend.camera.frame_pairing import FramePairing, PairedFrame
+from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
+from ngo_estimator.frontend.rejected_frames import RejectedFrame
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.listening import Listening
@@ -22,10 +26,6 @@ from ngo_estimator.nodes.sensors import sensor_array, sensor_topic
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
-from ngo_estimator.odometry.familiarity_watch import NOT_FITTED
-from ngo_estimator.odometry.frame_pairing import FramePairing, PairedFrame
-from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
-from ngo_estimator.odometry.rejected_frames import RejectedFrame
 
 _ACTIONS = (DiscreteAction.FORWARD, DiscreteAction.TURN_LEFT, DiscreteAction.TURN_RIGHT)
 _TWISTS = {"TwistStamped": TwistStamped, "Twist": Twist, "Odometry": Odometry}

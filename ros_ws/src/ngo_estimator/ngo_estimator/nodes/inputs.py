@@ -11,8 +11,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ngo_common.nodes.qos import overridable
 from ngo_common.waiting import waiting_messages
+from ngo_estimator.frontend.source_guard import SourceGuard
 from ngo_estimator.nodes.status import NodeStatus
-from ngo_estimator.odometry.source_guard import SourceGuard
 
 # The graph learns of a publisher before it learns its node's name: nothing is said before that.
 _UNKNOWN = "a node of a name not known yet"

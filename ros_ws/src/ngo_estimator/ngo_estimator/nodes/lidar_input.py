@@ -13,13 +13,13 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
 from ngo_recordings.association import ros_pose

@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from ngo_estimator.nodes.messages import to_time
 
 if TYPE_CHECKING:  # brings torch, which takes seconds: nodes import it after checking their parameters
-    from ngo_estimator.online.trajectory_update import Trajectory
+    from ngo_estimator.slam.trajectory_update import Trajectory
 
 _WIDTH_M = 0.03
 _COLOR = (0.1, 0.5, 0.9)

@@ -27,7 +27,7 @@ from ngo_estimator.geometry.planar_covariance import to_planar, to_spatial
 if TYPE_CHECKING:  # the cores bring torch, which takes seconds: nodes import them after checking their parameters
     from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
     from ngo_estimator.geometry import key_scan
-    from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
+    from ngo_estimator.slam.trajectory_update import Trajectory as WholeTrajectory
 
 _NS = 1_000_000_000
 _LARGEST_UNLIKENESS = 1e6  # of what float32 holds

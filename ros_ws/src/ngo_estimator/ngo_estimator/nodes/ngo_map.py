@@ -27,7 +27,7 @@ from ngo_estimator.nodes.messages import relative_step
 from ngo_estimator.nodes.settings import MapNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import weights_folder
-from ngo_estimator.online.saved_state import read_state, write_state
+from ngo_estimator.slam.saved_state import read_state, write_state
 from ngo_estimator.trajectory.files import seconds
 from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 

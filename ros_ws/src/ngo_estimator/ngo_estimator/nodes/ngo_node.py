@@ -35,11 +35,11 @@ from ngo_estimator.nodes.weights import load_trajectory
 if TYPE_CHECKING:
     from ngo_estimator.data.relative_step import RelativeStep
     from ngo_estimator.nodes.file_services import Loaded
-    from ngo_estimator.online.joining import Joining
-    from ngo_estimator.online.map_localisation import LocalisedStep, MapLocalisation
-    from ngo_estimator.online.session import Session
-    from ngo_estimator.online.tf_smoothing import SmoothedCorrection
-    from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
+    from ngo_estimator.slam.joining import Joining
+    from ngo_estimator.slam.map_localisation import LocalisedStep, MapLocalisation
+    from ngo_estimator.slam.session import Session
+    from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
+    from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 
 NAME = "ngo_node"
 _DEPTH = 100
@@ -84,9 +84,9 @@ class NgoNode(ManagedNode):
     def _configure(self) -> None:
         settings, built = self._settings, self._built
         # Imported here because torch takes seconds: a bad parameter is said at once.
-        from ngo_estimator.online.map_origin import MapOrigin
-        from ngo_estimator.online.session import Session
-        from ngo_estimator.online.tf_smoothing import SmoothedCorrection
+        from ngo_estimator.slam.map_origin import MapOrigin
+        from ngo_estimator.slam.session import Session
+        from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
 
         self._core = load_trajectory(settings, self.get_logger())
         self._origin_of, self._session_of = MapOrigin, Session

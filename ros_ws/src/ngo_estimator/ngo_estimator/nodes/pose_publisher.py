@@ -15,7 +15,7 @@ from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.step_messages import PoseWriter, TransformsWriter
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.tf_smoothing import SmoothedCorrection
+    from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
 
 _DEPTH = 100
 

@@ -6,8 +6,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from ngo_estimator.data.relative_step import RelativeStep
-    from ngo_estimator.online.joining import Joining
-    from ngo_estimator.online.map_localisation import LocalisedStep, MapLocalisation
+    from ngo_estimator.slam.joining import Joining
+    from ngo_estimator.slam.map_localisation import LocalisedStep, MapLocalisation
 
 
 class PoseSearch:

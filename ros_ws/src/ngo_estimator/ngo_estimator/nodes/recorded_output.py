@@ -15,7 +15,7 @@ from ngo_estimator.mapping.scan_source import ScanSource
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.nodes.step_messages import TYPES, StepMessages
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
-from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.errors import aligned, associate
 from ngo_estimator.trajectory.files import SpatialPoses, write_trajectory
 from ngo_estimator.trajectory.plot import save_plot

@@ -40,7 +40,7 @@ from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_topics
 
 if TYPE_CHECKING:
-    from ngo_estimator.odometry.local_odometry import LocalOdometry
+    from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
     from ngo_estimator.offline.lidar_run import LidarRun
     from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
     from ngo_estimator.offline.recording_run import RecordingRun
@@ -236,10 +236,10 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
     # Imported here because torch takes seconds: a file that is not there is said at once.
     import torch
 
-    from ngo_estimator.odometry.local_odometry import LocalOdometry
+    from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
     from ngo_estimator.offline.recording_run import RecordingRun
     from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
-    from ngo_estimator.online.online_trajectory import OnlineTrajectory
+    from ngo_estimator.slam.online_trajectory import OnlineTrajectory
     from ngo_recordings.frames import frames as frames_of
 
     torch.set_num_threads(1)
@@ -258,12 +258,12 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
 
 def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":
     """Registration of a lidar's scans, with the robot's odometry."""
+    from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
     from ngo_estimator.geometry.scan_points import Mounting
-    from ngo_estimator.odometry.lidar_odometry import LidarOdometry
     from ngo_estimator.offline.lidar_run import LidarRun
     from ngo_estimator.offline.recorded import Truth
     from ngo_estimator.offline.warm_up_scans import warm_up_scans
-    from ngo_estimator.online.scan_trajectory import ScanTrajectory
+    from ngo_estimator.slam.scan_trajectory import ScanTrajectory
     from ngo_recordings.frames import frames as frames_of
     from ngo_recordings.lidar_description import describe_lidar
     from ngo_recordings.scan_stream import scan_stream

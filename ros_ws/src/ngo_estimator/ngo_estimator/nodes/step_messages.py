@@ -12,7 +12,7 @@ from ngo_estimator.nodes import messages
 
 if TYPE_CHECKING:  # a node imports the cores after checking its parameters
     from ngo_estimator.data.relative_step import RelativeStep
-    from ngo_estimator.online.trajectory_update import TrajectoryUpdate
+    from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 
 ODOMETRY, POSE, TF = "/odom", "/ngo/pose", "/tf"
 TYPES = {

@@ -18,10 +18,10 @@ from ngo_estimator.nodes.loop_message import LoopMarkerWriter
 from ngo_estimator.nodes.messages import trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.nodes.settings import NgoNodeSettings
-from ngo_estimator.online.publication_pace import PublicationPace
+from ngo_estimator.slam.publication_pace import PublicationPace
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.trajectory_update import Trajectory as WholeTrajectory
+    from ngo_estimator.slam.trajectory_update import Trajectory as WholeTrajectory
 
 _DEPTH = 10
 

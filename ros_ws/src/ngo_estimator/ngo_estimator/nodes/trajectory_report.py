@@ -7,7 +7,7 @@ import numpy as np
 from ngo_estimator.geometry.planar_covariance import position_std
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.trajectory_update import TrajectoryUpdate
+    from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 
 
 class TrajectoryReport:

@@ -13,7 +13,7 @@ from ngo_estimator.nodes.settings import EstimatorSettings, NgoNodeSettings, Ste
 from ngo_estimator.offline.compiling import compiling
 
 if TYPE_CHECKING:
-    from ngo_estimator.online.corrected_trajectory import CorrectedTrajectory
+    from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 
 Core = TypeVar("Core")
 
@@ -49,13 +49,13 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
     def load(folder: Path, world: str) -> "CorrectedTrajectory":
         if is_lidar(folder):
             from ngo_estimator.offline.warm_up_scans import warm_up_scans
-            from ngo_estimator.online.scan_trajectory import ScanTrajectory
+            from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 
             with compiling(logger.info):
                 warm_up_scans()
             return ScanTrajectory.load(folder, world, settings.iterations_per_step)
         from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
-        from ngo_estimator.online.online_trajectory import OnlineTrajectory
+        from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
         online = OnlineTrajectory.load(
             folder, settings.window_frames, world, settings.key_frames, settings.iterations_per_step

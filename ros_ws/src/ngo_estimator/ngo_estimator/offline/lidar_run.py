@@ -5,12 +5,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry
-from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
-from ngo_estimator.online.scan_trajectory import ScanTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.online.trajectory_update import Trajectory, TrajectoryUpdate
+from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.files import SpatialPoses
 from ngo_recordings.frames import Frame
 

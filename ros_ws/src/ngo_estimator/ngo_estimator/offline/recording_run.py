@@ -8,13 +8,13 @@ import numpy as np
 
 from ngo_estimator.data.observations import observation
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, UNFAMILIAR
-from ngo_estimator.odometry.familiarity_watch import NOT_FITTED
-from ngo_estimator.odometry.frame_pairing import FramePairing, PairedFrame
-from ngo_estimator.odometry.local_odometry import AT_ONCE, LocalOdometry
-from ngo_estimator.odometry.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame
+from ngo_estimator.frontend.camera.familiarity_watch import NOT_FITTED
+from ngo_estimator.frontend.camera.frame_pairing import FramePairing, PairedFrame
+from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
+from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
-from ngo_estimator.online.trajectory_update import Trajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.frames import Frame
 

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarStep
 from ngo_estimator.geometry.planar_motion import between, compose
-from ngo_estimator.odometry.lidar_odometry import LidarOdometry, LidarStep
 from ngo_recordings.scan_stream import LidarScan
 
 _STEP_NS = 100_000_000

@@ -6,7 +6,7 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.planar_motion import compose
-from ngo_estimator.online.online_trajectory import OnlineTrajectory
+from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 _STEP_NS = 100_000_000
 _BLOCKS = 12  # of a drive through a ring of so many steps, which closes loops from its second turn on

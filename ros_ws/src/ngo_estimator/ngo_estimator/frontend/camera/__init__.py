@@ -1,0 +1,1 @@
+"""From images and actions to relative poses, by networks."""

@@ -1,0 +1,1 @@
+"""From scans and wheels to relative poses, by registration."""

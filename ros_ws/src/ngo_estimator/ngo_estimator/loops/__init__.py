@@ -1,0 +1,1 @@
+"""Loop closures: candidates, measurements and tests, of places and of scans."""

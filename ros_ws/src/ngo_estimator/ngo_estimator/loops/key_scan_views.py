@@ -1,0 +1,118 @@
+"""What is kept of each key scan to find it again: how far it sees in each direction, and where it looks."""
+
+from collections.abc import Iterable, Sequence, Set
+
+import numpy as np
+
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_indices, taken_integer
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.loops.walls_seen_through import PROFILE_BINS, range_profile
+
+_NEAR_M = 10.0
+"""Points up to there say where a scan looks."""
+
+
+class KeyScanViews:
+    """Range profile of each key scan, and the middle of its points in the robot's frame."""
+
+    def __init__(self) -> None:
+        self._profiles: list[np.ndarray] = []
+        self._middles = GrowingRows((2,), np.float64)
+        self._forgotten: set[int] = set()
+
+    def __len__(self) -> int:
+        return len(self._profiles)
+
+    @property
+    def profiles(self) -> Sequence[np.ndarray]:
+        """Range profile ``(360,)`` of each; zeros where the scan is gone."""
+        return self._profiles
+
+    @property
+    def forgotten(self) -> Set[int]:
+        """The keys whose scans are gone."""
+        return self._forgotten
+
+    def append(self, scan: KeyScan) -> None:
+        """Add the next key scan."""
+        self._profiles.append(_profile(scan))
+        self._middles.append(_middle(scan.points))
+
+    def forget(self, keys: Iterable[int]) -> None:
+        """Drop what is kept of these keys, whose scans are gone."""
+        nothing = np.zeros(PROFILE_BINS, np.float32)
+        for key in keys:
+            self._profiles[key] = nothing
+            self._forgotten.add(key)
+
+    def of_map(self, scans: Sequence[KeyScan]) -> "KeyScanViews":
+        """Those of all key scans of a map, of which these are the first."""
+        other = KeyScanViews()
+        other._profiles = [*self._profiles, *map(_profile, scans[len(self) :])]  # rays of old scans are gone
+        for scan in scans:
+            other._middles.append(_middle(scan.points))
+        other._forgotten = set(self._forgotten)
+        return other
+
+    def at(self, poses: np.ndarray) -> np.ndarray:
+        """Where the robot looks at poses ``(keys, 3)`` of all key scans: their middles ``(keys, 2)``, in the map."""
+        return _placed(self._middles.values, poses)
+
+    def most_alike(self, poses: np.ndarray, points: np.ndarray, pose: np.ndarray) -> int:
+        """The key scan near a pose ``(3,)`` that looks where points ``(n, 2)`` seen from there are.
+
+        A scanner does not see what is behind it. ``poses`` ``(keys, 3)`` are those of all key scans.
+        """
+        known = np.array([k for k in range(len(poses)) if k not in self._forgotten], np.int64)
+        view = _placed(_middle(points)[None], pose[None])
+        away = np.linalg.norm(poses[known, :2] - pose[:2], axis=1)
+        difference = np.linalg.norm(_placed(self._middles.values[known], poses[known]) - view, axis=1)
+        return int(known[(difference + 0.5 * away).argmin()])
+
+    def state(self) -> Arrays:
+        """All that is kept, for ``restore``."""
+        profiles = [profile for key, profile in enumerate(self._profiles) if key not in self._forgotten]
+        return {
+            "keys": np.array(len(self._profiles)),
+            "profiles": np.array(profiles, np.float32).reshape(-1, PROFILE_BINS),
+            "middles": self._middles.values,
+            "forgotten": np.array(sorted(self._forgotten), np.int64),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        count = taken_integer(arrays, "keys")
+        self._middles.restore(arrays, "middles")
+        require(len(self._middles) == count, f"there are not {count} middles of key scans")
+        forgotten = taken_indices(arrays, "forgotten", count)
+        self._forgotten = set(forgotten.tolist())
+        known = np.setdiff1d(np.arange(count), forgotten)
+        profiles = taken(arrays, "profiles", np.float32, len(known), PROFILE_BINS)
+        self._profiles = [np.zeros(PROFILE_BINS, np.float32)] * count
+        for key, profile in zip(known.tolist(), profiles, strict=True):
+            self._profiles[key] = profile
+
+
+def within(points: np.ndarray, range_m: float) -> np.ndarray:
+    """The points ``(n, 2)`` within a range of the origin."""
+    near: np.ndarray = points[(points**2).sum(1) <= range_m**2]
+    return near
+
+
+def _profile(scan: KeyScan) -> np.ndarray:
+    return range_profile(scan).astype(np.float32)  # as scans have them: nothing is lost
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The middle ``(2,)`` of the points around a robot, in its frame."""
+    near = within(points, _NEAR_M)
+    return near.mean(0) if len(near) else np.zeros(2)
+
+
+def _placed(middles: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Middles ``(n, 2)`` seen from poses ``(n, 3)``, in the map."""
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return poses[:, :2] + np.stack(
+        (cosine * middles[:, 0] - sine * middles[:, 1], sine * middles[:, 0] + cosine * middles[:, 1]), axis=1
+    )

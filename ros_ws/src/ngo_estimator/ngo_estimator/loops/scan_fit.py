@@ -1,0 +1,66 @@
+"""Scans searched in a submap by branch and bound (Hess et al. 2016, section V), then registered (Censi 2008).
+
+Not in the paper. A pose is believed where points lie on lines, no wall is seen through, and no other pose fits nearly
+as well. No fit is better than a wrong one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.geometry.branch_and_bound import search
+from ngo_estimator.geometry.scan_matching import icp
+from ngo_estimator.loops.key_scan_views import within
+from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_submaps import Submap
+from ngo_estimator.loops.walls_seen_through import PlacedScans, seen_through
+
+
+@dataclass(frozen=True)
+class ScanFit:
+    """How scans lie in a submap: ``pose`` ``(3,)``, ``covariance`` ``(3, 3)``, and evidence as in ``EVIDENCE``."""
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    response: float
+    second_peak: float
+    on_lines: float
+    through: float
+
+
+def fit(
+    config: ScanLoopConfig, submap: Submap, source: PlacedScans, centre: np.ndarray, window: np.ndarray
+) -> ScanFit | None:
+    """A source searched in a submap; None where a test fails, or where it fits elsewhere as well.
+
+    It is searched at ``centre`` plus and minus ``window``, both ``(3,)`` (m, m, rad).
+    """
+    chosen = search_points(config, source)
+    if submap.grid is None or len(chosen) == 0:
+        return None
+    match = search(config.search, submap.grid, chosen, centre, window)
+    if match is None or match.response < config.least_response:
+        return None
+    second_peak = match.second / match.response
+    if second_peak > config.most_second:
+        return None
+    registered = icp(submap.lines, source.points, source.normals, match.pose)
+    if registered.share < config.least_on_lines:
+        return None
+    through = seen_through(submap.scans, source, registered.pose)
+    if through > config.most_seen_through:
+        return None
+    return ScanFit(registered.pose, registered.covariance, match.response, second_peak, registered.share, through)
+
+
+def search_points(config: ScanLoopConfig, source: PlacedScans) -> np.ndarray:
+    """Some points ``(n, 2)`` of a source, by which it is searched."""
+    return _spread(within(source.points, config.range_m), config.search.resolution_m, config.search_points)
+
+
+def _spread(points: np.ndarray, cell_m: float, most: int) -> np.ndarray:
+    """One point ``(n, 2)`` of each cell, and of these every so many that at most ``most`` remain."""
+    row, column = np.floor(points / cell_m).astype(np.int64).T
+    _, first = np.unique((row << 32) + column, return_index=True)
+    chosen = points[np.sort(first)]
+    return chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)] if len(chosen) > most else chosen

@@ -1,0 +1,92 @@
+"""Which loops the graph of key scans uses: of those that are accepted, the ones it may believe and needs."""
+
+import math
+
+import numpy as np
+
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import Arrays, require, taken
+from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
+from ngo_estimator.graph.scan_pose_graph import RelativePoses
+from ngo_estimator.graph.ways_through_graph import way_covariances
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_loops import ScanLoops
+
+
+class ScanLoopSelection:
+    """Selects by row among all loops that were verified, which a caller gives as ``found``."""
+
+    def __init__(self, config: ScanGraphConfig) -> None:
+        self._config = config
+        self._doubted = np.zeros(0, np.int64)  # accepted loops for which too few speak as yet
+        self._used = GrowingRows((), np.int64)
+
+    def __len__(self) -> int:
+        return len(self._used)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The loops that the graph needs ``(n,)``."""
+        return self._used.values
+
+    def believed(self, fresh: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> np.ndarray:
+        """Those of the newly accepted loops that the graph may use, and of others that have waited.
+
+        A search tells a place from others within its window. A robot that may be farther away may be in another place
+        that looks alike, which was not searched: then more loops must agree. A loop waits for as long as more may.
+        """
+        rows = np.concatenate((self._doubted, fresh))
+        if len(rows) == 0:
+            return rows
+        config, windows = self._config, self._config.windows
+        loops, known = found[rows], found[self.rows]
+        covariance = way_covariances(
+            chain.nodes,
+            np.concatenate((chain.edges, known.pairs)),
+            np.concatenate((chain.step_covariance, known.covariance)),
+            loops.pairs,
+        )
+        metres = windows.deviations * np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+        turn = windows.deviations * np.sqrt(covariance[:, 2, 2])
+        searched = (metres <= windows.most_m) & (turn <= math.radians(windows.most_deg))
+        believed = searched | (loops.agreeing >= config.agreeing_beyond)
+        may_grow = loops.pairs[:, 1] >= len(chain) - 1 - config.loops.neighbour_keys
+        self._doubted = rows[~believed & may_grow]
+        return rows[believed]
+
+    def use(self, rows: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> bool:
+        """Take those of the believed loops into the graph that it needs; returns whether one surprises."""
+        loops, known, config = found[rows], found[self.rows], self._config
+        measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
+        off = (measured.residuals(chain.nodes) ** 2).sum(1)
+        at_walls = np.tile(np.diag((1.0, 1.0, WALLS_M)), (len(rows), 1, 1))
+        moved = (RelativePoses(loops.pairs, loops.relative, at_walls).residuals(chain.nodes) ** 2).sum(1)
+        surprising = (off > config.surprise**2) & (moved > config.surprise_m**2)
+        needed = needed_loops(
+            np.concatenate((chain.edges, known.pairs)),
+            np.concatenate((chain.step_variance, largest_variances(known.covariance))),
+            loops.pairs,
+            largest_variances(loops.covariance),
+            surprising,
+            config.redundant,
+        )
+        for row in rows[needed]:
+            self._used.append(row)
+        return bool(surprising.any())
+
+    def state(self) -> Arrays:
+        """All that later selections depend on, for ``restore``."""
+        return {"used": self._used.values, "doubted": self._doubted}
+
+    def restore(self, arrays: Arrays, found: int) -> None:
+        """Take a ``state()`` where so many loops were verified; raises ``StateError``."""
+        self._used.restore({"used": taken_rows(arrays, "used", found)}, "used")
+        self._doubted = taken_rows(arrays, "doubted", found)
+
+
+def taken_rows(arrays: Arrays, name: str, found: int) -> np.ndarray:
+    """The rows ``name`` ``(n,)`` among so many loops; raises ``StateError``."""
+    rows = taken(arrays, name, np.int64, -1)
+    require(bool(((rows >= 0) & (rows < found)).all()), f"'{name}' names loops that are not among the {found}")
+    return rows

@@ -1,0 +1,106 @@
+"""Key scans laid together in the frame of one of them: submaps of the map, and the newest scans.
+
+Not in the paper.
+"""
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.data.state_arrays import Arrays, flat, part, require, split, taken, under
+from ngo_estimator.geometry.branch_and_bound import PooledGrid, pooled_grid
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.line_map import LineMap, line_map_of_points
+from ngo_estimator.loops.key_scan_views import within
+from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.walls_seen_through import PROFILE_BINS, PlacedScans, placed
+
+SUBMAP_VARIANCE = np.diag((0.01**2, 0.01**2, math.radians(0.15) ** 2))
+"""Of the submap's own keys against each other, which registration in it can't see."""
+
+_PLACED_ROWS = {"points": (2,), "normals": (2,), "sensors": (3,), "profiles": (PROFILE_BINS,)}
+"""Shape of a row in each array of ``PlacedScans``, all float64."""
+
+
+@dataclass(frozen=True)
+class Submap:
+    """Scans around a key, in its frame: ``poses`` of the keys from ``first`` on, as they were when it was made. Without
+    any point there is no grid."""
+
+    first: int
+    poses: np.ndarray
+    scans: PlacedScans
+    lines: LineMap
+    grid: PooledGrid | None
+
+
+class ScanSubmaps:
+    """The submaps that were asked for last, each around a key."""
+
+    def __init__(self, config: ScanLoopConfig) -> None:
+        self._config = config
+        self._submaps: OrderedDict[int, Submap] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._submaps)
+
+    def around(self, place: int, scans: Sequence[KeyScan], profiles: Sequence[np.ndarray], poses: np.ndarray) -> Submap:
+        """The submap around a key, made of all key scans, their range profiles and their poses ``(keys, 3)``."""
+        if place in self._submaps:
+            self._submaps.move_to_end(place)
+            return self._submaps[place]
+        half = self._config.submap_keys // 2
+        first, after = max(0, place - half), min(len(scans), place - half + self._config.submap_keys)
+        local = _between(poses[place], poses[first:after])
+        submap = self._made(first, local, placed(scans[first:after], profiles[first:after], local))
+        self._submaps[place] = submap
+        if len(self._submaps) > self._config.most_submaps:
+            self._submaps.popitem(last=False)
+        return submap
+
+    def _made(self, first: int, local: np.ndarray, together: PlacedScans) -> Submap:
+        lines = line_map_of_points(together.points, together.normals)
+        near = within(together.points, self._config.range_m)
+        grid = pooled_grid(self._config.search, near) if len(near) else None
+        return Submap(first, local, together, lines, grid)
+
+    def state(self) -> Arrays:
+        """All submaps, for ``restore``: their scans lie where the poses had them, and may be gone since."""
+        submaps = list(self._submaps.values())
+        places = [(place, submap.first) for place, submap in self._submaps.items()]
+        arrays: Arrays = {
+            "places": np.array(places, np.int64).reshape(-1, 2),
+            **under("submaps.poses", flat([submap.poses for submap in submaps], np.zeros((0, 3)))),
+        }
+        for name, shape in _PLACED_ROWS.items():
+            rows = [getattr(submap.scans, name) for submap in submaps]
+            arrays |= under(f"submaps.{name}", flat(rows, np.zeros((0, *shape))))
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        places = taken(arrays, "places", np.int64, -1, 2)
+        poses = split(part(arrays, "submaps.poses"), np.float64, 3)
+        columns = [split(part(arrays, f"submaps.{name}"), np.float64, *shape) for name, shape in _PLACED_ROWS.items()]
+        require({len(parts) for parts in (poses, *columns)} == {len(places)}, f"there are not {len(places)} submaps")
+        self._submaps = OrderedDict(
+            (place, self._made(first, local, PlacedScans(*scans)))
+            for (place, first), local, *scans in zip(places.tolist(), poses, *columns, strict=True)
+        )
+
+
+def laid_together(scans: Sequence[KeyScan], profiles: Sequence[np.ndarray], poses: np.ndarray) -> PlacedScans:
+    """Scans at poses ``(scans, 3)``, in the frame of the last."""
+    return placed(scans, profiles, _between(poses[-1], poses))
+
+
+def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Poses ``(n, 3)`` seen from one pose ``(3,)``."""
+    a = np.broadcast_to(a, b.shape)
+    cosine, sine = np.cos(a[:, 2]), np.sin(a[:, 2])
+    x, y = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+    turn = (b[:, 2] - a[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
+    return np.stack((cosine * x + sine * y, cosine * y - sine * x, turn), axis=-1)

@@ -1,0 +1,176 @@
+"""The meta-poses that the optimizer takes, changes in each iteration, and returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ngo_estimator.geometry import se2
+from ngo_estimator.graph.gauss_newton import chain_factors, node_covariance, pair_factors, step_information
+from ngo_estimator.loops.loop_closure import Loops
+
+if TYPE_CHECKING:
+    from ngo_estimator.graph.block_cholesky import Array
+    from ngo_estimator.graph.normal_equations import FactorisedInformation
+
+
+@dataclass(frozen=True)
+class MetaSteps:
+    """Relative meta-poses of the local odometry, smoothed if the optimizer has a smoother.
+
+    ``relative`` ``(batch, poses, 3)`` (m, m, rad) and ``std``, their standard deviations along the axes of the pose
+    before. The last ``blocks`` of them are blocks of steps, with ``features`` ``(batch, blocks, width)`` if the
+    optimizer has a network. The poses in front of these are key frames: each leads to the next one, over any number of
+    steps. ``in_blocks`` ``(batch, blocks, block, 3)`` are the poses within blocks; overlaps need them.
+    ``fixed`` ``(batch, blocks)``: blocks that networks leave as they are.
+    """
+
+    relative: Tensor
+    std: Tensor
+    features: Tensor | None
+    blocks: int
+    in_blocks: Tensor | None = None
+    fixed: Tensor | None = None
+
+    @property
+    def key_frames(self) -> int:
+        """Relative meta-poses in front of the blocks."""
+        return self.relative.shape[1] - self.blocks
+
+
+@dataclass(frozen=True)
+class GraphState:
+    """The meta-poses between two iterations.
+
+    ``adjusted`` ``(batch, poses, 3)`` are the relative poses of the odometry with all adjustments so far, the paper's
+    Delta P. ``deviation`` ``(batch, poses, 3)`` is what closing loops has added to them. ``step_std`` ``(batch, poses,
+    3)`` are the deviations with which the odometry is believed, ``features`` ``(batch, blocks, width)`` the paper's F
+    (width 0 without a network).
+    """
+
+    adjusted: Tensor
+    deviation: Tensor
+    step_std: Tensor
+    features: Tensor
+
+    @classmethod
+    def initial(cls, steps: MetaSteps) -> GraphState:
+        """The state before the first iteration."""
+        batch, poses, _ = steps.relative.shape
+        features = steps.relative.new_zeros(batch, poses, 0) if steps.features is None else steps.features
+        return cls(steps.relative, torch.zeros_like(steps.relative), steps.std, features)
+
+    @property
+    def relative(self) -> Tensor:
+        """Corrected relative poses ``(batch, poses, 3)``."""
+        return self.adjusted + self.deviation
+
+    @cached_property
+    def poses(self) -> Tensor:
+        """Corrected global poses with the origin in front ``(batch, poses + 1, 3)``: the paper's P = r2g(Delta P)."""
+        return with_origin(se2.r2g(self.relative))
+
+
+@dataclass(frozen=True)
+class ClosedLoops:
+    """The loops of an iteration, and the belief in them.
+
+    ``weights`` ``(batch, loops)`` from zero to one, ``information`` ``(batch, loops, 3)`` (1/m^2, 1/m^2, 1/rad^2) along
+    the axes of the map. ``equations`` are those of the Gauss-Newton step; None if a gradient was asked for.
+    """
+
+    loops: Loops
+    weights: Tensor
+    information: Tensor
+    equations: FactorisedInformation | None
+
+
+class Solution(NamedTuple):
+    """Where an earlier optimisation of one trajectory ended.
+
+    ``relative`` ``(1, poses, 3)``, float64. ``weights`` ``(loops,)`` and ``information`` ``(loops, 3)`` of the loops
+    that the optimizer is given now, both negative for those that it was not given then.
+    """
+
+    relative: Tensor
+    weights: Array
+    information: Array
+
+    @property
+    def known(self) -> Array:
+        """Which loops it was given then ``(loops,)``."""
+        known: Array = self.information[:, 0] >= 0.0
+        return known
+
+
+class Correction(NamedTuple):
+    """What the network gives in one iteration: adjustments ``(batch, blocks, 3)``, and the stiffness of this shape."""
+
+    adjustment: Tensor
+    stiffness: Tensor
+
+
+@dataclass(frozen=True)
+class OptimizedMetaPoses:
+    """The optimizer's result for a batch of meta-steps.
+
+    ``meta_relative``: one ``(batch, poses, 3)`` for each iteration, first to last. ``step_std`` ``(batch, poses, 3)``:
+    the deviations with which the odometry is believed. ``closed``: the loops of the last iteration, None before it and
+    for an optimizer without loops. ``corrections``: what the network gave in each iteration. ``left``: iterations to
+    come.
+    """
+
+    meta_relative: list[Tensor]
+    step_std: Tensor
+    closed: ClosedLoops | None
+    corrections: list[Correction] = field(default_factory=list)
+    left: int = 0
+
+    @property
+    def loops(self) -> Loops | None:
+        """The loops, those found under corrected poses included."""
+        return None if self.closed is None else self.closed.loops
+
+    @property
+    def loop_weights(self) -> Tensor | None:
+        """Belief in each loop ``(batch, loops)``, zero to one."""
+        return None if self.closed is None else self.closed.weights
+
+    @property
+    def loop_information(self) -> Tensor | None:
+        """Information of each loop ``(batch, loops, 3)``, along the axes of the map."""
+        return None if self.closed is None else self.closed.information
+
+    @property
+    def equations(self) -> FactorisedInformation | None:
+        """The normal equations of the last Gauss-Newton step, where no gradient was asked for."""
+        return None if self.closed is None else self.closed.equations
+
+    def end_covariance(self) -> Tensor:
+        """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
+        if self.equations is not None:
+            # They are linearised before the last step. That step was small, and all else is the same.
+            return torch.from_numpy(self.equations.covariance([self.step_std.shape[1]])).unsqueeze(0)
+        poses = with_origin(se2.r2g(self.meta_relative[-1].double()))
+        information = step_information(self.step_std.double())
+        factors = [chain_factors(poses, torch.zeros_like(poses[:, 1:]), information)]
+        if self.closed is not None:
+            residual = torch.zeros_like(self.closed.information)
+            factors.append(pair_factors(self.closed.loops.nodes, poses, residual, self.closed.information))
+        return node_covariance(factors, poses.shape[1], poses.shape[1] - 1)
+
+
+@dataclass(frozen=True)
+class OptimizedTrajectory(OptimizedMetaPoses):
+    """The same with ``poses`` ``(batch, steps, 3)``: corrected global poses of all frames after the origin."""
+
+    poses: Tensor = field(kw_only=True)
+
+
+def with_origin(poses: Tensor) -> Tensor:
+    """Global poses ``(batch, poses + 1, 3)`` with the origin in front."""
+    return torch.cat((torch.zeros_like(poses[:, :1]), poses), dim=1)

@@ -1,0 +1,345 @@
+"""The Neural Graph Optimizer (paper, section "Neural Graph Optimization"), with and without loop closures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ngo_estimator.loops.loop_closure import Loops, LoopSearch, find_loops
+from ngo_estimator.loops.overlaps import find_overlaps
+from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.ngo.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
+from ngo_estimator.ngo.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
+from ngo_estimator.ngo.loop_gates import RobustLoopGate
+from ngo_estimator.ngo.loop_judge import LoopJudge
+from ngo_estimator.ngo.meta_poses import (
+    Correction,
+    GraphState,
+    MetaSteps,
+    OptimizedMetaPoses,
+    OptimizedTrajectory,
+    Solution,
+)
+from ngo_estimator.ngo.odometry_consistency import without_contradictions
+from ngo_estimator.ngo.pose_aggregation import (
+    PoseAggregationConfig,
+    block_variances,
+    frame_poses,
+    poses_in_blocks,
+)
+from ngo_estimator.ngo.registered_odometry import registered_steps
+
+_Channels = Callable[[GraphState], Tensor]
+
+_ODOMETRY_NOISE = (2.0, 2.0, 1.0)
+"""Before anything is learned: errors of a relative meta-pose in units of the deviations that its steps add up to."""
+
+
+@dataclass(frozen=True)
+class NeuralGraphOptimizerConfig:
+    """Configuration of the optimizer; ``paper_form`` gives the paper's.
+
+    The optimizer runs ``iterations`` iterations of attend and optimise, which share their weights. ``attention`` is
+    ``softmax``, or ``sum`` for the paper's C / sum(C). ``dilations`` holds one number for each convolution. With
+    ``residual`` each convolution is added to its input and normalised over its channels.
+    With ``loops`` the convolutions see the residuals of the loop candidates under the current poses, and each iteration
+    ends with a Gauss-Newton step that reduces these. ``search`` says how candidates are found.
+    Without ``network`` there are only Gauss-Newton steps, and one learned factor for the deviations of the odometry.
+    A ``smoother`` smooths the odometry before meta-poses are made of it.
+    ``correction_std`` (m, m, rad) is the unit of the adjustments: the typical error of a relative meta-pose.
+    ``covariance_scale`` multiplies the covariance of a pose. It is fitted to the errors on validation data.
+    """
+
+    aggregation: PoseAggregationConfig
+    iterations: int = 5
+    attention: str = "softmax"
+    dilations: tuple[int, ...] = (1, 1, 2, 4, 8, 4, 2, 1, 1)
+    residual: bool = True
+    loops: bool = True
+    network: bool = True
+    smoother: SmootherConfig | None = None
+    search: LoopSearch = field(default_factory=LoopSearch)
+    correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
+    covariance_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.attention not in ("softmax", "sum"):
+            raise ValueError(f"attention is {self.attention!r}; expected 'softmax' or 'sum'")
+        if self.iterations < 1 or not self.dilations or min(self.dilations) < 1:
+            raise ValueError(
+                f"iterations, dilations are {self.iterations}, {self.dilations}; expected at least 1, and a positive "
+                "number for each convolution"
+            )
+        if not (self.loops or self.network):
+            raise ValueError(f"loops, network are {self.loops}, {self.network}; expected at least one of them")
+        if self.smoother is not None and self.smoother.motion_feature_size != self.aggregation.motion_feature_size:
+            raise ValueError(
+                f"the smoother takes {self.smoother.motion_feature_size} motion features; expected "
+                f"{self.aggregation.motion_feature_size}, as the aggregation"
+            )
+        if min(self.correction_std) <= 0.0:
+            raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
+        if not 0.0 < self.covariance_scale < math.inf:
+            raise ValueError(f"covariance_scale is {self.covariance_scale}; expected a positive number")
+
+    @property
+    def context(self) -> int:
+        """Blocks before and after a block on which its relative meta-pose and feature depend."""
+        reach = 0 if self.smoother is None else self.smoother.reach
+        reach += self.aggregation.reach if self.network else 0
+        return math.ceil(reach / self.aggregation.block)
+
+    @property
+    def registrations(self) -> int:
+        """Iterations of a scan registration; 0 if ranges are not registered."""
+        return self.search.registrations if self.loops else 0
+
+    @classmethod
+    def paper_form(cls, aggregation: PoseAggregationConfig, **changes: object) -> NeuralGraphOptimizerConfig:
+        """Nine plain convolutions of kernel 3 over features and attention; no place codes and no loops."""
+        form: dict[str, object] = {
+            "attention": "sum",
+            "dilations": (1,) * 9,
+            "residual": False,
+            "loops": False,
+        }
+        return cls(aggregation=aggregation, **{**form, **changes})  # type: ignore[arg-type]
+
+
+class NeuralGraphOptimizer(AttentionNetwork):
+    """Redistributes the error of a trajectory by iterated attention and temporal convolution.
+
+    Each iteration attends over all meta-poses, passes features and attention through the convolutions, adds gated
+    adjustments to the relative meta-poses, and closes loops. A freshly initialised optimizer without loops returns its
+    input exactly; with loops it is a robust pose graph.
+    """
+
+    def __init__(self, config: NeuralGraphOptimizerConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("correction_std", torch.tensor(config.correction_std), persistent=False)
+        self.correction_std: Tensor
+        if config.smoother is not None:
+            self.smoother = OdometrySmoother(config.smoother)
+        if config.network:
+            channels = CHANNELS if config.loops else 0
+            self.build(
+                AttentionConfig(config.aggregation, config.attention, config.dilations, config.residual, channels)
+            )
+        if config.loops:
+            self.register_buffer("odometry_noise", torch.tensor(_ODOMETRY_NOISE), persistent=False)
+            self.odometry_noise: Tensor
+            self.loop_gate = RobustLoopGate()
+            if config.search.least_belief:
+                self.loop_judge = LoopJudge()
+            if not config.network:
+                self.log_scale = nn.Parameter(torch.zeros(3))
+
+    def with_smoother(self, smoother: OdometrySmoother | None) -> NeuralGraphOptimizer:
+        """The same optimizer with a copy of another smoother, or with none."""
+        config = replace(self.config, smoother=None if smoother is None else smoother.config)
+        values = {name: value for name, value in self.state_dict().items() if not name.startswith("smoother.")}
+        if smoother is not None:
+            values |= {f"smoother.{name}": value for name, value in smoother.state_dict().items()}
+        changed = NeuralGraphOptimizer(config)
+        changed.load_state_dict(values)
+        return changed
+
+    def with_registrations(self, registrations: int) -> NeuralGraphOptimizer:
+        """The same optimizer with another number of registration iterations; with 0 it looks for no overlaps."""
+        overlaps = self.config.search.overlaps if registrations else 0
+        search = replace(self.config.search, registrations=registrations, overlaps=overlaps)
+        changed = NeuralGraphOptimizer(replace(self.config, search=search))
+        changed.load_state_dict(self.state_dict())
+        return changed
+
+    @property
+    def block(self) -> int:
+        """Steps in a meta-pose."""
+        return self.config.aggregation.block
+
+    def registered(
+        self,
+        relative: Tensor,
+        log_std: Tensor,
+        place_codes: Tensor,
+        pair_head: PairHead,
+        origin_code: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The odometry as this optimizer takes it: measured again by ``registered_steps``, if it registers steps.
+
+        Args and shapes as of ``registered_steps``.
+        """
+        registrations = self.config.registrations
+        return registered_steps(pair_head, relative, log_std, place_codes, self.block, registrations, origin_code)
+
+    def find_loops(self, relative: Tensor, place_codes: Tensor, pair_head: PairHead) -> Loops:
+        """Loop candidates of trajectories; ``place_codes`` ``(batch, steps, code_length)`` are of each step's end."""
+        return find_loops(pair_head, place_codes, poses_in_blocks(relative, self.block), self.config.search)
+
+    def aggregate(self, relative: Tensor, log_std: Tensor, motion_features: Tensor) -> MetaSteps:
+        """Meta-steps of trajectories; arguments as of ``forward``."""
+        if self.config.smoother is not None:
+            relative, log_std = self.smoother(relative, log_std, motion_features)
+        in_blocks = poses_in_blocks(relative, self.block)
+        features = self.aggregation(relative, log_std, motion_features) if self.config.network else None
+        std = block_variances(in_blocks, log_std).sqrt()
+        return MetaSteps(in_blocks[..., -1, :], std, features, in_blocks.shape[1], in_blocks)
+
+    def forward(
+        self, relative: Tensor, log_std: Tensor, motion_features: Tensor, loops: Loops | None = None
+    ) -> OptimizedTrajectory:
+        """Optimise trajectories whose number of steps is a multiple of the block.
+
+        Args:
+            relative: relative poses ``(batch, steps, 3)`` (m, m, rad); log_std: logarithm of their deviations.
+            motion_features: ``(batch, steps, motion_feature_size)``.
+            loops: the result of ``find_loops``, for an optimizer with loops.
+        """
+        result = self.optimize(self.aggregate(relative, log_std, motion_features), loops)
+        poses = frame_poses(poses_in_blocks(relative, self.block), result.meta_relative[-1])
+        return OptimizedTrajectory(**vars(result), poses=poses)
+
+    def optimize(self, steps: MetaSteps, loops: Loops | None = None) -> OptimizedMetaPoses:
+        """Optimise meta-poses; the indices of ``loops`` count all ``steps``."""
+        *_, last = self.iterate(steps, loops)
+        return last
+
+    def iterate(
+        self,
+        steps: MetaSteps,
+        loops: Loops | None = None,
+        corrections: Sequence[Correction] | None = None,
+        solution: Solution | None = None,
+    ) -> Iterator[OptimizedMetaPoses]:
+        """Run the M iterations one by one, and yield the result after each; only the last one has its loops.
+
+        Args:
+            corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
+                running it.
+            solution: of an optimisation that took these corrections, to go on from. There is one result then, for a
+                single trajectory on the CPU without gradients. The belief in loops stays; only new ones are judged.
+
+        Raises:
+            ValueError: loops for an optimizer without loops, or none for one with loops.
+        """
+        if self.config.loops != (loops is not None):
+            given = "none were given" if loops is None else "loops were given"
+            raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
+        if loops is None:
+            return self._annealed(steps, NoLoopClosing(), self._phases(steps, loops, corrections))
+        if corrections is not None and solution is not None:
+            return self._resumed(steps, loops, corrections, solution)
+        return self._annealed(steps, self._loop_closing(steps, loops), self._phases(steps, loops, corrections))
+
+    def _annealed(
+        self,
+        steps: MetaSteps,
+        closing: LoopClosing | NoLoopClosing,
+        phases: AttentionPhases | _NoNetwork | _Remembered,
+    ) -> Iterator[OptimizedMetaPoses]:
+        """The results that begin at the odometry: all loops are judged, allowing for less of its drift each time."""
+        state, results = GraphState.initial(steps), []
+        made: list[Correction] = []
+        for iteration in range(self.config.iterations):
+            closing.look(state, iteration)
+            before = state.adjusted
+            state, stiffness = phases.optimise(state, closing.channels)
+            if steps.fixed is not None:
+                adjusted, stiffness = _without_fixed(before, state.adjusted, stiffness, steps.fixed)
+                state = replace(state, adjusted=adjusted)
+            if self.config.network:
+                made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
+            state = closing.close(state, stiffness)
+            results.append(state.relative.to(steps.relative.dtype))
+            left = self.config.iterations - 1 - iteration
+            yield OptimizedMetaPoses(list(results), state.step_std, None if left else closing.closed, made, left)
+
+    def _resumed(
+        self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
+    ) -> Iterator[OptimizedMetaPoses]:
+        from ngo_estimator.ngo import compiled_closing  # see _loop_closing
+
+        adjusted, stiffness = steps.relative.clone(), corrections[-1].stiffness
+        adjusted[:, steps.key_frames :] += sum(adjustment for adjustment, _ in corrections)
+        if steps.fixed is not None:
+            adjusted, stiffness = _without_fixed(steps.relative, adjusted, stiffness, steps.fixed)
+        # Where others must agree with a new loop, all of them are looked at.
+        which = None if self.config.search.least_belief else np.flatnonzero(~solution.known)
+        believed = self._judged(compiled_closing.without_contradictions(loops, steps, which), steps)
+        last = self.config.iterations - 1
+        return compiled_closing.resumed(
+            self.loop_gate, steps, believed, adjusted, stiffness, self.odometry_noise, solution, last
+        )
+
+    def _phases(
+        self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
+    ) -> AttentionPhases | _NoNetwork | _Remembered:
+        if not self.config.network:
+            return _NoNetwork(self)
+        if corrections is not None:
+            return _Remembered(corrections)
+        similarity = None if loops is None else loops.embeddings @ loops.embeddings.mT
+        return self.phases(steps.blocks, similarity, self.correction_std)
+
+    def overlaps(self, steps: MetaSteps, loops: Loops, poses: Tensor) -> Loops | None:
+        """Further loops under corrected poses ``(batch, poses + 1, 3)``; None if they are not to be looked for."""
+        search = self.config.search
+        if search.overlaps == 0 or loops.scans is None or steps.in_blocks is None:
+            return None
+        found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
+        return without_contradictions(found, steps)
+
+    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
+        find_overlaps = partial(self.overlaps, steps, loops)
+        closing, test = LoopClosing, without_contradictions
+        if not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu":
+            # The compiler's library takes 100 MB: only those pay for it that optimise.
+            from ngo_estimator.ngo import compiled_closing
+
+            closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
+        believed = self._judged(test(loops, steps), steps)
+        return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+
+    def _judged(self, loops: Loops, steps: MetaSteps) -> Loops:
+        least = self.config.search.least_belief
+        return self.loop_judge.judged(loops, steps, least) if least else loops
+
+
+def _without_fixed(before: Tensor, after: Tensor, stiffness: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
+    """Relative poses and stiffness after the phases, without adjustments of the blocks that are ``fixed``."""
+    which = fixed.unsqueeze(-1)
+    whole = nn.functional.pad(which, (0, 0, before.shape[1] - fixed.shape[1], 0))
+    return torch.where(whole, before, after), torch.where(which, torch.zeros_like(stiffness), stiffness)
+
+
+class _NoNetwork:
+    """Stands for both phases in an optimizer without a network: the same stiffness for all meta-poses."""
+
+    def __init__(self, optimizer: NeuralGraphOptimizer) -> None:
+        self._stiffness = optimizer.log_scale
+
+    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
+        """The state as it is, and the stiffness ``(3,)``."""
+        return state, self._stiffness
+
+
+class _Remembered:
+    """Stands for both phases where the network is not run: what it gave in another optimisation."""
+
+    def __init__(self, corrections: Sequence[Correction]) -> None:
+        self._corrections = iter(corrections)
+
+    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
+        """The state with the adjustments of the next iteration, and its stiffness."""
+        adjustment, stiffness = next(self._corrections)
+        adjusted = state.adjusted.clone()
+        adjusted[:, -adjustment.shape[1] :] += adjustment
+        return replace(state, adjusted=adjusted), stiffness

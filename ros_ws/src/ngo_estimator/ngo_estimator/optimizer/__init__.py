@@ -1,1 +1,0 @@
-"""The Neural Graph Optimizer: loops, gates, Gauss-Newton."""

@@ -1,0 +1,332 @@
+"""The state of a trajectory that is corrected online: one log of steps, one graph that owns poses and covariance."""
+
+import copy
+from abc import ABC, abstractmethod
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
+from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.slam.bridge import bridged
+from ngo_estimator.slam.map_localisation import MapLocalisation
+from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.step_log import StepLog, TakenStep
+from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
+
+AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
+
+
+class PoseGraph(Protocol):
+    """The owner of all poses in ``map``, of the newest covariance, and of the loops."""
+
+    loop_weights: np.ndarray
+    took_s: float
+    optimized: bool
+    """Whether an optimisation ended since the newest frame came."""
+    fault: str
+    """What failed since the newest frame came, in words; empty where nothing did."""
+
+    @property
+    def running(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether there is anything left to optimise."""
+
+    @property
+    def window_fill(self) -> float:
+        """Share of the window that is in use."""
+
+    @property
+    def largest_move_m(self) -> float:
+        """How far the last optimisation moved a node at most."""
+
+    @property
+    def loop_frames(self) -> np.ndarray:
+        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
+
+    @property
+    def loop_relative(self) -> np.ndarray:
+        """Their measurements ``(loops, 3)``."""
+
+    @property
+    def loop_std(self) -> np.ndarray:
+        """Deviations ``(loops, 3)`` of these."""
+
+    def begin(self) -> None:
+        """Begin to optimise."""
+
+    def advance(self, iterations: int) -> bool:
+        """Do so many parts of the update; returns whether it is done."""
+
+    def finish(self) -> bool:
+        """Optimise what is left; returns whether there was anything."""
+
+    def abandon(self) -> None:
+        """Leave undone what has begun."""
+
+    def fail(self, error: Exception) -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
+
+    def frame_poses(self, before: bool = False) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
+
+    def state(self) -> Arrays:
+        """All that later steps depend on."""
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
+
+
+class CorrectedTrajectory(ABC):
+    """Takes steps into a log and a graph, and tells what each changed.
+
+    An update takes several parts, most of them iterations of an optimisation. ``iterations_per_step`` of them are done
+    at the step that begins it and at each one after it, so that no step takes much longer than the others.
+    """
+
+    _graph: PoseGraph
+
+    def __init__(self, iterations_per_step: int) -> None:
+        self._iterations_per_step = iterations_per_step
+        self._log = StepLog()
+        self.reset()
+
+    @abstractmethod
+    def localisation(self, origin: MapOrigin) -> MapLocalisation:
+        """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says; raises ``ValueError``."""
+
+    @abstractmethod
+    def _new_graph(self) -> PoseGraph:
+        """A graph without any frame."""
+
+    @abstractmethod
+    def _checked(self, step: RelativeStep) -> RelativeStep:
+        """The step as it is taken; raises ``RejectedStep`` for one that cannot be used."""
+
+    @abstractmethod
+    def _begin_at(self, step: RelativeStep) -> None:
+        """Give the graph what is known of the first frame."""
+
+    @abstractmethod
+    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
+        """Give the graph a step; returns whether it is time to optimise."""
+
+    @property
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """What must be the same where a ``state()`` is restored: networks and settings, as JSON has them."""
+
+    def state(self) -> Arrays:
+        """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step."""
+        require(self._log.steps > 0, "the trajectory is empty")
+        own = {"online": self._online.values, "optimized": np.array(self._optimized), "odom": self._odom}
+        arrays = own | under("log", self._log.state()) | under("graph", self._graph.state())
+        return {name: np.array(array, order="C") for name, array in arrays.items()}
+
+    def restored(self: AnyTrajectory, arrays: Arrays) -> AnyTrajectory:
+        """Another trajectory with these networks and settings, in a ``state()``; this one stays as it is.
+
+        It goes on as the one that was saved would have, to the last bit.
+
+        Raises:
+            StateError: the arrays do not fit these settings, or each other.
+        """
+        other = copy.copy(self)
+        other._log = StepLog()
+        other._begin()
+        try:
+            other._restore(arrays)
+        except StateError:
+            raise
+        except Exception as error:  # of arrays that no ``state()`` gave
+            raise StateError(f"the arrays do not belong together ({type(error).__name__}: {error})") from error
+        return other
+
+    def _restore(self, arrays: Arrays) -> None:
+        self._log.restore(part(arrays, "log"))
+        self._graph.restore(part(arrays, "graph"))
+        self._loaded = True
+        self._online.restore(arrays, "online")
+        self._optimized = bool(taken(arrays, "optimized", np.bool_))
+        self._odom = taken(arrays, "odom", np.float64, 3)
+        whole = self.trajectory()
+        require(whole is not None, "the trajectory is empty")
+        assert whole is not None
+        lengths = {len(whole.stamps_ns), len(whole.poses_xyyaw), len(whole.online_xyyaw)}
+        require(len(lengths) == 1, f"there are {sorted(lengths)} poses of the same frames")
+        newest = self.newest()
+        require(
+            all(bool(np.isfinite(of).all()) for of in (whole.poses_xyyaw, newest.pose_xyyaw, newest.covariance)),
+            "poses are not finite",
+        )
+
+    def newest(self) -> TrajectoryUpdate:
+        """What the newest step gave, as it is now; raises ``RuntimeError`` before the first step."""
+        if self._log.steps == 0:
+            raise RuntimeError("the trajectory is empty; expected a step before")
+        return self._result(restarted=False, gap=False)
+
+    def reset(self) -> None:
+        """Forget everything: the next step begins a new trajectory."""
+        self._log.reset()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._loaded = False  # and no step taken since
+        self._online = GrowingRows((3,), np.float64)
+        self._graph = self._new_graph()
+        self._optimized = False
+        self._odom = np.zeros(3)  # of the newest frame, on TF
+
+    @property
+    def fault(self) -> str:
+        """What failed in the last step, or in ``finish``, in words; empty where nothing did."""
+        return self._graph.fault
+
+    def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
+        """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
+
+        Without ``optimize`` the newest frame follows the one before it by odometry alone. The next optimisation takes
+        all of them in.
+
+        Raises:
+            RejectedStep: values that are not finite, too large or of the wrong shape, a stamp that came already, or one
+                that is a little late; after loading, the first step of another odometry. The trajectory is as it was
+                before.
+        """
+        step = self._checked(step)
+        if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
+            raise RejectedStep(
+                f"step to {step.stamp_ns} ns is of an odometry that began at {step.origin_stamp_ns} ns, or older than "
+                "the loaded trajectory; expected the odometry of that one to go on, or a reset"
+            )
+        taken = self._log.take(step)
+        if taken.restarted:
+            self._begin()
+        return self._take(step, taken, optimize)
+
+    def join(self, step: RelativeStep, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
+        """Go on with another odometry, from the frame that ``step`` ends at.
+
+        Nobody knows the motion since the newest frame. A step to the pose that was found stands for it, and loops
+        refine it later.
+
+        Args:
+            pose_xyyaw: ``(3,)`` of the frame as this trajectory has it, before it is laid into ``map``; covariance:
+                ``(3, 3)`` of it.
+
+        Raises:
+            RejectedStep: as of ``update``; the stamp is not later than the newest one, or ``may_join`` is false.
+        """
+        step = self._checked(step)
+        if not self.may_join(step):
+            raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
+        relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
+        return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
+
+    def begins_anew(self, step: RelativeStep) -> bool:
+        """Whether a step is of another odometry, so that ``update`` would forget this trajectory."""
+        return self._log.is_restart(step)
+
+    def may_join(self, step: RelativeStep) -> bool:
+        """Whether the trajectory can go on with another odometry from this step's frame."""
+        return self._log.steps > 0
+
+    def check_later(self, step: RelativeStep) -> None:
+        """Raise ``RejectedStep`` if a step of another odometry is not later than the newest frame."""
+        self._log.check_later(step)
+
+    def _take(self, step: RelativeStep, taken: TakenStep, optimize: bool) -> TrajectoryUpdate:
+        self._loaded = False
+        if taken.begins:
+            self._begin_at(step)
+            self._online.append(np.zeros(3))
+        due = self._append(step, taken)
+        self._odom = step.tf_odom_xyyaw
+        if not optimize:
+            self._graph.abandon()
+        self._optimized = self._optimise(due and optimize)
+        update = self._result(taken.restarted, taken.gap)
+        self._online.append(update.pose_xyyaw)
+        return update
+
+    def _optimise(self, due: bool) -> bool:
+        """Go on with an optimisation, or begin one; returns whether the newest frame ended one."""
+        try:
+            if due:
+                self._graph.begin()
+            if self._graph.running:
+                self._graph.advance(self._iterations_per_step)
+        except Exception as error:  # numerics of a library, or a fault of ours: it may cost an optimisation, no more
+            self._graph.fail(error)
+        return self._graph.optimized
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether there is anything left to optimise, which later steps, or ``finish``, are to do."""
+        return self._graph.unfinished
+
+    @property
+    def optimization_s(self) -> float:
+        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+        return self._graph.took_s
+
+    def finish(self) -> TrajectoryUpdate | None:
+        """Optimise what is left, when no more steps come; None where there is nothing, or where it failed."""
+        try:
+            done = self._log.steps > 0 and self._graph.finish()
+        except Exception as error:  # see _optimise
+            self._graph.fail(error)
+            done = False
+        if not done:
+            return None
+        self._optimized = True
+        return self._result(restarted=False, gap=False)
+
+    def trajectory(self) -> Trajectory | None:
+        """The whole trajectory as it is now, or None before the first step."""
+        if self._log.steps == 0:
+            return None
+        graph, log = self._graph, self._log
+        poses, moved = graph.frame_poses(), np.zeros(log.steps + 1)
+        if self._optimized:
+            before = graph.frame_poses(before=True)
+            moved[:-1] = np.linalg.norm((poses - before)[:-1, :2], axis=1)
+        arrays = (
+            log.stamps_ns.values, poses, log.odometry.values, self._online.values, moved, log.odometry_std.values,
+            graph.loop_frames, graph.loop_weights, graph.loop_relative, graph.loop_std,
+        )  # fmt: skip
+        return Trajectory(*map(_read_only, arrays))
+
+    def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
+        graph = self._graph
+        pose, covariance = graph.newest()
+        map_from_odom = compose(pose, between(self._odom, np.zeros(3)))
+        return TrajectoryUpdate(
+            stamp_ns=int(self._log.stamps_ns.values[-1]),
+            pose_xyyaw=_read_only(pose.copy()),
+            covariance=_read_only(0.5 * (covariance + covariance.T)),
+            map_from_odom_xyyaw=_read_only(map_from_odom),
+            frames=self._log.steps + 1,
+            optimized=self._optimized,
+            restarted=restarted,
+            gap=gap,
+            largest_move_m=graph.largest_move_m if self._optimized else 0.0,
+            closed_loops=int((graph.loop_weights > 0.5).sum()),
+            window_fill=graph.window_fill,
+            fault=graph.fault,
+        )
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,201 @@
+"""Localisation in a map that stays as it is: relative poses in, the pose in the map out where it is known (no ROS).
+
+A frame is compared with the map wherever the robot has moved enough. Over a rolling window of such frames hypotheses
+of the newest pose are put together by odometry. A pose is claimed where hypotheses of several frames agree, and no
+other pose has nearly as many. From then on a filter fuses odometry with the sightings that agree with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry.planar_arrays import compose
+from ngo_estimator.geometry.planar_covariance import position_std, propagate
+from ngo_estimator.slam.evidence import (
+    Hypotheses,
+    HypothesisWindow,
+    Mode,
+    agreeing,
+    fused,
+    strongest_modes,
+    support,
+)
+from ngo_estimator.slam.sightings import MapMatcher, Sightings
+
+_NEW_LOOKS = 4
+"""A claimed pose is seen in one of so many last looks."""
+
+_STRONG = 0.8
+"""Belief of sightings that contradict a pose."""
+
+
+@dataclass(frozen=True)
+class LocalisationConfig:
+    """When a pose is claimed, and when it is lost again. Lengths are given in places, the matcher's ``place_m``.
+
+    The map is looked at after every ``look_places`` or ``look_deg`` of motion, and the last ``window`` looks count. A
+    claim needs the support of ``least_support`` looks, and of ``least_share`` of the window, over ``least_way_places``
+    of way, and another pose at most ``most_rival`` of that support. A pose is lost where another one could be claimed,
+    where ``least_support`` of strong belief gathers in the window and nothing agrees, or where the deviation of the
+    position passes ``lost_places``.
+    """
+
+    look_places: float = 0.4
+    look_deg: float = 10.0
+    window: int = 24
+    least_support: float = 7.0
+    least_share: float = 0.7
+    least_way_places: float = 3.0
+    most_rival: float = 0.35
+    lost_places: float = 2.0
+
+    def __post_init__(self) -> None:
+        positive = (self.look_places, self.look_deg, self.least_support, self.lost_places)
+        if not all(0.0 < value < math.inf for value in positive):
+            raise ValueError(
+                f"look_places, look_deg, least_support, lost_places are {positive}; expected positive numbers"
+            )
+        if self.window < 2 or not 0.0 <= self.least_way_places < math.inf:
+            raise ValueError(
+                f"window, least_way_places are {self.window}, {self.least_way_places}; expected at least 2, and a "
+                "length from 0 on"
+            )
+        if not (0.0 <= self.most_rival < 1.0 and 0.0 <= self.least_share <= 1.0):
+            raise ValueError(
+                f"most_rival, least_share are {self.most_rival}, {self.least_share}; expected shares of one, the first "
+                "below one"
+            )
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """What is known after a frame.
+
+    ``pose_xyyaw`` (3,) of the newest frame in the map and its ``covariance`` (3, 3); both None while the pose is not
+    known. ``hypotheses`` are the strongest modes of the window, best
+    first. ``claimed`` and ``lost`` say whether this frame began or ended that the pose is known.
+    """
+
+    stamp_ns: int
+    pose_xyyaw: np.ndarray | None
+    covariance: np.ndarray | None
+    hypotheses: tuple[Mode, ...]
+    claimed: bool
+    lost: bool
+
+
+class Localiser:
+    """Takes steps, and tells where in the map the robot is once that is beyond doubt."""
+
+    def __init__(self, matcher: MapMatcher, config: LocalisationConfig | None = None) -> None:
+        self.config = config or LocalisationConfig()
+        self._matcher = matcher
+        self._window = HypothesisWindow(self.config.window)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames: the pose is not known."""
+        self._matcher.reset()
+        self._window.clear()
+        self._odometry = np.zeros(3)
+        self._way_m = self._turn_rad = math.inf  # since the last look
+        self._looks_since = 0  # the whole map was asked
+        self._track: tuple[np.ndarray, np.ndarray] | None = None
+        self._modes: tuple[Mode, ...] = ()
+
+    def tell(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
+        """Take the newest frame's pose ``(3,)`` and covariance ``(3, 3)`` from somebody who knows them."""
+        self._track = pose_xyyaw.astype(np.float64), covariance.astype(np.float64)
+        self._window.clear()
+        self._modes = ()
+
+    def update(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> Localisation:
+        """Take the next step: ``relative`` ``(3,)`` with its ``covariance`` ``(3, 3)``, as the log of steps has it."""
+        known = self._track is not None
+        self._move(relative, covariance)
+        usable = self._matcher.append(step, self._odometry)
+        config = self.config
+        due = self._way_m >= config.look_places * self._matcher.place_m
+        if usable and (due or self._turn_rad >= math.radians(config.look_deg)):
+            self._look()
+        found = self._track is not None
+        pose, covariance_now = (None, None) if self._track is None else self._track
+        return Localisation(step.stamp_ns, pose, covariance_now, self._modes, found and not known, known and not found)
+
+    def _move(self, relative: np.ndarray, covariance: np.ndarray) -> None:
+        """Carry everything over a step."""
+        self._odometry = compose(self._odometry, relative)
+        self._way_m += float(np.hypot(relative[0], relative[1]))
+        self._turn_rad += abs(float(relative[2]))
+        self._window.move(relative, covariance)
+        if self._track is not None:
+            pose = compose(self._track[0], relative)
+            self._track = pose, propagate(self._track[1], pose, relative, covariance)
+
+    def _look(self) -> None:
+        """Compare the newest frame with the map, and weigh what the window says."""
+        self._way_m = self._turn_rad = 0.0
+        self._looks_since += 1
+        if self._track is not None and self._looks_since < self._matcher.search_every:
+            self._correct(Sightings.none())
+            return
+        self._looks_since = 0
+        self._window.add(self._matcher.everywhere())
+        hypotheses, place_m = self._window.hypotheses(), self._matcher.place_m
+        self._modes = strongest_modes(hypotheses, place_m)
+        if self._track is None:
+            if self._modes and self._may_claim(self._modes[0], self._modes[1:]):
+                mode = self._modes[0]
+                agree = agreeing(hypotheses, mode.pose_xyyaw, mode.covariance, place_m)
+                self._track = fused(hypotheses.where(agree), mode.pose_xyyaw)
+            return
+        agree = agreeing(hypotheses, *self._track, place_m)
+        if self._contradicted(hypotheses, agree):
+            self._track = None
+            return
+        newest = hypotheses.where(hypotheses.look == len(self._window) - 1)
+        self._correct(Sightings(newest.poses, newest.covariance, newest.belief))
+
+    def _correct(self, newest: Sightings) -> None:
+        """Fuse the track with what agrees with it, of the newest look and of the map around."""
+        assert self._track is not None
+        both = newest.and_also(self._matcher.around(self._track[0]))
+        seen = Hypotheses(both.poses, both.covariance, both.belief, np.zeros(len(both), np.int64))
+        seen = seen.where(agreeing(seen, *self._track, self._matcher.place_m))
+        if len(seen.look):
+            self._track = fused(seen, *self._track)
+
+    def _may_claim(self, mode: Mode, others: Sequence[Mode]) -> bool:
+        config, way_m = self.config, self._window.way_m[mode.looks]
+        rival = max((other.support for other in others), default=0.0)
+        return (
+            mode.support >= max(config.least_support, config.least_share * len(self._window))
+            and rival <= config.most_rival * mode.support
+            and float(way_m[0] - way_m[-1]) >= config.least_way_places * self._matcher.place_m
+            and mode.looks[-1] >= len(self._window) - _NEW_LOOKS
+        )
+
+    def _contradicted(self, hypotheses: Hypotheses, agree: np.ndarray) -> bool:
+        """Whether the track is lost; ``agree`` says which hypotheses agree with it."""
+        assert self._track is not None
+        place_m, least = self._matcher.place_m, self.config.least_support
+        if position_std(self._track[1]) > self.config.lost_places * place_m:
+            return True
+        ours = support(hypotheses, agree)
+        if ours == 0.0 and support(hypotheses, hypotheses.belief >= _STRONG) >= least:
+            return True
+        others = [mode for mode in self._modes if not _same(mode, self._track[0], place_m)]
+        if len(others) == len(self._modes) and self._modes:
+            track = Mode(*self._track, ours, np.zeros(0, np.int64))
+            return self._may_claim(others[0], (*others[1:], track))
+        return False
+
+
+def _same(mode: Mode, pose: np.ndarray, place_m: float) -> bool:
+    """Whether a mode lies within a place of a pose ``(3,)``."""
+    return bool(np.hypot(*(mode.pose_xyyaw - pose)[:2]) <= place_m)

@@ -1,0 +1,453 @@
+"""The graph of meta-poses behind the online trajectory: key frames, a window, and loops between any of them.
+
+Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 the first frame, the origin of ``map``.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.planar_motion import chained, compose, frames_between_nodes
+from ngo_estimator.graph.key_frames import KeyFrame
+from ngo_estimator.graph.meta_nodes import MetaNodes
+from ngo_estimator.graph.solved_graph import SolvedGraph
+from ngo_estimator.loops.loop_closure import Loops
+from ngo_estimator.loops.online_loops import OnlineLoops
+from ngo_estimator.loops.place_map import PlaceMap
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.ngo.meta_poses import MetaSteps, OptimizedMetaPoses, Solution
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_variances
+from ngo_estimator.slam.block_intake import BlockIntake
+from ngo_estimator.slam.network_corrections import NetworkCorrections
+from ngo_estimator.slam.odometry_blocks import OdometryBlocks
+from ngo_estimator.slam.step_log import StepLog
+from ngo_estimator.slam.trajectory_update import fault_of
+from ngo_estimator.slam.update_schedule import RunningOptimisation, is_due, parts_now
+
+_RESUMED = 1
+"""Results of an optimisation that goes on from the last solution."""
+
+_SHRUNK = 1e-5
+"""By less (m or rad) are poses those of the solution: a hundredth of what corrections are good to."""
+
+_LEAST_INFORMATION = 1e-12
+"""Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
+
+
+class MetaGraph:
+    """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
+
+    The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
+    ``anneal_every``-th block all loops are judged from the odometry on; between, only new ones.
+    """
+
+    def __init__(
+        self,
+        optimizer: NeuralGraphOptimizer,
+        pair_head: PairHead | None,
+        window: int,
+        key_frames: int,
+        network_every: int = 1,
+        anneal_every: int = 1,
+        log: Callable[[], StepLog] = StepLog,
+    ) -> None:
+        self._optimizer = optimizer
+        self._block, self._window = optimizer.block, window
+        self._scale = optimizer.config.covariance_scale
+        self._log = log  # of the steps as they came
+        self._odometry = OdometryBlocks(optimizer, pair_head, window, log)
+        self._nodes = MetaNodes(key_frames)
+        self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
+        self._loops: OnlineLoops | None = None
+        self._origin_code: np.ndarray | None = None
+        if optimizer.config.loops:
+            assert pair_head is not None
+            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.odometry)
+        overlaps = optimizer.config.search.overlaps > 0
+        self._intake = BlockIntake(self._odometry, self._nodes, self._loops, overlaps, self._scale)
+        self.loop_frames = np.zeros((0, 2), np.int64)
+        """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
+        self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        self._begun = False
+        self._running: RunningOptimisation | None = None
+        self._network_every, self._anneal_every = network_every, anneal_every
+        self._shrunk = False  # whether corrections of the last result were shrunk
+        self._annealed = 0  # blocks when all loops were judged last
+        self._corrections: NetworkCorrections | None = None
+        self._begun_s = 0.0
+        self.optimized, self.fault = False, ""
+        """Whether an optimisation ended, and what failed, since the newest frame came."""
+        self.took_s = 0.0
+        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+
+    @property
+    def window_fill(self) -> float:
+        """Share of the window that is in use."""
+        return min(1.0, self._odometry.steps / (self._window * self._block))
+
+    @property
+    def largest_move_m(self) -> float:
+        """How far the last optimisation moved a node at most."""
+        return self._nodes.largest_move_m
+
+    def begin_at(self, origin_code: np.ndarray | None) -> None:
+        """Take the place code of the first frame, where it is known, before the first step."""
+        self._origin_code = origin_code
+
+    def append(
+        self,
+        relative: np.ndarray,
+        variance: np.ndarray,
+        motion: np.ndarray,
+        code: np.ndarray,
+        joins: bool = False,
+        familiar: bool = True,
+    ) -> bool:
+        """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block.
+
+        With ``joins`` the step is where another odometry goes on, in another place.
+        A frame that is not ``familiar`` closes no loops, and networks leave the odometry around it as it is. Its
+        variances are honest, so that ``covariance_scale`` is not for them. The first one recalls those before it.
+        """
+        self.optimized, self.fault = False, ""
+        if not familiar:
+            code, variance = np.zeros_like(code), variance / self._scale
+            if self._odometry.is_familiar:
+                self._recall()
+        self._pose = compose(self._pose, relative.astype(np.float64))
+        self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
+        self._odometry.append(relative, variance, motion, familiar, joins)
+        if self._loops is not None:
+            self._loops.append(code)
+        if self._odometry.steps % self._block:
+            return False
+        try:
+            self.finish()  # what comes now changes the nodes that it is about
+        except Exception as error:  # it may cost an optimisation, and nothing else
+            self.fail(error)
+        self._complete_block()
+        return True
+
+    @torch.inference_mode()
+    def _complete_block(self) -> None:
+        try:
+            self._register(self._nodes.blocks * self._block)
+        except Exception as error:  # numerics of a library, or a fault of ours: the steps stay as they came
+            self.fail(error, "the registration of steps")
+        self._nodes.append(self._odometry.complete())
+        self._intake.begin()
+
+    def _register(self, first: int) -> None:
+        """Measure the newest block again, which begins with the step of number ``first``."""
+        if self._loops is None or self._odometry.registrations == 0:
+            return
+        before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
+        self._odometry.register(self._loops.codes(first), before)
+
+    @torch.inference_mode()
+    def _recall(self) -> None:
+        """Take the newest frames back, which were taken for familiar: their loops, and what was registered by them."""
+        self.abandon()  # it has their loops
+        first = self._odometry.recall()
+        if self._loops is not None:
+            self._loops.recall(first)
+
+    @property
+    def work(self) -> int:
+        """The most parts of an update: registering and taking in a block, the network's preparation, and iterations."""
+        config = self._optimizer.config
+        return (self._odometry.registrations > 0) + self._intake.parts + config.network + config.iterations
+
+    def _do(self) -> None:
+        """Do the next part of taking in the newest block."""
+        self.fault = self._intake.do() or self.fault
+
+    @torch.inference_mode()
+    def _settle(self) -> None:
+        """Do all that is left of taking in the newest block."""
+        while self._intake.left:
+            self._do()
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Let the window slide, and some key frames go."""
+        while self._nodes.blocks - self._nodes.first > self._window:
+            self._nodes.leave(self._key_frame(self._nodes.first))
+            if self._loops is not None:
+                self._loops.leave(self._nodes.first)
+        if self._nodes.keys.crowded:
+            thinned = self._nodes.thin()
+            if self._loops is not None:
+                self._loops.reattach(*thinned)
+
+    def _key_frame(self, node: int) -> KeyFrame:
+        """The key frame that the window's first node becomes."""
+        relative = self._nodes.step()
+        variance = self._odometry.optimized_std.slice(node, node + 1)[0] ** 2
+        if self._loops is not None:
+            return self._loops.key_frame(node, relative, variance)
+        nothing = np.zeros((self._block, 0), np.float32)
+        return KeyFrame(node, relative, variance, nothing, nothing, np.zeros((self._block, 3)))
+
+    @property
+    def running(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+        return self._begun
+
+    def begin(self) -> None:
+        """Begin to optimise all nodes of the window and the key frames before it."""
+        self._begun, self._begun_s = True, 0.0
+
+    @torch.inference_mode()
+    def _prepared(self) -> RunningOptimisation:
+        self._make_room()
+        odometry, keys, first, blocks = self._odometry, self._nodes.keys, self._nodes.first, self._nodes.blocks
+        relative = np.concatenate((keys.relative, odometry.relative.slice(first))).astype(np.float32)
+        std = np.concatenate((np.sqrt(keys.variance), odometry.std.slice(first))).astype(np.float32)
+        known = None if self._network_is_due else self._corrections
+        runs_network = self._optimizer.config.network and known is None
+        features = None
+        if runs_network:
+            features = torch.from_numpy(odometry.features.slice(first)).unsqueeze(0)
+        steps = MetaSteps(
+            torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, blocks - first
+        )
+        if (fixed := odometry.fixed.slice(first)).any():
+            steps = replace(steps, fixed=torch.from_numpy(fixed.copy()).unsqueeze(0))
+        loops, numbers, solution = None, np.zeros(0, np.int64), None
+        if self._loops is not None:
+            loops, numbers = self._loops.loops(keys.nodes, first, blocks)
+            loops = self._verified(loops)
+            if not self._annealing_is_due:
+                solution = Solution(torch.from_numpy(self._nodes.relative).unsqueeze(0), *self._loops.weighed(numbers))
+        corrections = None if known is None else known.for_blocks(first, blocks)
+        iterations = self._optimizer.iterate(steps, loops, corrections, solution)
+        return RunningOptimisation(iterations, numbers, runs_network, solution is None)
+
+    def _verified(self, loops: Loops) -> Loops:
+        """The same loops; none across a blind stretch where place codes alone tell them.
+
+        Nothing limits the motion within it, so that each place that looks alike would do.
+        """
+        search = self._optimizer.config.search
+        if search.registrations or search.least_belief or not self._odometry.blind.any():
+            return loops
+        blind = (summed_variances(self._odometry.blind, self._nodes.active) > 0.0).any(axis=1)
+        before = torch.from_numpy(np.concatenate(([0], blind.cumsum())))
+        return replace(loops, valid=loops.valid & (before[loops.end + 1] == before[loops.start]))
+
+    @property
+    def _network_is_due(self) -> bool:
+        """Whether what the network gave is too old."""
+        known = self._corrections
+        return known is None or is_due(self._nodes.blocks - known.last, known.last - known.first, self._network_every)
+
+    @property
+    def _is_light(self) -> bool:
+        """Whether the iterations of this update run no network."""
+        if self._running is not None:
+            return not self._running.runs_network
+        return not (self._optimizer.config.network and self._network_is_due)
+
+    @property
+    def _annealing_is_due(self) -> bool:
+        """Whether all loops are to be judged anew, from the odometry on."""
+        first = self._nodes.first
+        # Across blind stretches the poses are not those of the solution, even where the window has left them behind.
+        if self._shrunk or self._odometry.blind[first:].any() or self._network_is_due:
+            return True
+        return is_due(self._nodes.blocks - self._annealed, self._annealed - first, self._anneal_every)
+
+    def _iterate(self) -> None:
+        """Prepare an optimisation, or run its next iteration; without the network the first one goes with it."""
+        if self._running is None:
+            self._running = self._prepared()
+        self._running.advance()
+
+    @property
+    def _parts_left(self) -> int:
+        """Parts of the update to come."""
+        if self._running is not None and self._running.result is not None:
+            return self._running.result.left
+        iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
+        return self._intake.left + (self._running is None and not self._is_light) + iterations
+
+    @torch.inference_mode()
+    def advance(self, parts: int) -> bool:
+        """Do so many parts of the update, or more where it would not be done before the next block is complete.
+
+        Returns:
+            Whether it is done, and every node at its new pose.
+        """
+        if not self._begun:
+            raise RuntimeError("no optimisation has begun")
+        began = time.perf_counter()
+        steps_left = self._block - self._odometry.steps % self._block
+        if self._odometry.registrations and steps_left == self._block:
+            parts -= 1  # the step that completed the block has registered it
+        for _ in range(parts_now(parts, self._parts_left, steps_left, self._is_light)):
+            if self._intake.left:
+                self._do()
+            else:
+                self._iterate()
+        self._begun_s += time.perf_counter() - began
+        running = self._running
+        if running is None or running.result is None or not running.done:
+            return False
+        end = self._scale * running.result.end_covariance()[0].numpy()
+        poses = running.result.meta_relative[-1]
+        if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            raise ArithmeticError("poses or their covariances came out as no numbers")
+        self._running, self._begun, self.took_s = None, False, self._begun_s
+        moved = self._apply(running, running.result, end)
+        end = end + np.outer(moved, moved)
+        self._pose, self._covariance = self._odometry.carried(self._nodes.poses[-1], end)
+        self.optimized = True
+        return True
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether an optimisation has begun that is not done."""
+        return self.running
+
+    def finish(self) -> bool:
+        """Do what is left of an optimisation that has begun; returns whether there was one."""
+        self._settle()
+        if not self._begun:
+            return False
+        while not self.advance(self.work):
+            pass
+        return True
+
+    def _apply(self, running: RunningOptimisation, result: OptimizedMetaPoses, end: np.ndarray) -> np.ndarray:
+        """Take the result; how far the last node is from it ``(3,)``, as unfamiliar frames make corrections unsure."""
+        if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
+            self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
+            information = result.loop_information[0].double().numpy()
+            self.loop_std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
+            self.loop_weights = result.loop_weights[0].double().numpy()
+            self._loops.weigh(running.numbers, self.loop_weights, information)
+        solution = chained(result.meta_relative[-1][0].double().numpy())
+        poses = self._shrink(solution)
+        self._nodes.move(poses[1:])
+        keys, first = self._nodes.keys.nodes, self._nodes.first
+        self._odometry.optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
+        self._intake.solved = SolvedGraph(keys, first, self._nodes.blocks, end, result.equations)
+        if running.anneals:
+            self._annealed = self._nodes.blocks
+        if running.runs_network and self._network_every > 1:
+            self._corrections = NetworkCorrections.of(first, result.corrections)
+        moved: np.ndarray = poses[-1] - solution[-1]
+        return moved
+
+    def _shrink(self, solution: np.ndarray) -> np.ndarray:
+        """Poses of the active nodes ``(n, 3)``, whose corrections are shrunk across blind stretches."""
+        self._shrunk = False
+        blind = self._odometry.blind
+        if not blind.any():
+            return solution
+        active, log = self._nodes.active, self._log().odometry.values
+        odometry = se2.between(torch.from_numpy(log[0]), torch.from_numpy(log[active * self._block])).numpy()
+        ties = self._loops.ties() if self._loops is not None else (np.zeros((0, 2), np.int64), np.zeros(0))
+        joined = np.searchsorted(active, ties[0])
+        shrunk = shrunk_corrections(solution, odometry, summed_variances(blind, active), joined, ties[1])
+        self._shrunk = bool(np.abs(shrunk - solution).max() > _SHRUNK)
+        return shrunk
+
+    def abandon(self) -> None:
+        """Leave undone what has begun; the newest block is taken in all the same."""
+        self._running, self._begun = None, False
+        self._settle()
+
+    def fail(self, error: Exception, work: str = "an optimisation") -> None:
+        """Leave undone what has begun, and keep why: every node is where it was."""
+        self.abandon()
+        self.fault = fault_of(error, work)
+
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
+        return self._pose, self._covariance
+
+    def frame_poses(self, before: bool = False) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
+        odometry = self._odometry
+        return frames_between_nodes(self._nodes.all(before), odometry.odometry.values, self._block, odometry.shares())
+
+    def places(self) -> PlaceMap:
+        """The frames whose place codes are kept; raises ``ValueError`` where none are."""
+        if self._loops is None:
+            raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
+        return self._loops.places(self._nodes.first * self._block, self._nodes.keys, self.frame_poses())
+
+    def state(self) -> Arrays:
+        """All that later steps depend on, for ``restore``.
+
+        Of an optimisation in progress that is the number of its parts: nothing that its iterations began with has
+        changed.
+        """
+        code = self._origin_code
+        arrays = {
+            **self._odometry.state(),
+            **self._nodes.state(),
+            **self._intake.solved.state(),
+            "pose": self._pose,
+            "covariance": self._covariance,
+            "annealed": np.array(self._annealed),
+            "shrunk": np.array(self._shrunk),
+            **{name: getattr(self, name) for name in ("loop_frames", "loop_relative", "loop_std", "loop_weights")},
+            "origin_code": np.zeros(0, np.float32) if code is None else code,
+            "begun": np.array(self._begun),
+            "parts_left": np.array(self._intake.left),
+            "iterated": np.array(0 if self._running is None else self._running.parts),
+        }
+        # The window may have left them behind while nothing was optimised: then the network is due.
+        if self._corrections is not None and self._corrections.last > self._nodes.first:
+            arrays |= under("corrections", self._corrections.state())
+        return arrays if self._loops is None else arrays | under("loops", self._loops.state())
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
+        self._odometry.restore(arrays)
+        nothing = (self._block, 0)
+        shapes = (nothing, nothing) if self._loops is None else self._loops.key_frame_shapes
+        self._nodes.restore(arrays, *shapes)
+        frames, blocks, iterations = self._odometry.steps, self._nodes.blocks, self._optimizer.config.iterations
+        require(blocks == self._odometry.blocks, f"{frames} steps and {blocks} meta-poses do not belong together")
+        self._intake.solved = SolvedGraph.from_state(arrays, blocks)
+        self._pose = taken(arrays, "pose", np.float64, 3)
+        self._covariance = taken(arrays, "covariance", np.float64, 3, 3)
+        self._annealed, self._shrunk = taken_integer(arrays, "annealed"), bool(taken(arrays, "shrunk", np.bool_))
+        self.loop_frames = taken(arrays, "loop_frames", np.int64, -1, 2)
+        known = (self.loop_frames >= 0).all() and (self.loop_frames <= frames).all()
+        require(bool(known), "loops join frames that are not there")
+        for name, shape in (("loop_relative", (3,)), ("loop_std", (3,)), ("loop_weights", ())):
+            setattr(self, name, taken(arrays, name, np.float64, len(self.loop_frames), *shape))
+        code = taken(arrays, "origin_code", np.float32, -1)
+        self._origin_code = code if len(code) else None
+        if self._loops is not None:
+            self._loops.restore(part(arrays, "loops"))
+        if corrections := part(arrays, "corrections"):
+            given = self._corrections = NetworkCorrections.from_state(corrections, iterations)
+            fits = given.first <= self._nodes.first < given.last <= blocks
+            require(fits, f"corrections of the blocks {given.first} to {given.last} are given")
+        self._restore_progress(arrays)
+
+    def _restore_progress(self, arrays: Arrays) -> None:
+        """Take what was done of an update, and do its iterations again."""
+        left, iterated = (taken_integer(arrays, name) for name in ("parts_left", "iterated"))
+        require(left <= self._intake.parts, f"{left} parts of an update are left")
+        require(iterated <= self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
+        self._begun = bool(taken(arrays, "begun", np.bool_))
+        require(self._begun or not iterated, "an optimisation has not begun, and iterated")
+        require(not (left and iterated), "an optimisation has iterated before its time")
+        with torch.inference_mode():
+            self.fault = self._intake.resume(left)
+            for _ in range(iterated):
+                self._iterate()

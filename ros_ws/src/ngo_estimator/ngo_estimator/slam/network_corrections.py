@@ -1,0 +1,50 @@
+"""Corrections of the network that are kept from one of its runs to the next."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.state_arrays import Arrays, taken, taken_integer
+from ngo_estimator.ngo.meta_poses import Correction
+
+
+@dataclass(frozen=True)
+class NetworkCorrections:
+    """What the network gave when it ran last, ``(iterations, blocks, 3)``, for the blocks from number ``first`` on."""
+
+    first: int
+    adjustment: np.ndarray
+    stiffness: np.ndarray
+
+    @classmethod
+    def of(cls, first: int, given: Sequence[Correction]) -> "NetworkCorrections":
+        """Of all iterations of one optimisation."""
+        arrays = (torch.cat(parts).numpy() for parts in zip(*given, strict=True))
+        return cls(first, *arrays)
+
+    @property
+    def last(self) -> int:
+        """Number of the first block that the network did not see."""
+        return self.first + self.stiffness.shape[1]
+
+    def for_blocks(self, first: int, last: int) -> list[Correction]:
+        """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
+        stiffness, adjustment = self.stiffness[:, first - self.first :], self.adjustment[:, first - self.first :]
+        iterations, seen, _ = stiffness.shape
+        new = np.zeros((iterations, last - first - seen, 3), np.float32)
+        rows = np.hstack((adjustment, new)), np.hstack((stiffness, new + stiffness[:, -1:]))
+        pairs = zip(*(torch.from_numpy(array).unsqueeze(1) for array in rows), strict=True)
+        return [Correction(*pair) for pair in pairs]
+
+    def state(self) -> Arrays:
+        """The same as arrays, for ``from_state``."""
+        return {"first": np.array(self.first), "adjustment": self.adjustment, "stiffness": self.stiffness}
+
+    @classmethod
+    def from_state(cls, arrays: Arrays, iterations: int) -> "NetworkCorrections":
+        """Take a ``state()`` of so many iterations; raises ``StateError``."""
+        adjustment = taken(arrays, "adjustment", np.float32, iterations, -1, 3)
+        stiffness = taken(arrays, "stiffness", np.float32, *adjustment.shape[:2], -1)
+        return cls(taken_integer(arrays, "first"), adjustment, stiffness)

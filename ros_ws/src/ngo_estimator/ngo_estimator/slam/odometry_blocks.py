@@ -1,0 +1,248 @@
+"""The odometry of the graph: steps, and the blocks of steps between its nodes."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
+from ngo_estimator.data.state_arrays import Arrays, part, require, taken_integer, under
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import between, carried, compose
+from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.ngo.pose_aggregation import block_variances, poses_in_blocks
+from ngo_estimator.ngo.registered_odometry import registered_steps
+from ngo_estimator.slam.step_log import StepLog
+
+_TOLD_LATE = 16
+"""Frames before the first unfamiliar one that were taken for familiar and may not have been: a mean over them tells."""
+
+_STD = (1e-6, 1e2)
+"""What a step's deviation is limited to (m or rad)."""
+
+
+class OdometryBlocks:
+    """Takes steps, and makes blocks of them: registered, aggregated and smoothed.
+
+    Networks leave blocks near unfamiliar frames as they are.
+    """
+
+    def __init__(
+        self, optimizer: NeuralGraphOptimizer, pair_head: PairHead | None, window: int, log: Callable[[], StepLog]
+    ) -> None:
+        self._optimizer, self._pair_head = optimizer, pair_head
+        self._block, self._context = optimizer.block, optimizer.config.context
+        self._scale = optimizer.config.covariance_scale
+        self._log = log  # of the steps as they came
+        registers = pair_head is not None and pair_head.config.registers_odometry
+        self.registrations = optimizer.config.registrations if registers else 0
+        """Of each step; 0: steps stay as they came."""
+        self.odometry = GrowingRows((3,), np.float64)
+        """Poses of all frames by odometry, the first at the origin."""
+        self.odometry.append(np.zeros(3))
+        config = optimizer.config.aggregation
+        recalled = -(-_TOLD_LATE // self._block) + 1
+        steps_kept = (2 * self._context + 2 + recalled) * self._block
+        self._relative = SlidingRows((3,), np.float32, steps_kept)
+        self._log_std = SlidingRows((3,), np.float32, steps_kept)
+        self._motion = SlidingRows((config.motion_feature_size,), np.float32, steps_kept)
+        self._familiar = SlidingRows((), np.bool_, steps_kept)
+        blocks_kept = max(window, self._context) + 2
+        self.relative = SlidingRows((3,), np.float32, blocks_kept)
+        """Relative pose of each block, smoothed if the optimizer has a smoother, and its deviations ``std``."""
+        self.std = SlidingRows((3,), np.float32, blocks_kept)
+        self.optimized_std = SlidingRows((3,), np.float64, blocks_kept)
+        """Deviations with which the last optimisation believed each block."""
+        self.features = SlidingRows((config.width,), np.float32, blocks_kept)
+        """Of each block; without a network there are none."""
+        self.fixed = SlidingRows((), np.bool_, blocks_kept)
+        """Whether networks leave a block as it is."""
+        self._blind = GrowingRows((3,), np.float64)
+        self._recalled = 0  # block from which on frames turned out to be unfamiliar
+        self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on
+
+    @property
+    def steps(self) -> int:
+        """Steps so far."""
+        return len(self.odometry) - 1
+
+    @property
+    def blocks(self) -> int:
+        """Whole blocks so far."""
+        return len(self.relative)
+
+    @property
+    def blind(self) -> np.ndarray:
+        """Variance of the unfamiliar steps of each block ``(blocks, 3)``."""
+        return self._blind.values
+
+    @property
+    def is_familiar(self) -> bool:
+        """Whether there is a newest frame, and it is familiar."""
+        return len(self._familiar) > 0 and bool(self._familiar.slice(len(self._familiar) - 1)[0])
+
+    def append(
+        self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, familiar: bool, joins: bool
+    ) -> None:
+        """Take a step ``(3,)``; with ``joins`` another odometry goes on from there."""
+        self.odometry.append(compose(self.odometry.values[-1], relative.astype(np.float64)))
+        if joins:
+            self._joins.append(self.steps)
+        self._relative.append(relative)
+        self._log_std.append(0.5 * np.log(variance))
+        self._motion.append(motion)
+        self._familiar.append(familiar)
+
+    def register(self, codes: np.ndarray, code_before: np.ndarray | None) -> None:
+        """Measure the newest steps again, those behind the last whole block.
+
+        Args:
+            codes: place codes ``(block, code_length)`` of their frames; code_before: of the frame before them.
+        """
+        first = self.blocks * self._block
+        if self._pair_head is None or self.registrations == 0 or not self._familiar.slice(first).all():
+            return
+        if self._joins.values[-1:].max(initial=0) > first:
+            return  # the frames were seen from two places
+        before = None if code_before is None else torch.from_numpy(code_before).unsqueeze(0)
+        rows = self._relative.slice(first), self._log_std.slice(first), codes
+        steps, deviations, of_frames = (torch.from_numpy(values).unsqueeze(0) for values in rows)
+        relative, log_std = registered_steps(
+            self._pair_head, steps, deviations, of_frames, self._block, self.registrations, before
+        )
+        self._relative.replace(first, relative[0].numpy())
+        self._log_std.replace(first, log_std[0].numpy())
+        odometry = torch.from_numpy(self.odometry.values)
+        odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
+
+    def complete(self) -> np.ndarray:
+        """Make a block of the newest steps; returns the relative pose ``(3,)`` of its end, by odometry."""
+        in_block, std = self._in_blocks(self.blocks * self._block)
+        self._blind.append(self._blind_variance(self.blocks))
+        self.relative.append(in_block[0, 0, -1])
+        self.std.append(std[0])
+        self.optimized_std.append(std[0])
+        self.fixed.append(False)
+        return between(*self.odometry.values[[-1 - self._block, -1]])
+
+    def _in_blocks(self, first: int, stop: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Poses within the blocks of steps from number ``first`` on, and the deviations ``(blocks, 3)`` of blocks."""
+        rows = self._relative.slice(first, stop), self._log_std.slice(first, stop)
+        relative, log_std = (torch.from_numpy(values).unsqueeze(0) for values in rows)
+        in_block = poses_in_blocks(relative, self._block)
+        return in_block, block_variances(in_block, log_std).sqrt()[0]
+
+    def recall(self) -> int:
+        """Take the newest frames back, which were taken for familiar; returns the number of their first step."""
+        first = max(0, len(self._familiar) - _TOLD_LATE)
+        self._familiar.slice(first)[:] = False
+        self._recalled = min(first // self._block, self.blocks)
+        if self.registrations and self._recalled < self.blocks:
+            self._unregister(self._recalled)
+        for block in range(self._recalled, self.blocks):
+            self.blind[block] = self._blind_variance(block)
+        return first
+
+    def _unregister(self, first: int) -> None:
+        """Take the steps from block ``first`` on as the odometry had them."""
+        log, began = self._log(), first * self._block
+        odometry, std = log.odometry.values[began : len(self._relative) + 1], log.odometry_std.values[began:]
+        relative = se2.between(torch.from_numpy(odometry[:-1]), torch.from_numpy(odometry[1:]))
+        self._relative.replace(began, relative.numpy())
+        self._log_std.replace(began, np.log(std[: len(relative)].clip(*_STD)))
+        own = torch.from_numpy(self.odometry.values)
+        own[began + 1 :] = se2.compose(own[began], se2.r2g(relative))
+        in_block, block_std = self._in_blocks(began, self.blocks * self._block)
+        self.relative.replace(first, in_block[0, :, -1].numpy())
+        self.std.replace(first, block_std.numpy())
+
+    def _blind_variance(self, block: int) -> np.ndarray:
+        """Variance ``(3,)`` of the unfamiliar steps of a block, as the odometry has it."""
+        ends = block * self._block, (block + 1) * self._block
+        log_std, familiar = (rows.slice(*ends) for rows in (self._log_std, self._familiar))
+        variance: np.ndarray = np.exp(2.0 * log_std.astype(np.float64))[~familiar].sum(axis=0) * self._scale
+        return variance
+
+    def aggregate(self, block: int) -> None:
+        """Features and smoothed odometry of the blocks that the newest one changes, and of itself."""
+        if not self._optimizer.config.network and self._optimizer.config.smoother is None:
+            return
+        changed = max(0, min(block, self._recalled) - self._context)
+        self._recalled = block + 1
+        start = max(0, changed - self._context)
+        ends = start * self._block, (block + 1) * self._block
+        inputs = (torch.from_numpy(rows.slice(*ends)) for rows in (self._relative, self._log_std, self._motion))
+        steps = self._optimizer.aggregate(*(rows.unsqueeze(0) for rows in inputs))
+        if steps.features is not None:
+            self.features.replace(changed, steps.features[0, changed - start :].numpy())
+        familiar = self._familiar.slice(*ends).reshape(-1, self._block)
+        fixed = _near(np.atleast_1d(~familiar.all(axis=1)), self._context)
+        self.fixed.replace(changed, fixed[changed - start :])
+        if self._optimizer.config.smoother is not None:
+            in_blocks, std = self._in_blocks(*ends)
+            stays = torch.from_numpy(fixed).unsqueeze(-1)
+            smoothed = (self.relative, steps.relative[0], in_blocks[0, :, -1]), (self.std, steps.std[0], std)
+            for buffer, smooth, raw in smoothed:
+                buffer.replace(changed, torch.where(stays, raw, smooth)[changed - start :].numpy())
+
+    def carried(self, pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A pose ``(3,)`` of the last block's end and its covariance ``(3, 3)``, carried to the newest frame."""
+        whole = self.blocks * self._block
+        relative, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
+        return carried(pose, covariance, self.odometry.values[whole:], relative, np.exp(2.0 * log_std))
+
+    def shares(self) -> np.ndarray:
+        """The share of a block's correction in that of each of its frames ``(1 or blocks, block)``: evenly spread."""
+        frames = np.arange(1, self._block + 1, dtype=np.float64)
+        even = frames[None] / self._block
+        joins = self._joins.values[self._joins.values <= self.blocks * self._block]
+        if len(joins) == 0:
+            return even
+        shares = np.repeat(even, self.blocks, axis=0)
+        for frame in joins.tolist():  # the motion that nobody saw is the one that is corrected
+            block = (frame - 1) // self._block
+            shares[block] = frames >= frame - block * self._block
+        return shares
+
+    def _rows(self) -> tuple[dict[str, SlidingRows], dict[str, SlidingRows]]:
+        """Rows of steps, and rows of blocks, by their names in a state."""
+        of_steps = {"relative": self._relative, "log_std": self._log_std, "motion": self._motion}
+        of_blocks = {"steps": self.relative, "std": self.std, "optimized_std": self.optimized_std, "fixed": self.fixed}
+        return of_steps | {"familiar": self._familiar}, of_blocks
+
+    def state(self) -> Arrays:
+        """All that is kept of steps and blocks, for ``restore``."""
+        arrays = {"odometry": self.odometry.values, "blind": self.blind, "joins": self._joins.values}
+        arrays["recalled"] = np.array(self._recalled)
+        of_steps, of_blocks = self._rows()
+        for name, rows in {**of_steps, **of_blocks, "features": self.features}.items():
+            arrays |= under(name, rows.state())
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        for name, growing in (("odometry", self.odometry), ("blind", self._blind), ("joins", self._joins)):
+            growing.restore(arrays, name)
+        self._recalled = taken_integer(arrays, "recalled")
+        of_steps, of_blocks = self._rows()
+        for name, rows in {**of_steps, **of_blocks, "features": self.features}.items():
+            rows.restore(part(arrays, name))
+        steps, blocks, joins = self.steps, self.blocks, self._joins.values
+        require(
+            steps // self._block == blocks == len(self._blind)
+            and {len(rows) for rows in of_steps.values()} == {steps}
+            and {len(rows) for rows in of_blocks.values()} == {blocks},
+            f"{steps} steps and {blocks} meta-poses do not belong together",
+        )
+        require(
+            bool((joins > 0).all() and (joins <= steps).all()), "another odometry begins at a frame that is not there"
+        )
+
+
+def _near(found: np.ndarray, reach: int) -> np.ndarray:
+    """Which of ``n`` rows ``(n,)`` are one of those ``found``, or at most ``reach`` rows away from one."""
+    rows = (np.flatnonzero(found)[:, None] + np.arange(-reach, reach + 1)).ravel()
+    near = np.zeros(len(found), np.bool_)
+    near[rows[(rows >= 0) & (rows < len(found))]] = True
+    return near

@@ -1,0 +1,78 @@
+"""The online trajectory of a 2D lidar: relative poses and key scans in, the whole corrected trajectory out (no ROS)."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.data.relative_step import RelativeStep, check_step
+from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
+from ngo_estimator.slam.localisation import Localiser
+from ngo_estimator.slam.map_localisation import MapLocalisation
+from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.scan_graph import ScanGraph
+from ngo_estimator.slam.step_log import TakenStep
+
+
+class ScanTrajectory(CorrectedTrajectory):
+    """Keeps the trajectory of a lidar and corrects it whenever loops call for it.
+
+    Between two key scans the newest frames follow the last one by odometry. A robot that stands adds frames, and no key
+    scans.
+    """
+
+    _graph: ScanGraph
+
+    def __init__(self, config: ScanGraphConfig | None = None, iterations_per_step: int = 0) -> None:
+        if iterations_per_step < 0:
+            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
+        self._config = config or ScanGraphConfig()
+        super().__init__(iterations_per_step or self._config.iterations)
+
+    @classmethod
+    def load(cls, weights: Path, world: str | None = None, iterations_per_step: int = 0) -> "ScanTrajectory":
+        """Begin with the settings in the folder ``weights``; raises ``LidarFileError``, of one clear line."""
+        return cls(read_lidar_file(weights, "graph", ScanGraphConfig, world), iterations_per_step)
+
+    @property
+    def graph(self) -> ScanGraph:
+        """The graph of key scans."""
+        return self._graph
+
+    def walls(self, most: int) -> np.ndarray:
+        """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
+        return self._graph.walls(most)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The settings: there are no networks."""
+        return {"graph": asdict(self._config), "iterations_per_step": self._iterations_per_step}
+
+    def _new_graph(self) -> ScanGraph:
+        return ScanGraph(self._config)
+
+    def _checked(self, step: RelativeStep) -> RelativeStep:
+        check_step(step, 0, None)
+        return replace(step, covariance=bounded(step.covariance))
+
+    def _begin_at(self, step: RelativeStep) -> None:
+        self._graph.begin_at(step)
+
+    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
+        return self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins)
+
+    def may_join(self, step: RelativeStep) -> bool:
+        """Whether the trajectory can go on with another odometry from this step's frame, which needs a key scan."""
+        return super().may_join(step) and step.key is not None
+
+    def localisation(self, origin: MapOrigin) -> MapLocalisation:
+        """Localisation in the key scans as they are, which lie in ``map`` as ``origin`` says.
+
+        Raises:
+            ValueError: no key scan has a point.
+        """
+        return MapLocalisation(Localiser(self._graph.matcher(origin)), self._checked)

@@ -1,0 +1,71 @@
+"""Frames follow the nodes of the chain, and a saved chain is one piece."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.relative_step import KeyScanStep
+from ngo_estimator.data.state_arrays import Arrays, StateError
+from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.graph.key_scan_chain import KeyScanChain
+
+STEP, COVARIANCE = np.array((1.0, 0.0, 0.0)), np.diag((0.1, 0.2, 0.3))
+FLOOR = np.diag((1e-4, 1e-4, 1e-6))
+
+
+def straight(joins: bool = False) -> KeyScanChain:
+    """Five frames on a line, of which the first, the third and the last but one are nodes."""
+    chain = KeyScanChain(FLOOR)
+    chain.begin_at(0)
+    for frame in range(1, 5):
+        joined = joins and frame == 2
+        chain.append(STEP, COVARIANCE, joined)
+        if frame in (2, 3):
+            key = KeyScanStep(no_scan(frame), (0, 2)[frame - 2], STEP, COVARIANCE)
+            chain.append_node(key, joined)
+    return chain
+
+
+def test_frames_between_two_nodes_share_what_an_optimisation_moved() -> None:
+    chain = straight()
+    chain.move(np.array(((0.0, 0.0, 0.0), (2.4, 0.0, 0.0), (3.4, 0.2, 0.0))), FLOOR)
+    np.testing.assert_allclose(chain.frame_poses(before=False, nodes=None)[:, 0], (0.0, 1.2, 2.4, 3.4, 4.4))
+    np.testing.assert_allclose(chain.frame_poses(before=True, nodes=None)[:, 0], (0.0, 1.0, 2.0, 3.0, 4.0))
+    assert chain.largest_move_m == pytest.approx(np.hypot(0.4, 0.2))
+
+
+def test_where_another_odometry_goes_on_the_frames_before_stay() -> None:
+    chain = straight(joins=True)
+    chain.move(np.array(((0.0, 0.0, 0.0), (2.4, 0.0, 0.0), (3.4, 0.0, 0.0))), FLOOR)
+    np.testing.assert_allclose(chain.frame_poses(before=False, nodes=None)[:, 0], (0.0, 1.0, 2.4, 3.4, 4.4))
+
+
+def test_a_step_in_the_same_key_scans_is_as_sure_as_its_registration() -> None:
+    np.testing.assert_allclose(straight().step_covariance, np.tile(COVARIANCE + FLOOR, (2, 1, 1)))
+    # The motion where another odometry goes on is that of the frames: nothing was registered.
+    unknown = straight(joins=True).step_covariance[0]
+    np.testing.assert_allclose(np.diagonal(unknown), np.array((0.2, 0.4 + 0.3, 0.6)) + np.diagonal(FLOOR))
+
+
+def test_a_chain_comes_back_from_its_state() -> None:
+    chain, other = straight(joins=True), KeyScanChain(FLOOR)
+    other.restore(chain.state())
+    assert chain.state().keys() == other.state().keys()
+    for name, array in chain.state().items():
+        np.testing.assert_array_equal(other.state()[name], array)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda state: {"frames": state["frames"][:-1]},
+        lambda state: {"frames": state["frames"][::-1].copy()},
+        lambda state: {"joins": np.array((1,))},
+        lambda state: {"before": np.zeros((4, 3))},
+    ],
+)
+def test_parts_that_do_not_belong_together_are_refused(damage: Callable[[Arrays], Arrays]) -> None:
+    state = straight().state()
+    with pytest.raises(StateError, match=r"there are not|not there"):
+        KeyScanChain(FLOOR).restore({**state, **damage(state)})

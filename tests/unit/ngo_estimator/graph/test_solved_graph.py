@@ -1,0 +1,54 @@
+"""The last optimisation limits how far a loop from a key frame may be off."""
+
+from typing import Any
+
+import numpy as np
+
+from ngo_estimator.data.row_buffers import SlidingRows
+from ngo_estimator.graph.solved_graph import SolvedGraph
+
+
+class Independent:
+    """Poses with the variance 1, but node 1 with the variance 2, that know nothing of each other."""
+
+    def covariance(self, nodes: list[int]) -> np.ndarray:
+        return np.diag(np.repeat([2.0 if node == 1 else 1.0 for node in nodes], 3))
+
+
+def rows(values: np.ndarray) -> SlidingRows:
+    kept = SlidingRows((3,), np.float32, len(values))
+    kept.replace(0, values)
+    return kept
+
+
+def solved(information: Any = None) -> SolvedGraph:
+    """Of the key frames 0 and 3, and a window from node 4 to node 6."""
+    return SolvedGraph(np.array([0, 3]), 4, 6, np.eye(3), information)
+
+
+NODES = np.zeros((8, 3))
+STD = rows(np.full((7, 3), 0.5))
+
+
+def test_before_the_first_optimisation_there_is_no_limit() -> None:
+    for graph in (SolvedGraph.none(), solved()):
+        assert np.isinf(graph.most_drift(np.array([0, 3]), 4, NODES, STD, 1.0)).all()
+
+
+def test_the_limit_is_four_times_the_variance_between_the_two_poses() -> None:
+    limits = solved(Independent()).most_drift(np.array([0, 3, 2, 5]), 4, NODES, STD, 10.0)
+    # The origin is known; the last step's own variance comes on top, which is scaled already.
+    np.testing.assert_allclose(limits[0], 4.0 * (10.0 * 1.0 + 0.25))
+    np.testing.assert_allclose(limits[1], 4.0 * (10.0 * (1.0 + 2.0) + 0.25))
+    assert np.isinf(limits[2:]).all()  # no key frame, and a node of the window
+
+
+def test_heading_counts_by_the_distance() -> None:
+    nodes = NODES.copy()
+    nodes[6:, 0] = 2.0
+    limits = solved(Independent()).most_drift(np.array([3]), 4, nodes, STD, 1.0)
+    np.testing.assert_allclose(limits[0], 4.0 * (np.array([3.0, 3.0 + 2.0 * 2.0**2, 3.0]) + 0.25))
+
+
+def test_where_the_window_has_left_all_of_it_behind_there_is_no_limit() -> None:
+    assert np.isinf(solved(Independent()).most_drift(np.array([3]), 7, NODES, STD, 1.0)).all()

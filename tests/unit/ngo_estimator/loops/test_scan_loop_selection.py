@@ -1,0 +1,58 @@
+"""The graph uses the loops that it may believe and needs; a saved selection names loops that there are."""
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.relative_step import KeyScanStep
+from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
+from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+
+COVARIANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
+
+
+def straight(keys: int) -> KeyScanChain:
+    """Key scans on a line, one each metre."""
+    chain, step = KeyScanChain(1e-8 * np.eye(3)), np.array((1.0, 0.0, 0.0))
+    chain.begin_at(0)
+    for k in range(1, keys):
+        chain.append(step, COVARIANCE, joins=False)
+        chain.append_node(KeyScanStep(no_scan(k), k - 1, step, COVARIANCE), joins=False)
+    return chain
+
+
+def loop(relative: tuple[float, float, float], agreeing: int) -> ScanLoops:
+    """A loop from the first to the last of ten key scans."""
+    evidence = np.zeros((1, len(EVIDENCE)))
+    evidence[0, EVIDENCE.index("agreeing")] = agreeing
+    return ScanLoops(np.array(((0, 9),)), np.array((relative,)), COVARIANCE[None], evidence, np.ones(1, bool))
+
+
+@pytest.mark.parametrize(("off_m", "redundant", "used"), [(0.0, 1e6, 0), (0.0, 1.0, 1), (5.0, 1e6, 1)])
+def test_a_loop_is_used_where_it_tells_something_new(off_m: float, redundant: float, used: int) -> None:
+    selection, found = ScanLoopSelection(ScanGraphConfig(redundant=redundant)), loop((9.0 + off_m, 0.0, 0.0), 1)
+    believed = selection.believed(np.zeros(1, np.int64), found, straight(10))
+    assert len(believed) == 1
+    assert selection.use(believed, found, straight(10)) == (off_m > 0.0)
+    assert len(selection) == used
+
+
+def test_a_doubted_loop_waits_until_enough_loops_agree() -> None:
+    config = ScanGraphConfig(agreeing_beyond=5)
+    selection, lost = ScanLoopSelection(config), straight(10)
+    lost.step_covariance[:] = np.eye(3)
+    nothing = np.zeros(0, np.int64)
+    assert len(selection.believed(np.zeros(1, np.int64), loop((9.0, 0.0, 0.0), 4), lost)) == 0
+    assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 4), lost)) == 0
+    assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 5), lost)) == 1
+    assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 5), lost)) == 0
+
+
+@pytest.mark.parametrize("name", ["used", "doubted"])
+def test_a_state_with_loops_that_are_not_there_is_refused(name: str) -> None:
+    selection = ScanLoopSelection(ScanGraphConfig())
+    with pytest.raises(StateError, match=f"'{name}' names loops"):
+        selection.restore({**selection.state(), name: np.array((3,))}, 3)

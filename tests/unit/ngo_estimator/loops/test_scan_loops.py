@@ -1,0 +1,37 @@
+"""Loops of key scans have one row in each array, and come back from their state."""
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+
+
+def some_loops(*pairs: tuple[int, int]) -> ScanLoops:
+    count = len(pairs)
+    return ScanLoops(
+        np.array(pairs), np.ones((count, 3)), np.ones((count, 3, 3)), np.ones((count, len(EVIDENCE))),
+        np.ones(count, bool),
+    )  # fmt: skip
+
+
+def test_loops_come_back_from_their_state() -> None:
+    loops = ScanLoops.none().extended(some_loops((0, 4), (1, 5)))
+    for name, rows in vars(ScanLoops.restored(loops.state(), 6)).items():
+        np.testing.assert_array_equal(rows, getattr(loops, name))
+
+
+def test_a_state_with_loops_of_other_keys_is_refused() -> None:
+    with pytest.raises(StateError, match="not among the 5"):
+        ScanLoops.restored(some_loops((0, 5)).state(), 5)
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="shapes"):
+        ScanLoops(np.zeros((2, 2)), np.zeros((1, 3)), np.zeros((2, 3, 3)), np.zeros((2, 6)), np.zeros(2, bool))
+
+
+def test_shares_above_one_are_refused() -> None:
+    with pytest.raises(ValueError, match="shares"):
+        ScanLoopConfig(least_response=1.5)

@@ -1,0 +1,64 @@
+"""Blocks of the odometry: chained steps, unfamiliar ones among them, and joins to another odometry."""
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.slam.odometry_blocks import OdometryBlocks
+from ngo_estimator.slam.step_log import StepLog
+from tests.unit.ngo_estimator.samples import small_optimizer
+
+STEP, VARIANCE = np.array([0.1, 0.0, 0.0], np.float32), np.full(3, 0.01)
+
+
+def make() -> OdometryBlocks:
+    return OdometryBlocks(small_optimizer("gauss_newton"), None, 10, StepLog)
+
+
+def drive(blocks: int, unfamiliar: tuple[int, ...] = (), joins: tuple[int, ...] = ()) -> OdometryBlocks:
+    """A drive straight on; ``joins`` are frames, ``unfamiliar`` steps."""
+    odometry = make()
+    for step in range(8 * blocks):
+        odometry.append(STEP, VARIANCE, np.zeros(6, np.float32), step not in unfamiliar, step + 1 in joins)
+        if odometry.steps % 8 == 0:
+            np.testing.assert_allclose(odometry.complete(), [0.8, 0.0, 0.0], atol=1e-6)
+    return odometry
+
+
+def test_a_block_is_the_chain_of_its_steps() -> None:
+    odometry = drive(3)
+    assert (odometry.steps, odometry.blocks) == (24, 3)
+    np.testing.assert_allclose(odometry.relative.slice(0), np.tile([0.8, 0.0, 0.0], (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(odometry.std.slice(0)[:, 2] ** 2, 0.08, rtol=1e-5)
+    pose, covariance = odometry.carried(np.array([5.0, 1.0, 0.0]), np.eye(3))
+    np.testing.assert_array_equal(pose, [5.0, 1.0, 0.0])
+    np.testing.assert_array_equal(covariance, np.eye(3))
+
+
+def test_unfamiliar_steps_make_a_block_blind() -> None:
+    odometry = drive(3, unfamiliar=(8, 9))
+    np.testing.assert_allclose(odometry.blind[:, 0] / (0.02 * small_optimizer().config.covariance_scale), [0, 1, 0])
+
+
+def test_a_recall_takes_sixteen_steps_back() -> None:
+    odometry = drive(4)
+    assert odometry.is_familiar and odometry.recall() == 16 and not odometry.is_familiar
+    np.testing.assert_array_equal(odometry.blind.any(axis=1), [False, False, True, True])
+
+
+def test_a_correction_is_spread_evenly_but_where_another_odometry_goes_on() -> None:
+    even = np.arange(1, 9) / 8
+    np.testing.assert_array_equal(drive(3).shares(), even[None])
+    np.testing.assert_array_equal(drive(3, joins=(11,)).shares(), [even, [0, 0, 1, 1, 1, 1, 1, 1], even])
+
+
+def test_blocks_that_do_not_belong_to_the_steps_are_refused() -> None:
+    state = drive(3).state()
+    restored = make()
+    restored.restore(state)
+    np.testing.assert_array_equal(restored.std.slice(0), drive(3).std.slice(0))
+    for name in ("odometry", "blind"):
+        with pytest.raises(StateError, match="do not belong together"):
+            make().restore(state | {name: state[name][: -8 if name == "odometry" else -1]})
+    with pytest.raises(StateError, match="another odometry begins"):
+        make().restore(state | {"joins": np.array([25])})

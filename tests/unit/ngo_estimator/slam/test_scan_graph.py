@@ -1,0 +1,79 @@
+"""The published covariance follows the factors on the steps' deviations, and the poses do not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.geometry.key_scan import KeyScan, no_scan
+from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.slam.scan_graph import ScanGraph
+from tests.unit.ngo_estimator.loops.buildings import HALLWAY, TWICE, between, scan_at
+
+STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))
+
+
+def driven(factors: np.ndarray, keys: int = 6, config: ScanGraphConfig | None = None) -> ScanGraph:
+    """A graph after steps that each end at a key scan without points."""
+    graph = ScanGraph(config or ScanGraphConfig(step_m=1e-6, step_deg=1e-6))
+    nothing = np.zeros(0, np.float32)
+    for k in range(keys):
+        key = KeyScanStep(no_scan(k + 1), k, STEP, COVARIANCE, factors)
+        if k == 0:
+            graph.begin_at(RelativeStep(1, 0, STEP, COVARIANCE, 0, STEP, nothing, nothing, key=key))
+        graph.append(STEP, COVARIANCE, key)
+    return graph
+
+
+@pytest.mark.parametrize("optimised", [False, True])
+def test_the_published_covariance_follows_the_factors_and_the_poses_do_not(optimised: bool) -> None:
+    plain, scaled = driven(np.ones(3)), driven(np.full(3, 3.0))
+    if optimised:
+        for graph in (plain, scaled):
+            graph.begin()
+            while not graph.advance(1):
+                pass
+    (pose, covariance), (same_pose, larger) = plain.newest(), scaled.newest()
+    np.testing.assert_array_equal(same_pose, pose)
+    np.testing.assert_allclose(larger, 9.0 * covariance, rtol=1e-6)
+
+
+def test_optimising_a_chain_without_loops_keeps_its_covariance() -> None:
+    graph = driven(np.array((2.0, 2.0, 0.5)))
+    before = graph.newest()[1]
+    graph.begin()
+    graph.advance(5)
+    np.testing.assert_allclose(graph.newest()[1], before, rtol=1e-6)
+
+
+def test_a_key_scan_has_no_factors_by_default() -> None:
+    key = KeyScanStep(no_scan(1), 0, STEP, COVARIANCE)
+    np.testing.assert_array_equal(key.factors, 1.0)
+    assert dataclasses.replace(key, factors=np.full(3, 2.0)).factors[0] == 2.0
+
+
+def test_more_loops_must_agree_where_the_robot_may_be_farther_away_than_was_searched() -> None:
+    """The same scans at the same poses: steps that tell little leave room for a place that looks alike."""
+    sure, lost = (0.02, 0.02, 0.005), (0.5, 0.5, 0.005)
+    random = np.random.default_rng(1)
+    scans = [dataclasses.replace(scan_at(HALLWAY, pose, random), stamp_ns=k) for k, pose in enumerate(TWICE)]
+    usual, wary = ScanGraphConfig(), ScanGraphConfig(agreeing_beyond=1000)
+    at_once, _ = first_loop(scans, usual, sure)
+    late, agreeing = first_loop(scans, usual, lost)
+    assert at_once < late < len(scans) and agreeing >= usual.agreeing_beyond
+    assert first_loop(scans, wary, sure)[0] == at_once
+    assert first_loop(scans, wary, lost)[0] == len(scans)
+
+
+def first_loop(scans: list[KeyScan], config: ScanGraphConfig, step_std: tuple[float, float, float]) -> tuple[int, int]:
+    """Key scans until the graph has a loop, and how many then agree with it; all, and 0, where it never has any."""
+    graph, nothing, covariance = ScanGraph(config), np.zeros(0, np.float32), np.diag(np.square(step_std))
+    for k, step in enumerate(between(TWICE[:-1], TWICE[1:])):
+        key = KeyScanStep(scans[k + 1], k, step, covariance)
+        if k == 0:
+            graph.begin_at(RelativeStep(1, 0, step, covariance, 0, step, nothing, nothing, origin_scan=scans[0]))
+        graph.append(step, covariance, key)
+        if len(graph.measurements()[1].nodes):
+            return graph.keys, int(graph.used_loops.agreeing.max())
+    return len(scans), 0
