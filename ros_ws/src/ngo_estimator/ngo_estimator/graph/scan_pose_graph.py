@@ -6,6 +6,7 @@ gated since registration can be wrong and sure of it: the graph may break there 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,22 +48,10 @@ class RelativePoses:
         whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
         return whitened
 
-    def equations(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Their part in the normal equations at these poses, as ``NormalEquations`` takes it.
-
-        ``weights`` ``(n,)`` multiply the information.
-        """
-        start, end = (poses[self.nodes[:, k]] for k in (0, 1))
-        cos, sin = np.cos(start[:, 2]), np.sin(start[:, 2])
-        x, y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
-        jacobian = np.zeros((len(self.nodes), 3, 6))
-        jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = -cos, -sin, cos * y - sin * x
-        jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, -cos, -cos * x - sin * y
-        jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
-        jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = cos, sin, -sin, cos
-        whitened = self.root @ jacobian
-        weighted = (weights[:, None, None] * whitened).mT
-        return weighted @ whitened, (weighted @ self.residuals(poses)[..., None])[..., 0]
+    @cached_property
+    def information(self) -> np.ndarray:
+        """Inverse covariances ``(n, 3, 3)``."""
+        return self.root.mT @ self.root
 
 
 class ScanPoseGraph:
@@ -85,6 +74,7 @@ class ScanPoseGraph:
         self.weights = gates.copy()
         """What the loops weigh ``(n,)``, zero to one."""
         self.converged = False
+        self._relative = np.concatenate((steps.relative, loops.relative))
         self._structure = GraphStructure(np.concatenate((steps.nodes, loops.nodes)), len(poses))
         self._cost = self._total(self.poses)
 
@@ -111,12 +101,9 @@ class ScanPoseGraph:
 
     def _equations(self, steps: RelativePoses) -> NormalEquations:
         """Those of ``steps`` and of the loops, at the present poses and weights."""
-        parts = (
-            steps.equations(self.poses, self._kernel_weights(self._steps)),
-            self._loops.equations(self.poses, self.weights),
-        )
-        hessian, gradient = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return NormalEquations(hessian, gradient, self._structure)
+        weights = np.concatenate((self._kernel_weights(self._steps), self.weights))
+        information = np.concatenate((steps.information, self._loops.information))
+        return NormalEquations(self._structure, self.poses, self._relative, weights[:, None, None] * information)
 
     def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
         squared = (measured.residuals(self.poses) ** 2).sum(1)
