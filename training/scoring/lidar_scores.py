@@ -67,7 +67,7 @@ def score_drive(
             continue
         path = cache / f"{source.name}.{name}.npz"
         code = code_digest((*_ALWAYS, *source.code, *row.code))
-        identity = json.dumps([name, identity_of(row.settings), source.identity, code, _weights(row, weights)])
+        identity = json.dumps([name, identity_of(row.settings), source.identity, code, weights_digest(row, weights)])
         known = _read(path, identity)
         if known is None and known_only:
             continue
@@ -113,7 +113,7 @@ def _thinned(poses: np.ndarray) -> np.ndarray:
     return poses[:: max(1, -(-len(poses) // _MOST_DRAWN))]
 
 
-def _weights(row: Row, weights: Path) -> str:
+def weights_digest(row: Row, weights: Path) -> str:
     """A hash of the shipped settings, for a row of our own estimators."""
     if not any(module.__name__.startswith("ngo_estimator.") for module in row.code):
         return ""
