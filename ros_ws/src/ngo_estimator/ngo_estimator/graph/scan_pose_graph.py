@@ -5,53 +5,17 @@ by their residuals under the current poses, and takes a Gauss-Newton step. It be
 gated since registration can be wrong and sure of it: the graph may break there if loops say so.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
-from ngo_estimator.geometry.planar_arrays import between, wrap
+from ngo_estimator.graph.corrector import normal_equations
 from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
+from ngo_estimator.graph.relative_poses import RelativePoses
 
 _LEAST_STEP = 1e-4
 """Size of a step (m, rad) below which the poses have converged."""
 
 _HALVINGS = 4
 """How often a step that does not help is halved."""
-
-
-@dataclass(frozen=True)
-class RelativePoses:
-    """Measured poses of nodes, each seen from another.
-
-    ``nodes`` ``(n, 2)``: the second is seen from the first; ``relative`` ``(n, 3)`` (m, m, rad). ``root`` ``(n, 3, 3)``
-    makes the information matrix ``root.T @ root``, along the axes of the first node.
-    """
-
-    nodes: np.ndarray
-    relative: np.ndarray
-    root: np.ndarray
-
-    @classmethod
-    def of_covariances(cls, nodes: np.ndarray, relative: np.ndarray, covariance: np.ndarray) -> "RelativePoses":
-        """Measurements with covariances ``(n, 3, 3)``; raises ``ValueError`` for one that is not positive definite."""
-        try:
-            lower = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            raise ValueError("a covariance is not positive definite; expected positive definite ones") from None
-        return cls(nodes, relative, np.linalg.inv(lower))
-
-    def residuals(self, poses: np.ndarray) -> np.ndarray:
-        """Whitened residuals ``(n, 3)``, measured less predicted, under poses ``(nodes, 3)``."""
-        off = self.relative - between(poses[self.nodes[:, 0]], poses[self.nodes[:, 1]])
-        off[:, 2] = wrap(off[:, 2])
-        whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
-        return whitened
-
-    @cached_property
-    def information(self) -> np.ndarray:
-        """Inverse covariances ``(n, 3, 3)``."""
-        return self.root.mT @ self.root
 
 
 class ScanPoseGraph:
@@ -74,7 +38,6 @@ class ScanPoseGraph:
         self.weights = gates.copy()
         """What the loops weigh ``(n,)``, zero to one."""
         self.converged = False
-        self._relative = np.concatenate((steps.relative, loops.relative))
         self._structure = GraphStructure(np.concatenate((steps.nodes, loops.nodes)), len(poses))
         self._cost = self._total(self.poses)
 
@@ -101,9 +64,8 @@ class ScanPoseGraph:
 
     def _equations(self, steps: RelativePoses) -> NormalEquations:
         """Those of ``steps`` and of the loops, at the present poses and weights."""
-        weights = np.concatenate((self._kernel_weights(self._steps), self.weights))
-        information = np.concatenate((steps.information, self._loops.information))
-        return NormalEquations(self._structure, self.poses, self._relative, weights[:, None, None] * information)
+        parts = (steps, self._kernel_weights(self._steps)), (self._loops, self.weights)
+        return normal_equations(self.poses, *parts, structure=self._structure)
 
     def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
         squared = (measured.residuals(self.poses) ** 2).sum(1)
