@@ -98,6 +98,8 @@ class LoopClosing:
     def _take(self, loops: Loops) -> None:
         self._loops = loops
         self._structure: GraphStructure | None = None
+        if self._new is not None and not len(self._new):
+            return
         self._judged: JudgedLoops[Any]
         if not self._is_single:
             self._judged = JudgedLoops.of(loops)
@@ -163,9 +165,9 @@ class LoopClosing:
 
     def _look(self, adjusted: Any, deviation: Any, step_std: Any, iteration: int) -> None:
         self._adjusted, self._deviation, self._poses = adjusted, deviation, chained(adjusted + deviation)
-        loops, poses = self._judged, self._poses
         if self._new is not None and not len(self._new):
             return
+        loops, poses = self._judged, self._poses
         expected = odometry_variances(loops.nodes, poses, step_std**2)
         if loops.most_drift is not None:
             expected = library(expected).minimum(expected, loops.most_drift)

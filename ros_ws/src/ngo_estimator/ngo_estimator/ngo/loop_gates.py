@@ -166,6 +166,8 @@ def without_contradictions(loops: Loops, steps: MetaSteps, which: np.ndarray | N
     Args:
         which: indices of the loops of the only trajectory that are tested, by default all.
     """
+    if which is not None and not len(which):
+        return loops
     with torch.no_grad():
         if not is_single(steps):
             held = _hold(loops.nodes, loops.measured.double(), steps.relative.double(), steps.std.double())
