@@ -19,7 +19,7 @@ import tyro
 from ngo_estimator.checkpoint import load_local
 from training.common import records
 from training.data.worlds import world_named
-from training.report.results_page import interval, markdown
+from training.report.page import interval, markdown
 from training.scoring.validation_steps import odometry_errors
 from training.train_local import RPE_STEPS
 

@@ -8,15 +8,15 @@ trained or chosen on, and beside other programs. The command writes ``training/r
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from tqdm import tqdm
 
 from ngo_recordings import mounting, recording, scan_stream, topics
 from ngo_sim import building2d, episodes, maze2d
@@ -25,19 +25,28 @@ from training.common.command_line import run_command
 from training.common.records import write_at_once
 from training.data import building_drives, scans, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
+from training.data.lidar_drives import LidarDrive
 from training.data.scans import CONDITIONS
 from training.data.simulated_drives import maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, logs_below
 from training.report import lidar_figures, lidar_page
-from training.scoring.lidar_bars import PUBLISHED, Bar, Table, bars
+from training.scoring.lidar_bars import PUBLISHED, Bar, bars
 from training.scoring.lidar_rows import ROWS, Row
-from training.scoring.lidar_scores import DriveSource, Scored, score_drive
+from training.scoring.lidar_scores import made_runs, scored_rows
 from training.scoring.statistics import compare, mean_interval
-
-Numbers = dict[str, dict[str, Any]]
-"""``{mean, ci95}`` by the metric's key."""
+from training.scoring.table import (
+    Drive,
+    Measured,
+    Numbers,
+    Table,
+    column,
+    interval_of,
+    intervals,
+    means_over_samples,
+    measure,
+)
 
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
 _BUILDINGS = (building2d, building_drives)
@@ -47,6 +56,7 @@ _MOST_SCANS = 20_000  # of a building: some robots stand for hours
 _PAIRED = ("ate_m", "within_three_deviations", "negative_log_likelihood")
 _SLIPS_PER_KM = 300.0  # of the table of slip; the buildings have up to 60
 _ABLATED = ("buildings", "aliased")
+_WITH_WHEELS = ("logs", "buildings", "aliased", "slip")
 _SLIP_ROWS = ("wheels", "ours")
 _SETTINGS = ("buildings", "first_building", "ablation", "length_m", "mazes", "frames")
 _SCANNER_ROWS = ("ours_without_wheels",)
@@ -108,12 +118,12 @@ def main(arguments: Arguments) -> dict[str, Any]:
     rows, skipped = _rows(arguments.rows)
     slip_rows = {name: row for name, row in rows.items() if name in _SLIP_ROWS}
     tables = {
-        name: _measured(arguments, name, sources, slip_rows if name == "slip" else rows)
-        for name, sources in _sources(arguments, skipped).items()
+        name: _measured(arguments, name, drives, slip_rows if name == "slip" else rows)
+        for name, drives in _plans(arguments, skipped).items()
     }
     scanner_rows = {name: row for name, row in rows.items() if name in _SCANNER_ROWS}
     scanners = {
-        condition: _measured(arguments, condition, _scanner_sources(arguments, condition), scanner_rows)
+        condition: _measured(arguments, condition, _scanner_plan(arguments, condition), scanner_rows)
         for condition in CONDITIONS
     }
     found = bars(tables, scanners)
@@ -152,93 +162,85 @@ def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
     )
 
 
-def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSource]]:
+def _plans(arguments: Arguments, skipped: list[str]) -> dict[str, Sequence[Drive]]:
     """The drives of each table; what is not there is added to what is skipped."""
     seeds = BUILDING_TEST_SEEDS[arguments.first_building :]
     aliased = seeds[_ALIASED_FIRST:]
-    sources = {
+    mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
+    plans: dict[str, Sequence[Drive]] = {
         "buildings": [_building(arguments, "buildings", seed) for seed in seeds[: arguments.buildings]],
         "aliased": [_building(arguments, "aliased", seed) for seed in aliased[: arguments.buildings]],
         "slip": [_building(arguments, "slip", seed) for seed in seeds[: arguments.ablation]],
+        "maze2d": [
+            _drive(
+                arguments,
+                f"maze2d_{seed}",
+                f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
+                partial(maze_drive, seed, arguments.frames, mazes[0]),
+                _MAZES,
+            )
+            for seed in mazes
+        ],
     }
-    mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
-    sources["maze2d"] = [
-        DriveSource(
-            f"maze2d_{seed}",
-            f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
-            partial(maze_drive, seed, arguments.frames, mazes[0]),
-            _MAZES,
-            has_wheels=False,
-        )
-        for seed in mazes
-    ]
-    if arguments.logs is None:
-        skipped.append("logs: no folder is given (--logs)")
-        return sources
-    logs = logs_below(arguments.logs)
+    logs = {} if arguments.logs is None else logs_below(arguments.logs)
     if not logs:
-        skipped.append("logs: the folder has none")
-        return sources
-    of_logs = [DriveSource(name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()]
-    return {"logs": of_logs, **sources}
+        skipped.append("logs: no folder is given (--logs)" if arguments.logs is None else "logs: the folder has none")
+        return plans
+    of_logs = [
+        _drive(arguments, name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()
+    ]
+    return {"logs": of_logs, **plans}
 
 
-def _building(arguments: Arguments, table: str, seed: int) -> DriveSource:
-    slips = _SLIPS_PER_KM if table == "slip" else None
-    named = "" if slips is None else f", {slips:g} slips a km"
-    return DriveSource(
-        f"{table}_{seed}",
-        f"building {seed} {table} {arguments.length_m:g} m, {_MOST_SCANS} scans{named}",
-        partial(building_drive, seed, arguments.length_m, table == "aliased", _MOST_SCANS, slips),
-        _BUILDINGS,
-    )
-
-
-def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
+def _scanner_plan(arguments: Arguments, condition: str) -> Sequence[Drive]:
     changes = CONDITIONS[condition]
     return [
-        DriveSource(
+        _drive(
+            arguments,
             f"maze_{seed}",
             f"scanned maze {seed}, {condition}, {json.dumps(changes)}, {arguments.frames} frames",
             partial(scanned_maze_drive, seed, arguments.frames, changes),
             _MAZES,
-            has_wheels=False,
         )
         for seed in WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes]
     ]
 
 
-def _measured(arguments: Arguments, table: str, sources: Sequence[DriveSource], rows: Mapping[str, Row]) -> Table:
-    cache = arguments.runs / "scan" / "results" / table.replace(" ", "_").replace("%", "percent").replace(",", "")
-    measured: dict[str, dict[str, Scored]] = {}
-    ablation = len(sources) if table == "logs" else arguments.ablation if table in _ABLATED else 0
-    with tqdm(sources, desc=table, unit="drive") as bar:
-        for index, source in enumerate(bar):
-            bar.set_postfix_str(source.name)
-            asked = {
-                name: row
-                for name, row in rows.items()
-                if (index < ablation or not row.ablation) and not (table == "logs" and row.needs_truth)
-            }
-            measured[source.name] = dict(
-                score_drive(source, asked, arguments.weights, cache, known_only=arguments.known)
-            )
-    return measured
+def _building(arguments: Arguments, name: str, seed: int) -> Drive:
+    slips = _SLIPS_PER_KM if name == "slip" else None
+    named = "" if slips is None else f", {slips:g} slips a km"
+    identity = f"building {seed} {name} {arguments.length_m:g} m, {_MOST_SCANS} scans{named}"
+    make = partial(building_drive, seed, arguments.length_m, name == "aliased", _MOST_SCANS, slips)
+    return _drive(arguments, f"{name}_{seed}", identity, make, _BUILDINGS)
 
 
-def _log_numbers(scored: Mapping[str, Scored]) -> dict[str, Numbers]:
+def _drive(
+    arguments: Arguments, name: str, identity: str, make: Callable[[], LidarDrive], code: tuple[ModuleType, ...]
+) -> Drive:
+    return Drive(name, identity, partial(made_runs, make, arguments.weights), code)
+
+
+def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Mapping[str, Row]) -> Table:
+    """A table; rows of the ablation have its first drives alone, those that need wheels no mazes."""
+    folder = arguments.runs / "scan" / "results" / name.replace(" ", "_").replace("%", "percent").replace(",", "")
+    ablation = len(drives) if name == "logs" else arguments.ablation if name in _ABLATED else 0
+    scored = scored_rows(rows, arguments.weights)
+
+    def is_asked(index: int, row: Row) -> bool:
+        without_truth, without_wheels = name == "logs", name not in _WITH_WHEELS
+        left_out = (row.needs_truth and without_truth) or (row.needs_wheels and without_wheels)
+        return (index < ablation or not row.ablation) and not left_out
+
+    plan = [
+        (drive, {key: scored[key] for key, row in rows.items() if is_asked(index, row)})
+        for index, drive in enumerate(drives)
+    ]
+    return measure(plan, folder, name, known_only=arguments.known)
+
+
+def _log_numbers(scored: Mapping[str, Measured]) -> dict[str, Numbers]:
     """Of one log: means over its relations, the interval by resampling them; one number of a whole log has none."""
-    return {
-        row: {key: _interval(values) for key, values in one.errors.items()}
-        for row, one in scored.items()
-        if not one.failed
-    }
-
-
-def _interval(values: np.ndarray) -> dict[str, Any]:
-    if len(values) == 0:
-        return {"mean": None, "ci95": None}
-    return mean_interval(values).as_json() if len(values) > 1 else {"mean": float(values[0]), "ci95": None}
+    return {row: intervals(one.errors) for row, one in scored.items() if not one.failed}
 
 
 def _published(log: str) -> dict[str, Numbers]:
@@ -248,29 +250,28 @@ def _published(log: str) -> dict[str, Numbers]:
     }
 
 
-def _table_numbers(table: Table) -> dict[str, Numbers]:
+def _table_numbers(found: Table) -> dict[str, Numbers]:
     """Of several drives: means over them, the interval by resampling them, and how many these are."""
-    by_row: dict[str, dict[str, list[float]]] = {}
-    for rows in table.values():
-        for row, scored in rows.items():
-            for key, values in scored.errors.items():
-                by_row.setdefault(row, {}).setdefault(key, []).append(float(values.mean()))
+    rows = dict.fromkeys(row for measured in found.values() for row, one in measured.items() if one.errors)
     return {
-        row: {key: {**_interval(np.array(values)), "drives": len(values)} for key, values in errors.items()}
-        for row, errors in by_row.items()
+        row: {
+            key: {**interval_of(values), "drives": len(values)}
+            for key, values in means_over_samples(column(found, row)).items()
+        }
+        for row in rows
     }
 
 
-def _paired(table: Table) -> dict[str, Any]:
+def _paired(found: Table) -> dict[str, Any]:
     """By row: how much larger its numbers are than those of our row on the same drives, in a table of two or more."""
     pairs: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for rows in table.values():
-        for row, scored in rows.items():
+    for rows in found.values():
+        for row, measured in rows.items():
             other = _paired_with(row)
             known = rows[other].errors if other in rows and other != row else {}
             for key in _PAIRED:
-                if key in known and key in scored.errors:
-                    pair = float(scored.errors[key][0]), float(known[key][0])
+                if key in known and key in measured.errors:
+                    pair = float(measured.errors[key][0]), float(known[key][0])
                     pairs.setdefault(row, {}).setdefault(key, []).append(pair)
     return {
         row: {

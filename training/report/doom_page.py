@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
-from training.report.results_page import interval, markdown, number
+from training.report.page import interval, markdown, number
+from training.report.page import page as whole
 from training.scoring.doom_rows import METRICS, ROWS
 
 _TITLES = {
@@ -48,7 +49,7 @@ def page(result: dict[str, Any], weights: Path) -> str:
         parts.append(f"## {title}\n\n" + markdown(["Map", "Path, m", *(f"`{row}`" for row in ROWS)], rows))
     parts.append("## Training\n\n" + markdown(["Network", "Command", "Minutes", "Datapoints/s"], _trainings(weights)))
     parts.append(_LEVELS)
-    return "\n\n".join(parts) + "\n"
+    return whole(parts)
 
 
 def _ratios(maps: dict[str, Any], returns: dict[str, float]) -> str:

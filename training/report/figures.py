@@ -22,9 +22,9 @@ from training.baselines.deepvo import DEEPVO
 from training.report import attention_map
 from training.report.maze_views import in_maze, maze_and_start
 from training.report.training_records import learning_curve, run_folder
-from training.scoring.error_cache import Evaluation
 from training.scoring.row_estimators import Arrays
 from training.scoring.scores import METRICS, Metric, in_sentence
+from training.scoring.table import Measured
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
 TRUTH, LOCAL_COLOR, CORRECTED = "#1f6fd6", "#2ca02c", "#ff7f0e"
@@ -62,7 +62,7 @@ MAIN_ROWS = (
 )
 CORRECTED_ROW = "ngo_5"
 
-Tables = dict[str, dict[str, list[Evaluation]]]
+Tables = dict[str, dict[str, list[Measured]]]
 
 
 def draw_all(
@@ -124,15 +124,15 @@ def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], evalua
     for row, (table, arrays) in zip(panels, stores.items(), strict=True):
         found = evaluations[table]
         steps = arrays["truth"].shape[1]
-        corrected, odometry = (found[name][0].scores[steps][metric.key] for name in (CORRECTED_ROW, "local"))
+        corrected, odometry = (found[name][0].errors[f"{steps}:{metric.key}"] for name in (CORRECTED_ROW, "local"))
         order = np.argsort(corrected)
         for axes, what, k in ((row[0], "median", int(order[len(order) // 2])), (row[1], "largest", int(order[-1]))):
             maze, start = maze_and_start(sources.world, table, split, k)
             draw_maze(axes, maze)
             for poses, color, label, width in (
                 (np.asarray(arrays["truth"][k]), TRUTH, "truth", 2.4),
-                (found["local"][0].poses[k], LOCAL_COLOR, "local", 1.1),
-                (found[CORRECTED_ROW][0].poses[k], CORRECTED, f"corrected ({CORRECTED_ROW})", 1.1),
+                (found["local"][0].drawn["poses"][k], LOCAL_COLOR, "local", 1.1),
+                (found[CORRECTED_ROW][0].drawn["poses"][k], CORRECTED, f"corrected ({CORRECTED_ROW})", 1.1),
             ):
                 xy = in_maze(start, poses)[:, :2]
                 axes.plot(xy[:, 0], xy[:, 1], color=color, linewidth=width, label=label, alpha=0.9)

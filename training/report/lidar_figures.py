@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from training.data.batches import seen_from_first
-from training.scoring.lidar_scores import Scored
+from training.scoring.table import Measured
 
-Drives = Mapping[str, Mapping[str, Scored]]
+Drives = Mapping[str, Mapping[str, Measured]]
 
 _MANY = 4  # smaller pictures of more drives
 _DRAWN = {"buildings": 4, "aliased": 2}
@@ -61,16 +61,19 @@ def _draw(path: Path, drives: Drives) -> None:
     plt.close(figure)
 
 
-def _draw_drive(axis: Any, name: str, rows: Mapping[str, Scored]) -> None:
+def _draw_drive(axis: Any, name: str, rows: Mapping[str, Measured]) -> None:
     ours = rows["ours"]
-    if len(ours.walls):
-        axis.plot(*ours.walls.T, ",", color="0.45", rasterized=True)
-    if "wheels" in rows and len(rows["wheels"].path):
-        axis.plot(*seen_from_first(rows["wheels"].path)[:, :2].T, color="tab:red", linewidth=0.7, label="wheels")
-    if len(ours.truth):
-        axis.plot(*seen_from_first(ours.truth)[:, :2].T, color="black", linewidth=1.6, label="truth")
-    axis.plot(*ours.path[:, :2].T, color="tab:blue", linewidth=0.8, label="corrected")
-    shown = np.concatenate((ours.walls, ours.path[:, :2]))
+    walls, path, truth = (ours.drawn[name] for name in ("walls", "path", "truth"))
+    if len(walls):
+        axis.plot(*walls.T, ",", color="0.45", rasterized=True)
+    if "wheels" in rows and not rows["wheels"].failed:
+        axis.plot(
+            *seen_from_first(rows["wheels"].drawn["path"])[:, :2].T, color="tab:red", linewidth=0.7, label="wheels"
+        )
+    if len(truth):
+        axis.plot(*seen_from_first(truth)[:, :2].T, color="black", linewidth=1.6, label="truth")
+    axis.plot(*path[:, :2].T, color="tab:blue", linewidth=0.8, label="corrected")
+    shown = np.concatenate((walls, path[:, :2]))
     low, high = np.percentile(shown, 0.5, axis=0), np.percentile(shown, 99.5, axis=0)
     margin = 0.05 * float((high - low).max()) + 0.5
     axis.set_xlim(low[0] - margin, high[0] + margin)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from training.scoring.lidar_scores import Scored
+from training.scoring.table import Measured
 
-Table = Mapping[str, Mapping[str, Scored]]
-"""Scored rows by the drive's name, then the row's."""
+Table = Mapping[str, Mapping[str, Measured]]
+"""By the drive's name, then the row's."""
 
 PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
     "aces": {"cartographer_published": {"translation_m": 0.0375, "rotation_deg": 0.373}},
@@ -155,5 +155,5 @@ def _covariance_bars(tables: Mapping[str, Table]) -> Iterator[Bar]:
                 yield Bar(f"{table}, {row}: truth within three deviations", float(np.mean(found)), least=0.95)
 
 
-def _of(rows: Mapping[str, Scored], row: str) -> dict[str, np.ndarray]:
+def _of(rows: Mapping[str, Measured], row: str) -> dict[str, np.ndarray]:
     return rows[row].errors if row in rows else {}
