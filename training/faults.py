@@ -9,7 +9,6 @@ command writes ``training/results/faults.json`` and ``docs/results_faults.md``. 
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,22 +17,21 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from ngo_estimator.checkpoint import FAMILIARITY, load_local, load_place
-from ngo_estimator.data.weights_file import load_description
+from ngo_estimator.checkpoint import load_local, load_place
 from ngo_estimator.frontend.camera import local_odometry
 from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.episodes import simulate
 from training.data.faults import SensedDrive, faulted
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
 from training.report import faults_page
+from training.report.folders import Folders
 from training.scoring import honesty
 from training.scoring.honesty import HonestRun, honest_run
-from training.scoring.table import Drive, Measured, Row, column, intervals, means_over_samples, measure
+from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, means_over_samples, measure
 
 CLEAN = "clean"
 FAULTS_OF = {
@@ -52,25 +50,14 @@ _SEEDS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS}
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the measurement."""
 
     split: Literal["validation", "test"] = "test"
     """Mazes and scenarios to measure in. Everything is chosen on validation; test is for the final table alone."""
-    mazes: int = 6
-    """Drives of each row, each in a maze of its own."""
-    frames: int = 600
-    """Frames of a drive."""
-    worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")
-    """Worlds to measure."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets faults.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_faults.md."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what was measured."""
+    mazes: int = 6  # Drives of each row, each in a maze of its own.
+    frames: int = 600  # Frames of a drive.
+    worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")  # Worlds to measure.
 
     def __post_init__(self) -> None:
         if self.mazes < 2 or self.frames < 100:
@@ -84,15 +71,11 @@ class _Cores:
     local: LocalOdometry
     plain: LocalOdometry
     online: OnlineTrajectory
-    identity: str
 
     @classmethod
     def load(cls, folder: Path, world: str) -> _Cores:
-        (network, described), (place, of_place) = load_local(folder, world), load_place(folder, world)
-        sha256 = load_description(folder / f"{FAMILIARITY}.safetensors", FAMILIARITY)["sha256"]
-        online = OnlineTrajectory.load(folder, world=world)
-        identity = json.dumps([sha256, described["sha256"], of_place["sha256"], online.identity])
-        return cls(LocalOdometry.load(folder, world), LocalOdometry(network, place, world), online, identity)
+        plain = LocalOdometry(load_local(folder, world)[0], load_place(folder, world)[0], world)
+        return cls(LocalOdometry.load(folder, world), plain, OnlineTrajectory.load(folder, world=world))
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -106,19 +89,18 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "tables": {world: _table(arguments, world) for world in arguments.worlds},
     }
     result.pop("arguments")
-    write_at_once(arguments.out / "faults.json", json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_faults.md", faults_page.page(result))
-    return result
+    return arguments.publish("faults", result, faults_page.page(result))
 
 
 def _table(arguments: Arguments, world: str) -> dict[str, Any]:
     """Of a world by the fault: means over drives."""
     networks = "maze3d" if world == "doom" else world
-    cores = _Cores.load(arguments.weights / networks, networks)
+    weights = arguments.weights / networks
+    cores, identity = _Cores.load(weights, networks), folder_digest(weights)
     folder = arguments.runs / "faults" / arguments.split
     table: dict[str, Any] = {}
     for name in SCENARIOS[arguments.split] if world == "doom" else (CLEAN, *FAULTS_OF[world]):
-        row = Row(partial(_measured, cores=cores, clean=name == CLEAN), cores.identity, _CODE)
+        row = Row(partial(_measured, cores=cores, clean=name == CLEAN), identity, _CODE)
         plan = [(_drive(arguments, world, name, number), {"ours": row}) for number in range(arguments.mazes)]
         table[name] = _summary(column(measure(plan, folder, f"{world} {name}"), "ours"))
     return table

@@ -11,6 +11,7 @@ ones repeat one module with one texture. Writes ``training/results/relocalisatio
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass
 from functools import partial
@@ -26,7 +27,6 @@ from ngo_estimator.slam import localisation, online_trajectory, place_matcher, s
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.batches import seen_from_first
 from training.data.kidnapped_drives import Features, kidnapped_drives
 from training.data.lidar_drives import LidarDrive
@@ -34,10 +34,10 @@ from training.data.worlds import WORLDS, World
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_identity, logs_below, read_drive
 from training.report import relocalisation_page
+from training.report.folders import Folders
 from training.scoring import kidnapped, kidnapped_logs, online_estimate, relocalisation_rows
 from training.scoring.kidnapped import NUMBERS, KnownMap, MapErrors, scored, starts
 from training.scoring.kidnapped_logs import as_arrays, log_starts, starts_of, summary_of
-from training.scoring.lidar_scores import settings_digest
 from training.scoring.metrics import off_by, rms
 from training.scoring.online_estimate import run_online
 from training.scoring.relocalisation_rows import ROWS, Networks, RowName, row_of
@@ -47,6 +47,7 @@ from training.scoring.table import (
     Numbers,
     Row,
     column,
+    folder_digest,
     interval_of,
     intervals,
     means_over_samples,
@@ -55,7 +56,7 @@ from training.scoring.table import (
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the table."""
 
     tables: tuple[Literal["maze2d", "maze3d", "maze2d_aliased", "maze3d_aliased"], ...] = (
@@ -67,26 +68,14 @@ class Arguments:
     """Tables to measure; none: those in the JSON stay as they are, for the logs alone."""
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Thresholds are chosen on validation; the test split is for the final table alone."""
-    mazes: int = 10
-    """Mazes of each table."""
+    mazes: int = 10  # Mazes of each table.
     starts: int = 50
     """Starts in mapped parts of each maze; up to a fifth as many more are taken in parts without a map."""
-    aliased_starts: int = 20
-    """The same in each aliased maze."""
-    rows: tuple[RowName, ...] = ROWS
-    """Rows to measure."""
+    aliased_starts: int = 20  # The same in each aliased maze.
+    rows: tuple[RowName, ...] = ROWS  # Rows to measure.
     logs: Path | None = None
     """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: they stay as the JSON has them."""
-    log_starts: int = 20
-    """Starts in each log."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets relocalisation.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_relocalisation.md."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of drives, maps and what was measured."""
+    log_starts: int = 20  # Starts in each log.
 
     def __post_init__(self) -> None:
         if min(self.mazes, self.starts, self.aliased_starts) < 2:
@@ -113,37 +102,35 @@ def main(arguments: Arguments) -> dict[str, Any]:
     if arguments.logs is not None:
         of_logs = {**made, "command": f"{made['command']} --logs FOLDER"}
         result["logs"] = {**of_logs, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
-    write_at_once(path, json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_relocalisation.md", relocalisation_page.page(result))
     for table, rows in result["tables"].items():
         for row, numbers in rows.items():
             line = ", ".join(f"{name} {number['mean']:.4g}" for name, number in numbers.items())
             print(f"{table:15} {row:16} {line}")
-    return result
+    return arguments.publish("relocalisation", result, relocalisation_page.page(result))
 
 
 def measured(arguments: Arguments, name: str) -> dict[str, Any]:
     """All rows of a table: of starts in mapped parts, of other starts, and the errors of the maps themselves."""
     world, aliased = WORLDS[name.removesuffix("_aliased")], name.endswith("_aliased")
     stores = kidnapped_drives(world, arguments.split, aliased, arguments.mazes, arguments.weights, arguments.runs)
-    networks = Networks.load(world, arguments.weights)
+    networks, weights = Networks.load(world, arguments.weights), folder_digest(arguments.weights / world.name)
     folder = arguments.runs / world.name / "relocalisation" / f"{arguments.split}_{'aliased_' * aliased}results"
     count = arguments.aliased_starts if aliased else arguments.starts
     drives = [
         Drive(f"maze_{number}", f"{name} {arguments.split} {number}", partial(_Maze, stores, number))
         for number in range(arguments.mazes)
     ]
-    map_row = Row(partial(_map, world=world, weights=arguments.weights), networks.identity, _MAP_CODE)
+    map_row = Row(partial(_map, world=world, weights=arguments.weights), weights, _MAP_CODE)
     maps = measure([(drive, {_MAP: map_row}) for drive in drives], folder, f"{name} maps")
 
     def with_map(drive: Drive) -> dict[str, Row]:
         poses = maps[drive.name][_MAP].drawn["poses"]
+        identity = f"{weights} {count} {hashlib.sha256(poses.tobytes()).hexdigest()}"
         return {
             row: Row(partial(_starts, row=row, networks=networks, poses=poses, count=count), identity, _ROW_CODE)
             for row in arguments.rows
         }
 
-    identity = f"{networks.identity} {count}"
     found = measure([(drive, with_map(drive)) for drive in drives], folder, name)
     return {
         **{kind: {row: _summary(column(found, row), kind) for row in arguments.rows} for kind in _KINDS},
@@ -196,7 +183,7 @@ def _starts(maze: _Maze, row: RowName, networks: Networks, poses: np.ndarray, co
 def _logs(arguments: Arguments, folder: Path) -> dict[str, Any]:
     """Numbers of each log in the folder."""
     weights, count = arguments.weights / "scan", arguments.log_starts
-    row = Row(partial(_log, weights=weights, count=count), f"{count} {settings_digest(weights)}", _LOG_CODE)
+    row = Row(partial(_log, weights=weights, count=count), f"{count} {folder_digest(weights)}", _LOG_CODE)
     plan = [
         (Drive(name, log_identity(path), partial(read_drive, path), (lidar_logs,)), {"ours": row})
         for name, path in logs_below(folder).items()

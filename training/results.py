@@ -13,7 +13,6 @@ measured in mazes that nothing was trained or chosen on. The command writes ``tr
 import json
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -24,11 +23,11 @@ from ngo_estimator.trajectory import errors
 from training import results_doom, results_scan
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.prerequisites import Scripts, Wanted, prepare
 from training.report import attention, figures, results_page, tables
+from training.report.folders import Folders
 from training.report.training_records import trainings_json
 from training.scoring import oracle_rows
 from training.scoring import prefix_errors as prefix_errors_module
@@ -41,27 +40,16 @@ from training.scoring.table_rows import ROWS, Sources, rows_of
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the results."""
 
-    world: Literal["maze2d", "maze3d"]
-    """World to measure in."""
+    world: Literal["maze2d", "maze3d"]  # World to measure in.
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Designs are chosen on validation; the test split is for the final tables alone."""
-    trajectories: int = 0
-    """Trajectories of each table, each in a maze of its own; 0 for the world's number."""
-    seeds: int = 3
-    """Trainings of each optimizer, with the seeds 0, 1, ..."""
+    trajectories: int = 0  # Trajectories of each table, each in a maze of its own; 0 for the world's number.
+    seeds: int = 3  # Trainings of each optimizer, with the seeds 0, 1, ...
     prefixes: tuple[int, ...] = ()
     """Numbers of steps after which errors are given, as if the robot had stopped there; none: the world's."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors of the local network and the place encoder."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets WORLD.json, and holds WORLD.gtsam.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_WORLD.md and images/."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of feature stores, rows' weights, logs and estimates."""
 
     def __post_init__(self) -> None:
         if (self.trajectories < 2 and self.trajectories != 0) or self.seeds < 1:
@@ -92,11 +80,9 @@ def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]
             table: tables.rows_json(limiting_rows(arguments, sources, table, found), result["steps"], world)
             for table, found in evaluations.items()
         }
-    write_at_once(arguments.out / f"{world.name}.json", json.dumps(result, indent=2) + "\n")
-    images = figures.draw_all(arguments.docs / "images", sources, arguments.split, stores, evaluations, result)
-    write_at_once(arguments.docs / f"results_{world.name}.md", results_page.page(result, images, world))
+    images = figures.draw_all(arguments.images, sources, arguments.split, stores, evaluations, result)
     print(f"{world.name}: {arguments.out / f'{world.name}.json'}, {arguments.docs / f'results_{world.name}.md'}")
-    return result
+    return arguments.publish(world.name, result, results_page.page(result, images, world))
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,13 @@ from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
 from training.data.episodes import images_of
 from training.data.features import features_of
 from training.data.worlds import World, world_named
 from training.report.doom_levels import draw_levels
 from training.report.doom_page import draw, page
+from training.report.folders import Folders
 from training.scoring import doom_rows
 from training.scoring.doom_rows import (
     ROWS,
@@ -56,27 +56,15 @@ _TRUTH = "truth"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the measurement."""
 
-    world: Literal["doom"] = "doom"
-    """World to measure in."""
+    world: Literal["doom"] = "doom"  # World to measure in.
     split: Literal["validation", "test"] = "test"
     """Maps to measure on. Settings are chosen on validation; the test maps are for the final table alone."""
-    seeds: int = 3
-    """Drives of each map."""
-    frames: int = 1000
-    """Frames of a drive."""
-    maps: int = 0
-    """Number of maps; 0: all."""
-    weights: Path = records.WEIGHTS
-    """Folder with doom/*.safetensors."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets doom.json, and holds doom.gtsam.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_doom.md and images/."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what is kept of each drive."""
+    seeds: int = 3  # Drives of each map.
+    frames: int = 1000  # Frames of a drive.
+    maps: int = 0  # Number of maps; 0: all.
 
     def __post_init__(self) -> None:
         if self.seeds < 2 or self.frames < 2 or self.maps < 0:
@@ -104,11 +92,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
         result["maps"][name] = {row: intervals(means[row]) for row in ROWS}
         first = next(iter(table.values()))
         tracks[name] = {row: measured.drawn["track"] for row, measured in first.items()}
-    write_at_once(arguments.out / f"{arguments.world}.json", json.dumps(result, indent=2) + "\n")
-    draw_levels(arguments.docs / "images" / "doom_levels.png")
-    draw(arguments.docs / "images" / "results_doom_maps.png", tracks)
-    write_at_once(arguments.docs / "results_doom.md", page(result, folder))
-    return result
+    draw_levels(arguments.images / "doom_levels.png")
+    draw(arguments.images / "results_doom_maps.png", tracks)
+    return arguments.publish(arguments.world, result, page(result, folder))
 
 
 def map_name(of: Map) -> str:

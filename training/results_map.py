@@ -33,7 +33,7 @@ from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from ngo_estimator.slam import scan_trajectory
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
+from training.data.batches import seen_from_first
 from training.data.episodes import GROUP, simulate
 from training.data.features import OPTIMIZER_INPUTS, Networks, features_of
 from training.data.lidar_drives import ReferencePoses
@@ -41,13 +41,14 @@ from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, World, world_name
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_identity, logs_below, read_drive
 from training.report import map_page
+from training.report.folders import Folders
 from training.scoring import map_errors
 from training.scoring.lidar_rows import DriveRuns, Pipeline
-from training.scoring.lidar_scores import made_runs, settings_digest
-from training.scoring.map_errors import intersections, mean_entropy_bits, seen_from, true_map
+from training.scoring.lidar_scores import made_runs
+from training.scoring.map_errors import intersections, mean_entropy_bits, true_map
 from training.scoring.metrics import path_length_m
 from training.scoring.online_estimate import steps_of, with_origin
-from training.scoring.table import Drive, Measured, Row, column, intervals, measure, samples
+from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, measure, samples
 
 _CODE = (map_errors, whole_trajectory, scan_map, scan_sources)
 _LOG_CODE = (map_errors, scan_map, scan_sources, lidar_odometry, scan_trajectory)
@@ -57,33 +58,18 @@ _DEFAULT = OccupancyConfig()
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the measurement."""
 
-    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")
-    """Worlds whose mazes are drawn."""
+    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")  # Worlds whose mazes are drawn.
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Settings are chosen on validation; the test split is for the final table alone."""
-    mazes: int = 20
-    """Mazes of each world, each with a trajectory of its own."""
-    frames: int = 500
-    """Frames of a trajectory."""
-    logs: Path | None = None
-    """Folder of real logs (.bag, .log, .clf, gzipped or not); none: left out."""
-    hit: float = _DEFAULT.hit
-    """Log odds that a scan adds to a cell in which it ends."""
-    passed: float = _DEFAULT.passed
-    """Log odds that a scan takes from a cell which it looks through."""
-    max_range_m: float = 0.0
-    """Longest range that enters a map; 0: that of ngo_map."""
-    weights: Path = records.WEIGHTS
-    """Folder with the weights of each world."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets map.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_map.md."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what was measured."""
+    mazes: int = 20  # Mazes of each world, each with a trajectory of its own.
+    frames: int = 500  # Frames of a trajectory.
+    logs: Path | None = None  # Folder of real logs (.bag, .log, .clf, gzipped or not); none: left out.
+    hit: float = _DEFAULT.hit  # Log odds that a scan adds to a cell in which it ends.
+    passed: float = _DEFAULT.passed  # Log odds that a scan takes from a cell which it looks through.
+    max_range_m: float = 0.0  # Longest range that enters a map; 0: that of ngo_map.
 
     def __post_init__(self) -> None:
         if self.mazes < 2 or self.frames < 2:
@@ -109,10 +95,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "logs": log_table(arguments, skipped),
         "skipped": skipped,
     }
-    write_at_once(arguments.out / "map.json", json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_map.md", map_page.page(result))
     print(json.dumps({"tables": result["tables"], "skipped": skipped}))
-    return result
+    return arguments.publish("map", result, map_page.page(result))
 
 
 def drawn(
@@ -132,7 +116,8 @@ def maze_table(arguments: Arguments, world: World) -> dict[str, Any]:
     made = Mazes.load(arguments, world)
     # Mazes of a group are simulated together: all are of the size that is drawn for the first.
     groups = [tuple(seeds[first : first + GROUP]) for first in range(0, len(seeds), GROUP)]
-    rows = {row: Row(partial(maze_errors, row=row, mazes=made), made.identity, _CODE) for row in _ROWS}
+    identity = _identity(arguments, made.folder)
+    rows = {row: Row(partial(maze_errors, row=row, mazes=made), identity, _CODE) for row in _ROWS}
     drives = [
         Drive(f"mazes_{group[0]}_{len(group)}", f"{group}, {arguments.frames} frames", partial(made.drives, group))
         for group in groups
@@ -152,21 +137,17 @@ class Mazes:
     source: ScanSource
     config: ScanMapConfig
     frames: int
-    identity: str
 
     @classmethod
     def load(cls, arguments: Arguments, world: World) -> "Mazes":
         """From the folder of all weights; raises ``ValueError`` where these see no ranges."""
-        folder = arguments.weights / world.name
-        (local, of_local), (place, of_place) = load_local(folder, world.name), load_place(folder, world.name)
-        optimizer, of_optimizer = load_optimizer(folder, world.name)
-        source = scan_source(folder, world.name, arguments.max_range_m)
+        folder, name = arguments.weights / world.name, world.name
+        source = scan_source(folder, name, arguments.max_range_m)
         if source is None or world.registration is None:
-            raise ValueError(f"the weights of {world.name} see no ranges; expected ranges behind their place codes")
-        hashes = [described["sha256"] for described in (of_local, of_place, of_optimizer)]
-        identity = json.dumps([hashes, repr(arguments.map_config), arguments.max_range_m])
-        networks = Networks(local, place)
-        return cls(world, folder, networks, optimizer, source, arguments.map_config, arguments.frames, identity)
+            raise ValueError(f"the weights of {name} see no ranges; expected ranges behind their place codes")
+        networks = Networks(load_local(folder, name)[0], load_place(folder, name)[0])
+        optimizer = load_optimizer(folder, name)[0]
+        return cls(world, folder, networks, optimizer, source, arguments.map_config, arguments.frames)
 
     def drives(self, seeds: tuple[int, ...]) -> list["MazeDrive"]:
         """A drive through each maze of a group."""
@@ -184,7 +165,7 @@ class Mazes:
     def poses(self, drive: "MazeDrive", row: str) -> np.ndarray:
         """The poses ``(frames, 3)`` of a row, seen from the first frame."""
         if row == "true":
-            return seen_from(drive.poses_xyyaw[0], drive.poses_xyyaw)
+            return seen_from_first(drive.poses_xyyaw)
         arrays = [torch.from_numpy(drive.features[name]) for name in OPTIMIZER_INPUTS]
         if row == "odometry":
             return with_origin(se2.r2g(arrays[0].double()).numpy())
@@ -211,13 +192,17 @@ def maze_errors(drives: list[MazeDrive], row: str, mazes: Mazes) -> Measured:
     return Measured({"free_iou": free, "occupied_iou": occupied})
 
 
+def _identity(arguments: Arguments, weights: Path) -> str:
+    return json.dumps([folder_digest(weights), repr(arguments.map_config), arguments.max_range_m])
+
+
 def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
     """By log and row: mean entropy (bit) of the known cells, and occupied cells a metre of the way."""
     logs = {} if arguments.logs is None else logs_below(arguments.logs)
     if not logs:
         skipped.append("logs: no folder is given (--logs), or it has none")
     weights = arguments.weights / "scan"
-    identity = json.dumps([settings_digest(weights), repr(arguments.map_config), arguments.max_range_m])
+    identity = _identity(arguments, weights)
     rows = {
         row: Row(partial(log_errors, row=row, arguments=arguments), identity, _LOG_CODE)
         for row in ("odometry", "corrected", "reference")

@@ -22,7 +22,6 @@ from ngo_recordings import mounting, recording, scan_stream, topics
 from ngo_sim import building2d, episodes, maze2d
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data import building_drives, scans, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
 from training.data.lidar_drives import LidarDrive
@@ -32,6 +31,7 @@ from training.data.worlds import WORLDS
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, logs_below
 from training.report import lidar_figures, lidar_page
+from training.report.folders import Folders
 from training.scoring.lidar_bars import PUBLISHED, Bar, bars
 from training.scoring.lidar_rows import ROWS, Row
 from training.scoring.lidar_scores import made_runs, scored_rows
@@ -46,6 +46,7 @@ from training.scoring.table import (
     intervals,
     means_over_samples,
     measure,
+    pairs,
 )
 
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
@@ -63,37 +64,23 @@ _SCANNER_ROWS = ("ours_without_wheels",)
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the lidar's results."""
 
-    world: Literal["scan"] = "scan"
-    """World to measure in."""
+    world: Literal["scan"] = "scan"  # World to measure in.
     logs: Path | None = None
     """Folder of real logs (.bag, .log, .clf, gzipped or not), with relations as NAME.relations; none: left out."""
-    buildings: int = 20
-    """Simulated buildings of each of the two tables."""
+    buildings: int = 20  # Simulated buildings of each of the two tables.
     first_building: int = 0
     """Number of the first one among the test seeds: others than those of the tables that are published."""
-    length_m: float = 500.0
-    """Way that the robot drives in a building."""
-    ablation: int = 5
-    """How many of these get the rows of the ablation; and how many buildings have slipping wheels."""
-    mazes: int = 8
-    """Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0."""
-    frames: int = 2000
-    """Scans in a maze."""
-    rows: tuple[str, ...] = ()
-    """Rows to measure, by name; none: all."""
+    length_m: float = 500.0  # Way that the robot drives in a building.
+    ablation: int = 5  # How many of these get the rows of the ablation; and how many buildings have slipping wheels.
+    mazes: int = 8  # Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0.
+    frames: int = 2000  # Scans in a maze.
+    rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all.
     known: bool = False
     """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
-    weights: Path = records.WEIGHTS / "scan"
-    """Folder with lidar.json, the settings of our estimators."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets scan.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_scan.md and images/."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what was measured."""
+    weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
 
     def __post_init__(self) -> None:
         if unknown := [row for row in self.rows if row not in ROWS]:
@@ -140,11 +127,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "skipped": skipped,
         "failed": _failures({"logs": logs, **tables, **scanners}),
     }
-    write_at_once(arguments.out / "scan.json", json.dumps(result, indent=2) + "\n")
-    images = lidar_figures.draw(arguments.docs / "images", logs, tables)
-    write_at_once(arguments.docs / "results_scan.md", lidar_page.page(result, images))
+    images = lidar_figures.draw(arguments.images, logs, tables)
     _print(found, skipped)
-    return result
+    return arguments.publish("scan", result, lidar_page.page(result, images))
 
 
 def _command(recorded: str, with_logs: bool) -> str:
@@ -264,27 +249,18 @@ def _table_numbers(found: Table) -> dict[str, Numbers]:
 
 def _paired(found: Table) -> dict[str, Any]:
     """By row: how much larger its numbers are than those of our row on the same drives, in a table of two or more."""
-    pairs: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for rows in found.values():
-        for row, measured in rows.items():
-            other = _paired_with(row)
-            known = rows[other].errors if other in rows and other != row else {}
-            for key in _PAIRED:
-                if key in known and key in measured.errors:
-                    pair = float(measured.errors[key][0]), float(known[key][0])
-                    pairs.setdefault(row, {}).setdefault(key, []).append(pair)
-    return {
-        row: {
-            "with": _paired_with(row),
-            **{key: _compared(key, np.array(found)) for key, found in keys.items() if len(found) > 1},
-        }
-        for row, keys in pairs.items()
-    }
+    result: dict[str, Any] = {}
+    for row in dict.fromkeys(row for rows in found.values() for row in rows if row != _paired_with(row)):
+        both = {key: pairs(found, row, _paired_with(row), key) for key in _PAIRED}
+        if any(map(len, both.values())):
+            compared = {key: _compared(key, numbers) for key, numbers in both.items() if len(numbers) > 1}
+            result[row] = {"with": _paired_with(row), **compared}
+    return result
 
 
-def _compared(key: str, pairs: np.ndarray) -> dict[str, Any]:
-    """A row's numbers against another's, pairs ``(drives, 2)``; likelihoods, which may be negative, have no ratio."""
-    values, others = pairs.T
+def _compared(key: str, both: np.ndarray) -> dict[str, Any]:
+    """A row's numbers against another's ``(drives, 2)``; likelihoods, which may be negative, have no ratio."""
+    values, others = both.T
     if key == "negative_log_likelihood":
         return {"difference": mean_interval(values - others).as_json()}
     return compare(values, others).as_json()

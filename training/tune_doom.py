@@ -59,14 +59,10 @@ HARM_BELOW_M = 0.2
 class Arguments:
     """Settings of the choice."""
 
-    seeds: int = 5
-    """Drives of each validation map, and twice as many through generated levels."""
-    frames: int = 1000
-    """Frames of a drive."""
-    weights: Path = records.WEIGHTS
-    """Folder with doom/*.safetensors, which gets the optimizer."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets doom.gtsam.json."""
+    seeds: int = 5  # Drives of each validation map, and twice as many through generated levels.
+    frames: int = 1000  # Frames of a drive.
+    weights: Path = records.WEIGHTS  # Folder with doom/*.safetensors, which gets the optimizer.
+    out: Path = records.ROOT / "training" / "results"  # Folder that gets doom.gtsam.json.
     runs: Path = records.ROOT / "runs"
     """Folder of what is kept of each drive."""
 

@@ -7,10 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +17,7 @@ from ngo_sim.mazes import draw_maze
 from training.baselines.deepvo import DEEPVO
 from training.report import attention_map
 from training.report.maze_views import in_maze, maze_and_start
+from training.report.pictures import save
 from training.report.training_records import learning_curve, run_folder
 from training.scoring.row_estimators import Arrays
 from training.scoring.scores import METRICS, Metric, in_sentence
@@ -69,29 +66,27 @@ def draw_all(
     folder: Path, sources: Sources, split: str, stores: dict[str, Arrays], evaluations: Tables, result: dict[str, Any]
 ) -> dict[str, str]:
     """Write every figure into ``folder``; returns the name of each file and what it shows."""
-    folder.mkdir(parents=True, exist_ok=True)
     images: dict[str, str] = {}
 
-    def save(kind: str, caption: str, figure: Figure | None) -> None:
+    def add(kind: str, caption: str, figure: Figure | None) -> None:
         if figure is not None:
             name = f"results_{sources.world.name}_{kind}.png"
-            figure.savefig(folder / name, dpi=130)
-            plt.close(figure)
+            save(figure, folder / name, dpi=130, tight=False)
             images[name] = caption
 
     metric = METRICS[sources.world.name][0]
-    save(
+    add(
         "trajectories",
         f"Trajectories with the median and the largest {in_sentence(metric.title)} of `{CORRECTED_ROW}` in each table: "
         "odometry green, corrected orange, truth blue; the first training seed.",
         trajectories(sources, split, stores, evaluations),
     )
-    save(
+    add(
         "error_by_frames",
         "Error against the number of frames that the estimator had seen; bands are 95 % intervals.",
         by_prefix(result, _absolute(sources.world.name), "frames", lambda _, steps: float(steps)),
     )
-    save(
+    add(
         "percent_by_distance",
         "Error as a ratio to the distance travelled.",
         by_prefix(
@@ -101,12 +96,12 @@ def draw_all(
             lambda table, steps: float(result["path_m"][table][str(steps)]),
         ),
     )
-    save(
+    add(
         "learning_curves",
         "Learning curves on validation: networks, and optimizers with the mean and range of the training seeds.",
         learning_curves(sources, len(result["seeds"])),
     )
-    save(
+    add(
         "attention",
         "Where one meta-pose looks in the last iteration, over the maze (it is the star; a dot is a meta-pose, the "
         "darker and larger the more attention it gets) and over time, with the true revisits and its loop closures.",

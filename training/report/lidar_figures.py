@@ -4,14 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 
 from training.data.batches import seen_from_first
+from training.report.pictures import panels, save
 from training.scoring.table import Measured
 
 Drives = Mapping[str, Mapping[str, Measured]]
@@ -46,19 +42,11 @@ def _drawable(drives: Drives) -> Drives:
 
 
 def _draw(path: Path, drives: Drives) -> None:
-    many = len(drives) > _MANY
-    columns = min(3 if many else 2, len(drives))
-    lines = -(-len(drives) // columns)
-    width, height = (4.6, 4.0) if many else (7.0, 6.0)
-    figure, axes = plt.subplots(lines, columns, figsize=(width * columns, height * lines), squeeze=False)
-    for axis in axes.flat[len(drives) :]:
-        axis.set_visible(False)
-    for axis, (name, rows) in zip(axes.flat, drives.items(), strict=False):
+    across, width, height = (3, 4.6, 4.0) if len(drives) > _MANY else (2, 7.0, 6.0)
+    figure, axes = panels(len(drives), across, width, height)
+    for axis, (name, rows) in zip(axes, drives.items(), strict=True):
         _draw_drive(axis, name, rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.tight_layout()
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
+    save(figure, path, dpi=90)
 
 
 def _draw_drive(axis: Any, name: str, rows: Mapping[str, Measured]) -> None:

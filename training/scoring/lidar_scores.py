@@ -1,6 +1,5 @@
 """The lidar's rows as rows of a table: the errors of what they estimate, and what is drawn of it."""
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -14,7 +13,7 @@ from training.scoring import lidar_errors as errors_module
 from training.scoring import metrics, relations, table
 from training.scoring.lidar_errors import Errors, covariance_errors, lidar_errors
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row, identity_of
-from training.scoring.table import Measured
+from training.scoring.table import Measured, folder_digest
 
 _ALWAYS = (lidar_drives, errors_module, metrics, relations)
 _MOST_DRAWN = 4000  # poses of a path in a picture
@@ -83,9 +82,4 @@ def weights_digest(row: Row, weights: Path) -> str:
     """A hash of the shipped settings, for a row of our own estimators."""
     if not any(module.__name__.startswith("ngo_estimator.") for module in row.code):
         return ""
-    return settings_digest(weights)
-
-
-def settings_digest(weights: Path) -> str:
-    """A hash of all files of our settings and networks."""
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(weights.iterdir()))).hexdigest()
+    return folder_digest(weights)

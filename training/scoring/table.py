@@ -4,6 +4,7 @@ A table is rows x drives x metrics. A row measures all its metrics on a drive at
 while the drive, the row and their code are those of today, so that each command goes on after a stop.
 """
 
+import hashlib
 import json
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -75,16 +76,19 @@ Table = dict[str, dict[str, Measured]]
 def measure(plan: Sequence[tuple[Drive, Rows]], folder: Path, title: str = "", known_only: bool = False) -> Table:
     """Measure the rows of each drive, or read ``folder/DRIVE.ROW.npz``; with ``known_only`` nothing is measured."""
     table: Table = {}
-    with tqdm(plan, desc=title, unit="drive") as bar:
-        for drive, rows in bar:
-            bar.set_postfix_str(drive.name)
-            table[drive.name] = dict(_measured(drive, rows, folder, known_only))
+    with tqdm(total=sum(len(rows) for _, rows in plan), desc=title, unit="row") as bar:
+        for drive, rows in plan:
+            table[drive.name] = dict(_measured(drive, rows, folder, known_only, bar))
     return table
 
 
-def _measured(drive: Drive, rows: Rows, folder: Path, known_only: bool) -> Iterator[tuple[str, Measured]]:
+def _measured(
+    drive: Drive, rows: Rows, folder: Path, known_only: bool, bar: "tqdm[Any]"
+) -> Iterator[tuple[str, Measured]]:
     made: list[Any] = []
     for name, row in rows.items():
+        bar.set_postfix_str(f"{drive.name} {name}")
+        bar.update()
         path = folder / f"{drive.name}.{name}.npz"
         identity = json.dumps([name, row.identity, drive.identity, code_digest((*drive.code, *row.code))])
         known = read(path, identity)
@@ -134,6 +138,12 @@ def write(path: Path, identity: str, measured: Measured) -> None:
         np.savez(file, identity=np.array(identity), failed=np.array(measured.failed), **arrays)  # type: ignore[arg-type]
 
 
+def folder_digest(folder: Path) -> str:
+    """A hash of the files in a folder of weights and settings, for the identity of what follows from them."""
+    files = sorted(path for path in folder.iterdir() if path.is_file())
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
 def column(table: Table, row: str) -> list[Measured]:
     """What one row gives on all drives that have it."""
     return [rows[row] for rows in table.values() if row in rows]
@@ -143,8 +153,8 @@ def means_over_samples(found: Iterable[Measured]) -> dict[str, np.ndarray]:
     """By the metric's key the mean over the samples of each drive ``(drives,)``, of those that have it."""
     values: dict[str, list[float]] = {}
     for measured in found:
-        for key, samples in measured.errors.items():
-            values.setdefault(key, []).append(float(samples.mean()))
+        for key, some in measured.errors.items():
+            values.setdefault(key, []).append(float(some.mean()))
     return {key: np.array(means) for key, means in values.items()}
 
 
@@ -155,6 +165,13 @@ def samples(found: Iterable[Measured]) -> dict[str, np.ndarray]:
         for key, some in measured.errors.items():
             values.setdefault(key, []).append(some)
     return {key: np.concatenate(some) for key, some in values.items()}
+
+
+def pairs(table: Table, row: str, other: str, key: str) -> np.ndarray:
+    """The first number of a metric of two rows ``(drives, 2)``, on the drives where both have it."""
+    both = [(rows[row].errors, rows[other].errors) for rows in table.values() if row in rows and other in rows]
+    found = [(float(a[key][0]), float(b[key][0])) for a, b in both if key in a and key in b]
+    return np.array(found).reshape(-1, 2)
 
 
 def intervals(values: Mapping[str, np.ndarray]) -> Numbers:

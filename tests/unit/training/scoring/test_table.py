@@ -13,11 +13,13 @@ from training.scoring.table import (
     Measured,
     Row,
     column,
+    folder_digest,
     interval_of,
     intervals,
     kept,
     means_over_samples,
     measure,
+    pairs,
     samples,
 )
 
@@ -151,3 +153,23 @@ def test_arrays_are_kept_as_measurements_are(tmp_path: Path) -> None:
     assert kept(path, "one", dict)["a"].tolist() == [0, 1, 2]
     assert kept(path, "two", dict) == {}
     assert table.read(path, "one") is None
+
+
+def test_rows_are_paired_on_the_drives_where_both_have_a_number() -> None:
+    found = {
+        "a": {"one": Measured.of({"m": 1.0}), "two": Measured.of({"m": 3.0})},
+        "b": {"one": Measured.of({"m": 2.0}), "two": Measured(failed="lost")},
+        "c": {"one": Measured.of({"m": 5.0})},
+        "d": {"one": Measured.of({"m": 7.0}), "two": Measured.of({"m": 8.0})},
+    }
+    assert pairs(found, "one", "two", "m").tolist() == [[1.0, 3.0], [7.0, 8.0]]
+    assert pairs(found, "one", "three", "m").shape == (0, 2)
+
+
+def test_a_folder_is_known_by_what_its_files_hold(tmp_path: Path) -> None:
+    (tmp_path / "weights").write_text("one")
+    before = folder_digest(tmp_path)
+    (tmp_path / "below").mkdir()
+    assert folder_digest(tmp_path) == before
+    (tmp_path / "weights").write_text("two")
+    assert folder_digest(tmp_path) != before
