@@ -1,0 +1,130 @@
+"""The table of what real robots do to their data: errors of the lidar's rows after each change of a log.
+
+    python -m training.results --world stress --logs FOLDER
+    python -m training.results --world stress --logs FOLDER --logs-named csail --changes people --seeds 0 --rows ours
+
+FOLDER holds logs (.bag, .log, .clf, gzipped or not) with relations as NAME.relations. What is measured is kept in
+``runs/``: a run that is restricted adds to the table, and one that was stopped goes on. The table holds all that the
+code of today has measured. The command writes ``training/results/stress.json`` and ``docs/results_stress.md``.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from training.common import records
+from training.common.command_line import run_command
+from training.common.records import write_at_once
+from training.data.lidar_changes import CHANGES, UNSEEDED
+from training.recordings.lidar_logs import logs_below, relations_of
+from training.report import stress_page
+from training.scoring.lidar_rows import ROWS
+from training.scoring.stress_cells import CLEAN, StressCell, StressLog, cell_numbers
+
+STRESS_ROWS = ("wheels", "ours", "ours_without_wheels", "kiss_icp")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the table."""
+
+    logs: Path
+    """Folder of real logs with relations as NAME.relations."""
+    world: Literal["stress"] = "stress"
+    """World to measure in."""
+    logs_named: tuple[str, ...] = ()
+    """Logs to measure, by a part of their name; none: all."""
+    changes: tuple[str, ...] = ()
+    """Changes to measure, by name; none: all."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the changes."""
+    rows: tuple[str, ...] = ()
+    """Rows to measure, by name; none: all."""
+    weights: Path = records.WEIGHTS / "scan"
+    """Folder with lidar.json, the settings of our estimators."""
+    out: Path = records.ROOT / "training" / "results"
+    """Folder that gets stress.json."""
+    docs: Path = records.ROOT / "docs"
+    """Folder that gets results_stress.md."""
+    runs: Path = records.ROOT / "runs"
+    """Folder of what was measured."""
+
+    def __post_init__(self) -> None:
+        for name, given, known in (("changes", self.changes, (*CHANGES,)), ("rows", self.rows, STRESS_ROWS)):
+            if unknown := [one for one in given if one not in known]:
+                raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(known)}")
+        if not self.seeds or min(self.seeds) < 0:
+            raise ValueError(f"seeds are {self.seeds}; expected one or more, none negative")
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Measure, print each cell, write everything, and return the JSON's content."""
+    record = records.record("results", arguments)
+    cache = arguments.runs / "stress"
+    logs = [StressLog(path, arguments.weights, cache) for path in _paths(arguments.logs)]
+    rows = [name for name in STRESS_ROWS if not ROWS[name].missing()]
+    asked = [name for name in rows if name in (arguments.rows or rows)]
+    named = [log for log in logs if any(part in log.name for part in (arguments.logs_named or ("",)))]
+    for number, seed in enumerate(arguments.seeds):
+        changes = [name for name in arguments.changes or CHANGES if number == 0 or name not in UNSEEDED]
+        for log in named:
+            _measure(log, changes, seed, asked)
+    result = {
+        "command": 'make results WORLD=stress ARGS="--logs FOLDER"',
+        "revision": record["revision"],
+        "logs": {log.name: _table(log, rows, arguments.seeds) for log in logs},
+        "skipped": [f"{name}: {ROWS[name].missing()}" for name in STRESS_ROWS if name not in rows],
+    }
+    write_at_once(arguments.out / "stress.json", json.dumps(result, indent=2) + "\n")
+    write_at_once(arguments.docs / "results_stress.md", stress_page.page(result))
+    return result
+
+
+def _paths(folder: Path) -> list[Path]:
+    paths = [path for path in logs_below(folder).values() if relations_of(path).is_file()]
+    if not paths:
+        raise ValueError(f"{folder} has no log with relations as NAME.relations beside it")
+    return paths
+
+
+def _measure(log: StressLog, changes: Sequence[str], seed: int, rows: Sequence[str]) -> None:
+    """Every row after every change, and before them without any, which says what would be possible."""
+    clean = dict(log.cells(CLEAN, seed, rows))
+    for change in changes:
+        for name, cell in log.cells(change, seed, rows):
+            print(f"{log.name:10s} {change:22s} seed {seed}  {name:20s} {_words(log, cell, clean[name])}", flush=True)
+
+
+def _words(log: StressLog, cell: StressCell, clean: StressCell) -> str:
+    if cell.failed:
+        return f"failed: {cell.failed}"
+    return "  ".join(f"{key} {value:.3f}" for key, value in cell_numbers(log.relations, cell, clean).items())
+
+
+def _table(log: StressLog, rows: Sequence[str], seeds: Sequence[int]) -> dict[str, dict[str, Any]]:
+    """``CHANGE.ROW.KEY`` of all that is known: means over the seeds, and under ``seeds`` the numbers of each."""
+    table: dict[str, dict[str, Any]] = {}
+    for change in CHANGES:
+        for name in rows:
+            cells = {seed: log.known(change, seed, name) for seed in (seeds[:1] if change in UNSEEDED else seeds)}
+            known = {seed: cell for seed, cell in cells.items() if cell is not None}
+            if known:
+                table.setdefault(change, {})[name] = _numbers(log, known, log.known(CLEAN, 0, name))
+    return table
+
+
+def _numbers(log: StressLog, cells: Mapping[int, StressCell], clean: StressCell | None) -> dict[str, Any]:
+    if failed := {str(seed): cell.failed for seed, cell in cells.items() if cell.failed}:
+        return {"failed": failed}
+    each = {str(seed): cell_numbers(log.relations, cell, clean) for seed, cell in cells.items()}
+    keys = next(iter(each.values()))
+    means = {key: float(np.mean([numbers[key] for numbers in each.values()])) for key in keys}
+    return {**means, "seeds": each}
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)
