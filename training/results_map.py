@@ -44,7 +44,7 @@ from training.report import map_page
 from training.report.folders import Folders
 from training.scoring import map_errors
 from training.scoring.lidar_rows import DriveRuns, Pipeline
-from training.scoring.lidar_scores import made_runs
+from training.scoring.lidar_scores import with_runs
 from training.scoring.map_errors import intersections, mean_entropy_bits, true_map
 from training.scoring.metrics import path_length_m
 from training.scoring.online_estimate import steps_of, with_origin
@@ -207,10 +207,8 @@ def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
         row: Row(partial(log_errors, row=row, arguments=arguments), identity, _LOG_CODE)
         for row in ("odometry", "corrected", "reference")
     }
-    plan = [
-        (Drive(name, log_identity(path), partial(made_runs, partial(read_drive, path), weights), (lidar_logs,)), rows)
-        for name, path in logs.items()
-    ]
+    drives = [Drive(name, log_identity(path), partial(read_drive, path), (lidar_logs,)) for name, path in logs.items()]
+    plan = [(with_runs(drive, weights), rows) for drive in drives]
     found = measure(plan, arguments.runs / "scan" / "map", "logs")
     skipped += [f"{name}: {log['corrected'].failed}" for name, log in found.items() if log["corrected"].failed]
     return {

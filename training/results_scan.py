@@ -8,11 +8,10 @@ trained or chosen on, and beside other programs. The command writes ``training/r
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +23,6 @@ from training.common import records
 from training.common.command_line import run_command
 from training.data import building_drives, scans, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
-from training.data.lidar_drives import LidarDrive
 from training.data.scans import CONDITIONS
 from training.data.simulated_drives import maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
@@ -34,7 +32,7 @@ from training.report import lidar_figures, lidar_page
 from training.report.folders import Folders
 from training.scoring.lidar_bars import PUBLISHED, Bar, bars
 from training.scoring.lidar_rows import ROWS, Row
-from training.scoring.lidar_scores import made_runs, scored_rows
+from training.scoring.lidar_scores import scored_rows, with_runs
 from training.scoring.statistics import compare, mean_interval
 from training.scoring.table import (
     Drive,
@@ -157,8 +155,7 @@ def _plans(arguments: Arguments, skipped: list[str]) -> dict[str, Sequence[Drive
         "aliased": [_building(arguments, "aliased", seed) for seed in aliased[: arguments.buildings]],
         "slip": [_building(arguments, "slip", seed) for seed in seeds[: arguments.ablation]],
         "maze2d": [
-            _drive(
-                arguments,
+            Drive(
                 f"maze2d_{seed}",
                 f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
                 partial(maze_drive, seed, arguments.frames, mazes[0]),
@@ -171,17 +168,14 @@ def _plans(arguments: Arguments, skipped: list[str]) -> dict[str, Sequence[Drive
     if not logs:
         skipped.append("logs: no folder is given (--logs)" if arguments.logs is None else "logs: the folder has none")
         return plans
-    of_logs = [
-        _drive(arguments, name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()
-    ]
+    of_logs = [Drive(name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()]
     return {"logs": of_logs, **plans}
 
 
 def _scanner_plan(arguments: Arguments, condition: str) -> Sequence[Drive]:
     changes = CONDITIONS[condition]
     return [
-        _drive(
-            arguments,
+        Drive(
             f"maze_{seed}",
             f"scanned maze {seed}, {condition}, {json.dumps(changes)}, {arguments.frames} frames",
             partial(scanned_maze_drive, seed, arguments.frames, changes),
@@ -196,13 +190,7 @@ def _building(arguments: Arguments, name: str, seed: int) -> Drive:
     named = "" if slips is None else f", {slips:g} slips a km"
     identity = f"building {seed} {name} {arguments.length_m:g} m, {_MOST_SCANS} scans{named}"
     make = partial(building_drive, seed, arguments.length_m, name == "aliased", _MOST_SCANS, slips)
-    return _drive(arguments, f"{name}_{seed}", identity, make, _BUILDINGS)
-
-
-def _drive(
-    arguments: Arguments, name: str, identity: str, make: Callable[[], LidarDrive], code: tuple[ModuleType, ...]
-) -> Drive:
-    return Drive(name, identity, partial(made_runs, make, arguments.weights), code)
+    return Drive(f"{name}_{seed}", identity, make, _BUILDINGS)
 
 
 def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Mapping[str, Row]) -> Table:
@@ -217,7 +205,7 @@ def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Ma
         return (index < ablation or not row.ablation) and not left_out
 
     plan = [
-        (drive, {key: scored[key] for key, row in rows.items() if is_asked(index, row)})
+        (with_runs(drive, arguments.weights), {key: scored[key] for key, row in rows.items() if is_asked(index, row)})
         for index, drive in enumerate(drives)
     ]
     return measure(plan, folder, name, known_only=arguments.known)

@@ -1,7 +1,8 @@
 """The lidar's rows as rows of a table: the errors of what they estimate, and what is drawn of it."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,14 +14,19 @@ from training.scoring import lidar_errors as errors_module
 from training.scoring import metrics, relations, table
 from training.scoring.lidar_errors import Errors, covariance_errors, lidar_errors
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row, identity_of
-from training.scoring.table import Measured, folder_digest
+from training.scoring.table import Drive, Measured, folder_digest
 
 _ALWAYS = (lidar_drives, errors_module, metrics, relations)
 _MOST_DRAWN = 4000  # poses of a path in a picture
 
 
+def with_runs(drive: Drive, weights: Path) -> Drive:
+    """A drive that makes a ``LidarDrive``, for ``scored_rows``: its rows share the runs of our estimators."""
+    return replace(drive, make=lambda: DriveRuns(drive.make(), weights))
+
+
 def scored_rows(rows: Mapping[str, Row], weights: Path) -> dict[str, table.Row]:
-    """Rows that measure a drive, as ``made_runs`` makes it."""
+    """Rows that measure drives ``with_runs``."""
     return {
         name: table.Row(
             partial(scored, row=row),
@@ -29,11 +35,6 @@ def scored_rows(rows: Mapping[str, Row], weights: Path) -> dict[str, table.Row]:
         )
         for name, row in rows.items()
     }
-
-
-def made_runs(make: Callable[[], LidarDrive], weights: Path) -> DriveRuns:
-    """A drive for ``scored_rows``, made now."""
-    return DriveRuns(make(), weights)
 
 
 def scored(runs: DriveRuns, row: Row) -> Measured:
@@ -61,9 +62,10 @@ def scored(runs: DriveRuns, row: Row) -> Measured:
 
 
 def _errors(drive: LidarDrive, estimate: Estimate) -> Errors:
-    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses)
+    known = drive.reference is not None
+    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses) if known else {}
     for name, poses in (("online", estimate.online), ("odometry", estimate.odometry)):
-        if poses is not None:
+        if poses is not None and known:
             found = lidar_errors(drive.reference, estimate.stamps_ns, poses)
             errors.update({f"{name}_{key}": values for key, values in found.items()})
     if isinstance(drive.reference, TruePoses) and estimate.online is not None and estimate.covariances is not None:

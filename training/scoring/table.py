@@ -74,9 +74,12 @@ Table = dict[str, dict[str, Measured]]
 
 
 def measure(plan: Sequence[tuple[Drive, Rows]], folder: Path, title: str = "", known_only: bool = False) -> Table:
-    """Measure the rows of each drive, or read ``folder/DRIVE.ROW.npz``; with ``known_only`` nothing is measured."""
+    """Measure the rows of each drive, or read ``folder/DRIVE.ROW.npz``; with ``known_only`` nothing is measured.
+
+    A bar with the ``title`` shows how far it is; without a title there is none.
+    """
     table: Table = {}
-    with tqdm(total=sum(len(rows) for _, rows in plan), desc=title, unit="row") as bar:
+    with tqdm(total=sum(len(rows) for _, rows in plan), desc=title, unit="row", disable=not title) as bar:
         for drive, rows in plan:
             table[drive.name] = dict(_measured(drive, rows, folder, known_only, bar))
     return table
