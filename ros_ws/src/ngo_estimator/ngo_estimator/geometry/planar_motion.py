@@ -1,4 +1,4 @@
-"""Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: ``se2`` without torch.
+"""Planar rigid motions ``[x, y, yaw]`` (m, m, rad; REP-103) of single poses, compiled; ``se2`` has those of many.
 
 Poses have the shape ``(3,)`` where nothing else is said. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies
 in ``(-pi, pi]``.
@@ -189,16 +189,5 @@ def carried(pose: Array, covariance: Array, odometry: Array, relative: Array, va
     last = pose
     for k in range(len(relative)):
         last = compose(pose, between(odometry[0], odometry[k + 1]))
-        yaw = last[2] - relative[k, 2]
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        lever = np.eye(3)
-        lever[0, 2] = -(sin * relative[k, 0] + cos * relative[k, 1])
-        lever[1, 2] = cos * relative[k, 0] - sin * relative[k, 1]
-        result = np.zeros((3, 3))
-        for i in range(3):
-            for j in range(3):
-                for m in range(3):
-                    for n in range(3):
-                        result[i, j] += lever[i, m] * covariance[m, n] * lever[j, n]
-        covariance = result + turned_covariance(yaw, np.diag(variance[k]))
+        covariance = propagated(covariance, last, relative[k], np.diag(variance[k]))
     return last, covariance

@@ -1,6 +1,6 @@
 """Pose selection: a bounded choice of poses from before the window, which keeps old places recognisable.
 
-Not in the paper, whose trajectories end before they grow too long. Poses that leave the window come here; when there
+Poses that leave the window come here; when there
 are too many, those go whose place is told and covered by others. What stays forms a chain from the origin to the
 window, so that a correction reaches everything between.
 """

@@ -9,7 +9,7 @@ import numpy as np
 from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
-from ngo_estimator.geometry import planar_arrays
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, propagated
 from ngo_estimator.graph.relative_poses import RelativePoses
@@ -148,21 +148,21 @@ class KeyScanChain:
         nodes = (self._nodes.values if nodes is None else nodes).copy()
         if before:  # nodes that came since follow the last of those
             last = len(self._before) - 1
-            since = planar_arrays.between(nodes[last], nodes[last:])
+            since = se2.between(nodes[last], nodes[last:])
             nodes[: last + 1] = self._before
-            nodes[last:] = planar_arrays.compose(self._before[-1], since)
+            nodes[last:] = se2.compose(self._before[-1], since)
         odometry, at = self._odometry.values, self._frames.values
         starts, ends = nodes, odometry[at]
         frames = np.arange(len(odometry))
         segment = np.searchsorted(at, frames, side="right") - 1
-        within = planar_arrays.between(ends[segment], odometry)
+        within = se2.between(ends[segment], odometry)
         bent = np.zeros_like(starts)
-        bent[:-1] = planar_arrays.between(starts[:-1], starts[1:]) - planar_arrays.between(ends[:-1], ends[1:])
-        bent[:, 2] = planar_arrays.wrap(bent[:, 2])
+        bent[:-1] = se2.between(starts[:-1], starts[1:]) - se2.between(ends[:-1], ends[1:])
+        bent[:, 2] = se2.wrap(bent[:, 2])
         share = (frames - at[segment]) / np.append(np.diff(at), 1)[segment]
         ends_at = np.append(at[1:], -1)  # the motion that nobody saw is the one that is corrected
         share[np.isin(ends_at, self._joins.values)[segment]] = 0.0
-        return planar_arrays.compose(starts[segment], within + share[:, None] * bent[segment])
+        return se2.compose(starts[segment], within + share[:, None] * bent[segment])
 
     def _rows(self) -> dict[str, GrowingRows]:
         return {

@@ -1,6 +1,6 @@
 """Finds loops of 2D lidar key scans, verified without learning.
 
-Not in the paper. A new key asks for loops with earlier keys near which the robot may be. Its scan and the scans of the
+A new key asks for loops with earlier keys near which the robot may be. Its scan and the scans of the
 keys before it are searched in a submap of an earlier key. A loop is accepted where they fit, near the graph's pose, and
 a neighbouring loop agrees. No loop is better than a wrong one.
 """

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, taken
-from ngo_estimator.geometry.planar_arrays import compose, inverse
 from ngo_estimator.geometry.planar_motion import turned_covariance
+from ngo_estimator.geometry.se2 import compose, inverse
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ngo_estimator.data.relative_step import (
 )
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
-from ngo_estimator.geometry.planar_arrays import between, compose, inverse
+from ngo_estimator.geometry.se2 import between, compose, inverse
 
 
 @dataclass(frozen=True)

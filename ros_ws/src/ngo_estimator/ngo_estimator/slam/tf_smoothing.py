@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, taken, taken_integer
-from ngo_estimator.geometry.planar_arrays import compose, inverse
+from ngo_estimator.geometry.se2 import compose, inverse
 
 
 class SmoothedCorrection:
