@@ -24,14 +24,8 @@ class PoseGraph(Protocol):
 
     loop_weights: np.ndarray
     took_s: float
-    optimized: bool
-    """Whether an optimisation ended since the newest frame came."""
     fault: str
-    """What failed since the newest frame came, in words; empty where nothing did."""
-
-    @property
-    def running(self) -> bool:
-        """Whether an optimisation has begun that is not done."""
+    """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
 
     @property
     def unfinished(self) -> bool:
@@ -57,20 +51,11 @@ class PoseGraph(Protocol):
     def loop_std(self) -> np.ndarray:
         """Deviations ``(loops, 3)`` of these."""
 
-    def begin(self) -> None:
-        """Begin to optimise."""
-
-    def advance(self, iterations: int) -> bool:
-        """Do so many parts of the update; returns whether it is done."""
+    def work(self, optimize: bool) -> bool:
+        """Do what the newest frame made due: look for loops, and optimise; returns whether it optimised."""
 
     def finish(self) -> bool:
-        """Optimise what is left; returns whether there was anything."""
-
-    def abandon(self) -> None:
-        """Leave undone what has begun."""
-
-    def fail(self, error: Exception) -> None:
-        """Leave undone what has begun, and keep why: every node is where it was."""
+        """Optimise what is left; returns whether there was anything, and it worked."""
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
@@ -88,14 +73,18 @@ class PoseGraph(Protocol):
 class CorrectedTrajectory(ABC):
     """Takes steps into a log and a graph, and tells what each changed.
 
-    An update takes several parts, most of them iterations of an optimisation. ``iterations_per_step`` of them are done
-    at the step that begins it and at each one after it, so that no step takes much longer than the others.
+    A step is answered by the odometry behind the last corrected pose. The work that it makes due, such as the search for
+    loops and an optimisation, is done by ``correct``: a live node calls it when it has published the answer, in the time
+    until the next step. Where nobody calls it, the next step begins with it. So results do not depend on who calls.
+
+    Args:
+        answers_first: False: the work is done before the step is answered.
     """
 
     _graph: PoseGraph
 
-    def __init__(self, iterations_per_step: int) -> None:
-        self._iterations_per_step = iterations_per_step
+    def __init__(self, answers_first: bool) -> None:
+        self._answers_first = answers_first
         self._log = StepLog()
         self.reset()
 
@@ -116,8 +105,8 @@ class CorrectedTrajectory(ABC):
         """Give the graph what is known of the first frame."""
 
     @abstractmethod
-    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
-        """Give the graph a step; returns whether it is time to optimise."""
+    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
+        """Give the graph a step."""
 
     @property
     @abstractmethod
@@ -125,8 +114,12 @@ class CorrectedTrajectory(ABC):
         """What must be the same where a ``state()`` is restored: networks and settings, as JSON has them."""
 
     def state(self) -> Arrays:
-        """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step."""
+        """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step.
+
+        Work that is due is done before.
+        """
         require(self._log.steps > 0, "the trajectory is empty")
+        self._work()
         own = {"online": self._online.values, "optimized": np.array(self._optimized), "odom": self._odom}
         arrays = own | under("log", self._log.state()) | under("graph", self._graph.state())
         return {name: np.array(array, order="C") for name, array in arrays.items()}
@@ -183,13 +176,14 @@ class CorrectedTrajectory(ABC):
         self._loaded = False  # and no step taken since
         self._online = GrowingRows((3,), np.float64)
         self._graph = self._new_graph()
-        self._optimized = False
+        self._due, self._optimize = False, True  # whether the graph has work, and may optimise
+        self._optimized, self._fault = False, ""  # since the last result
         self._odom = np.zeros(3)  # of the newest frame, on TF
 
     @property
     def fault(self) -> str:
-        """What failed in the last step, or in ``finish``, in words; empty where nothing did."""
-        return self._graph.fault
+        """What failed in the last step, in ``correct`` or in ``finish``, in words; empty where nothing did."""
+        return self._fault
 
     def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
         """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
@@ -203,6 +197,7 @@ class CorrectedTrajectory(ABC):
                 before.
         """
         step = self._checked(step)
+        self._begin_result()
         if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
             raise RejectedStep(
                 f"step to {step.stamp_ns} ns is of an odometry that began at {step.origin_stamp_ns} ns, or older than "
@@ -229,6 +224,7 @@ class CorrectedTrajectory(ABC):
         step = self._checked(step)
         if not self.may_join(step):
             raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
+        self._begin_result()
         relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
         return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
 
@@ -249,47 +245,49 @@ class CorrectedTrajectory(ABC):
         if taken.begins:
             self._begin_at(step)
             self._online.append(np.zeros(3))
-        due = self._append(step, taken)
+        self._append(step, taken)
         self._odom = step.tf_odom_xyyaw
-        if not optimize:
-            self._graph.abandon()
-        self._optimized = self._optimise(due and optimize)
+        self._due, self._optimize = True, optimize
+        if not self._answers_first:
+            self._work()
         update = self._result(taken.restarted, taken.gap)
         self._online.append(update.pose_xyyaw)
         return update
 
-    def _optimise(self, due: bool) -> bool:
-        """Go on with an optimisation, or begin one; returns whether the newest frame ended one."""
-        try:
-            if due:
-                self._graph.begin()
-            if self._graph.running:
-                self._graph.advance(self._iterations_per_step)
-        except Exception as error:  # numerics of a library, or a fault of ours: it may cost an optimisation, no more
-            self._graph.fail(error)
-        return self._graph.optimized
+    def _begin_result(self) -> None:
+        """Forget what the last result told, and do the work that is left of it."""
+        self._optimized, self._fault = False, ""
+        self._work()
+
+    def _work(self) -> None:
+        """Do the work that is due."""
+        if self._due:
+            self._due = False
+            self._optimized |= self._graph.work(self._optimize)
+            self._fault = self._graph.fault or self._fault
+
+    def correct(self) -> TrajectoryUpdate | None:
+        """Do the work that the newest step made due; None where it changed nothing."""
+        self._begin_result()
+        return self._result(restarted=False, gap=False) if self._optimized or self._fault else None
 
     @property
     def unfinished(self) -> bool:
         """Whether there is anything left to optimise, which later steps, or ``finish``, are to do."""
-        return self._graph.unfinished
+        return self._due or self._graph.unfinished
 
     @property
     def optimization_s(self) -> float:
-        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+        """Computing time of the last optimisation, and of the search for loops before it."""
         return self._graph.took_s
 
     def finish(self) -> TrajectoryUpdate | None:
         """Optimise what is left, when no more steps come; None where there is nothing, or where it failed."""
-        try:
-            done = self._log.steps > 0 and self._graph.finish()
-        except Exception as error:  # see _optimise
-            self._graph.fail(error)
-            done = False
-        if not done:
-            return None
-        self._optimized = True
-        return self._result(restarted=False, gap=False)
+        self._begin_result()
+        if self._log.steps > 0 and self._graph.finish():
+            self._optimized = True
+        self._fault = self._graph.fault or self._fault
+        return self._result(restarted=False, gap=False) if self._optimized else None
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""
@@ -322,7 +320,7 @@ class CorrectedTrajectory(ABC):
             largest_move_m=graph.largest_move_m if self._optimized else 0.0,
             closed_loops=int((graph.loop_weights > 0.5).sum()),
             window_fill=graph.window_fill,
-            fault=graph.fault,
+            fault=self._fault,
         )
 
 

@@ -40,29 +40,20 @@ class ScanGraph:
         self._scans = KeyScanStore()
         self._finder = ScanLoopFinder(config.loops)
         self._selection = ScanLoopSelection(config)
-        self._running: ScanPoseGraph | None = None
-        self._rows = np.zeros(0, np.int64)
-        self._left = 0
+        self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
         self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
         self.loop_weights = np.zeros(0)
         """Of the loops in the last optimisation ``(loops,)``, zero to one."""
         self.took_s = 0.0
         """Computing time of the last optimisation."""
-        self.optimized = False
-        """Whether an optimisation ended since the newest frame came."""
         self.fault = ""
-        """What failed since the newest frame came, in words. Everything is then as it was before, but for the loops."""
+        """What failed in the last ``work`` or ``finish``, in words. All is then as it was before, but for the loops."""
 
     @property
     def keys(self) -> int:
         """Key scans so far."""
         return len(self._chain)
-
-    @property
-    def running(self) -> bool:
-        """Whether an optimisation has begun that is not done."""
-        return self._running is not None
 
     @property
     def largest_move_m(self) -> float:
@@ -76,32 +67,44 @@ class ScanGraph:
 
     def append(
         self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None, joins: bool = False
-    ) -> bool:
-        """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise.
+    ) -> None:
+        """Take a step ``(3,)`` with its covariance ``(3, 3)``; ``work`` does what it makes due.
 
         With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place.
         """
-        self.optimized, self.fault = False, ""
         self._chain.append(relative, covariance, joins)
-        if key is None:
-            return False
-        if self._running is not None:  # what comes now adds a node to those that it is about
-            try:
-                self.advance(self._left)
-            except Exception as error:  # it may cost an optimisation, and nothing else
-                self.fail(error)
-        self._chain.append_node(key, joins)
-        self._scans.append(key.scan)
-        try:
-            return self._look_for_loops()
-        except Exception as error:  # numerics of a library, or a fault of ours: it may cost loops, and nothing else
-            self.fail(error, "the search for loops")
-            return False
+        if key is not None:
+            self._chain.append_node(key, joins)
+            self._scans.append(key.scan)
+            self._is_key = True
 
-    def fail(self, error: Exception, work: str = "an optimisation") -> None:
-        """Leave undone what has begun, and keep why: every node is where it was."""
-        self.fault = fault_of(error, work)
-        self._running, self._waiting = None, 0
+    def work(self, optimize: bool = True) -> bool:
+        """Look for loops of a new key scan, and optimise where it is time; returns whether it did.
+
+        A fault costs what failed alone: loops, or an optimisation. Every node is then where it was.
+        """
+        self.fault = ""
+        if not self._is_key:
+            return False
+        self._is_key = False
+        try:
+            due = self._look_for_loops()
+        except Exception as error:  # numerics of a library, or a fault of ours
+            self.fault, self._waiting = fault_of(error, "the search for loops"), 0
+            return False
+        return due and optimize and self._optimised(self.config.iterations)
+
+    def _optimised(self, iterations: int) -> bool:
+        """Optimise all nodes; returns whether it did not fail."""
+        self._waiting = 0
+        began = time.perf_counter()
+        try:
+            self._optimise(iterations)
+        except Exception as error:  # see ``work``
+            self.fault = fault_of(error, "an optimisation")
+            return False
+        self.took_s = time.perf_counter() - began
+        return True
 
     def _look_for_loops(self) -> bool:
         """Ask for loops of the newest key; returns whether an optimisation is due."""
@@ -145,52 +148,26 @@ class ScanGraph:
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._chain.steps, measured
 
-    def begin(self) -> None:
-        """Begin to optimise all nodes."""
-        began = time.perf_counter()
-        self._rows = self._selection.rows.copy()
+    def _optimise(self, iterations: int) -> None:
+        rows = self._selection.rows.copy()
         steps, measured = self.measurements()
-        gates = np.ones(len(self._rows))
-        self._running = ScanPoseGraph(steps, measured, gates, self._chain.nodes, self.config.kernel)
-        self._left = self.config.iterations
-        self._waiting = 0
-        self.took_s = time.perf_counter() - began
-
-    def advance(self, iterations: int) -> bool:
-        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
-
-        An error leaves every node where it was.
-        """
-        running = self._running
-        if running is None:
-            raise RuntimeError("no optimisation has begun")
-        began = time.perf_counter()
-        for _ in range(min(iterations, self._left)):
-            running.iterate()
-            self._left = 0 if running.converged else self._left - 1
-        self.took_s += time.perf_counter() - began
-        if self._left:
-            return False
+        graph = ScanPoseGraph(steps, measured, np.ones(len(rows)), self._chain.nodes, self.config.kernel)
+        for _ in range(iterations):
+            graph.iterate()
+            if graph.converged:
+                break
         end = self._chain.end
         if self.keys > 1:
-            end = running.covariance(self._chain.published_steps, self.keys - 1)
-        if not (np.isfinite(running.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            end = graph.covariance(self._chain.published_steps, self.keys - 1)
+        if not (np.isfinite(graph.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
-        self._running = None
-        self._chain.move(running.poses, end)
-        self._loop_rows, self.loop_weights = self._rows, running.weights
-        self.optimized = True
-        return True
-
-    def abandon(self) -> None:
-        """Leave undone what has begun."""
-        if self._running is not None:
-            self._running, self._waiting = None, self.config.keys_between
+        self._chain.move(graph.poses, end)
+        self._loop_rows, self.loop_weights = rows, graph.weights
 
     @property
     def unfinished(self) -> bool:
-        """Whether an optimisation has begun, or a loop waits for one."""
-        return self.running or self._waiting > 0
+        """Whether a loop waits for an optimisation."""
+        return self._waiting > 0
 
     @property
     def window_fill(self) -> float:
@@ -200,12 +177,7 @@ class ScanGraph:
     def finish(self) -> bool:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
         self.fault = ""
-        if self._running is None:
-            if len(self._selection) == 0:
-                return False
-            self.begin()
-        self._left = _MOST_ITERATIONS
-        return self._running is not None and self.advance(self._left)
+        return len(self._selection) > 0 and self._optimised(_MOST_ITERATIONS)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
@@ -227,10 +199,7 @@ class ScanGraph:
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``.
-
-        Of an optimisation in progress that is the number of its iterations: nothing that it began with has changed.
-        """
+        """All that later steps depend on, for ``restore``, when ``work`` is done."""
         return {
             **self._chain.state(),
             **self._selection.state(),
@@ -239,7 +208,6 @@ class ScanGraph:
             "waiting": np.array(self._waiting),
             "loop_rows": self._loop_rows,
             "loop_weights": self.loop_weights,
-            "iterations": np.array(-1 if self._running is None else self.config.iterations - self._left),
         }
 
     def restore(self, arrays: Arrays) -> None:
@@ -252,12 +220,7 @@ class ScanGraph:
         self._selection.restore(arrays, found)
         self._loop_rows = taken_rows(arrays, "loop_rows", found)
         self.loop_weights = taken(arrays, "loop_weights", np.float64, len(self._loop_rows))
-        done, waiting = taken_integer(arrays, "iterations", -1), taken_integer(arrays, "waiting")
-        require(done < self.config.iterations, f"an optimisation has run {done} iterations already")
-        if done >= 0:
-            self.begin()
-            self.advance(done)
-        self._waiting = waiting
+        self._waiting = taken_integer(arrays, "waiting")
 
     @property
     def loop_frames(self) -> np.ndarray:
