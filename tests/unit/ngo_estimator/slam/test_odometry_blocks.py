@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
 from ngo_estimator.slam.step_log import StepLog
 from tests.unit.ngo_estimator.samples import small_optimizer
@@ -53,12 +53,11 @@ def test_a_correction_is_spread_evenly_but_where_another_odometry_goes_on() -> N
 
 
 def test_blocks_that_do_not_belong_to_the_steps_are_refused() -> None:
-    state = drive(3).state()
-    restored = make()
-    restored.restore(state)
+    state = state_of(drive(3))
+    restored = restore(make(), state)
     np.testing.assert_array_equal(restored.std.slice(0), drive(3).std.slice(0))
-    for name in ("odometry", "blind"):
+    for name, cut in (("odometry.rows", -8), ("_blind.rows", -1)):
         with pytest.raises(StateError, match="do not belong together"):
-            make().restore(state | {name: state[name][: -8 if name == "odometry" else -1]})
+            restore(make(), state | {name: state[name][:cut]})
     with pytest.raises(StateError, match="another odometry begins"):
-        make().restore(state | {"joins": np.array([25])})
+        restore(make(), state | {"_joins.rows": np.array([25])})

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.slam.scan_graph import ScanGraph
@@ -76,3 +77,9 @@ def first_loop(scans: list[KeyScan], config: ScanGraphConfig, step_std: tuple[fl
         if len(graph.measurements()[1].nodes):
             return graph.keys, int(graph.used_loops.agreeing.max())
     return len(scans), 0
+
+
+@pytest.mark.parametrize("name", ["_selection._used.rows", "_selection.doubted"])
+def test_a_state_with_loops_that_are_not_there_is_refused(name: str) -> None:
+    with pytest.raises(StateError, match="not among the 0"):
+        restore(ScanGraph(ScanGraphConfig()), {**state_of(driven(np.ones(3))), name: np.array((3,))})

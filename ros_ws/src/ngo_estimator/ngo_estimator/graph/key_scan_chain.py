@@ -8,7 +8,7 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import planar_arrays
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, propagated
@@ -35,7 +35,7 @@ class KeyScanChain:
         self._key_stamp_ns = 0
         self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
         self._end = np.zeros((3, 3))  # covariance of the last node in the map
-        self._before = np.zeros((1, 3))
+        self._before = np.zeros((0, 3))  # poses of the nodes before the last ``move``
         self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on, nodes all of them
 
     def __len__(self) -> int:
@@ -164,35 +164,13 @@ class KeyScanChain:
         share[np.isin(ends_at, self._joins.values)[segment]] = 0.0
         return planar_arrays.compose(starts[segment], within + share[:, None] * bent[segment])
 
-    def _rows(self) -> dict[str, GrowingRows]:
-        return {
-            "odometry": self._odometry,
-            "frames": self._frames,
-            "joins": self._joins,
-            "nodes": self._nodes,
-            "steps": self._steps,
-            "step_covariance": self._step_covariance,
-            "published_covariance": self._published_covariance,
-            "step_variance": self._step_variance,
-        }
+    SAVED = (
+        "_odometry", "_frames", "_joins", "_nodes", "_steps", "_step_covariance", "_published_covariance",
+        "_step_variance", "_key_stamp_ns", "_since", "_end", "_before",
+    )  # fmt: skip
 
-    def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``."""
-        return {
-            **{name: rows.values for name, rows in self._rows().items()},
-            "key_stamp_ns": np.array(self._key_stamp_ns, np.int64),
-            "since": self._since,
-            "end": self._end,
-            "before": self._before,
-        }
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        for name, rows in self._rows().items():
-            rows.restore(arrays, name)
-        self._key_stamp_ns = taken_integer(arrays, "key_stamp_ns", -(2**63))
-        self._since, self._end = taken(arrays, "since", np.float64, 3, 3), taken(arrays, "end", np.float64, 3, 3)
-        self._before = taken(arrays, "before", np.float64, -1, 3)
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
         keys, frames = len(self), self._frames.values
         of_steps = (self._steps, self._step_covariance, self._published_covariance, self._step_variance)
         require(
@@ -201,6 +179,4 @@ class KeyScanChain:
         )
         ordered = frames[0] == 0 and (np.diff(frames) > 0).all() and frames[-1] < len(self._odometry)
         joined = np.isin(self._joins.values, frames[1:]).all()
-        require(
-            bool(ordered and joined) and 1 <= len(self._before) <= keys, "frames or nodes are named that are not there"
-        )
+        require(bool(ordered and joined) and len(self._before) <= keys, "frames or nodes are named that are not there")

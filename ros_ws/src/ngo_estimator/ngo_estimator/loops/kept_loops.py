@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ngo_estimator.data.state_arrays import Arrays, require, taken
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.loops.pair_measurement import PairMeasurement
@@ -132,18 +132,12 @@ class KeptLoops:
         kept = self.best(np.flatnonzero(behind & believed), most)
         return self.where(np.concatenate((kept, np.flatnonzero(~behind))))
 
-    def state(self) -> Arrays:
-        """All of it, for ``from_state``."""
-        return dict(zip(_COLUMNS, self._columns(), strict=True))
-
-    @classmethod
-    def from_state(cls, arrays: Arrays) -> KeptLoops:
-        """The loops of a ``state()``; raises ``StateError``."""
-        count = len(taken(arrays, "weight", np.float64, -1))
-        kept = cls(*(taken(arrays, name, dtype, count, *shape) for name, (dtype, shape) in _COLUMNS.items()))
-        forward = (kept.start >= 0) & (kept.start < kept.end) & (kept.frame >= -1)
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored loops that are none."""
+        columns = self._columns()
+        forward = (self.start >= 0) & (self.start < self.end) & (self.frame >= -1)
+        require({len(column) for column in columns} == {len(self)}, f"there are not {len(self)} loops")
         require(bool(forward.all()), "a loop does not lead from an earlier node to a later one")
-        return kept
 
     def for_optimizer(self, keys: np.ndarray, first: int, embeddings: np.ndarray) -> Loops:
         """The record in float32, numbered as the optimizer counts: key frames, and the nodes of the window behind them.

@@ -14,7 +14,7 @@ from numba import njit
 from torch import Tensor
 
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, under
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
@@ -88,25 +88,13 @@ class OnlineLoops:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def state(self) -> Arrays:
-        """All that the search keeps, for ``restore``."""
-        kept = under("kept", self._kept.state())
-        return {**under("codes", self._codes.state()), **under("embeddings", self._embeddings.state()), **kept}
+    SAVED = ("_codes", "_embeddings", "_kept")
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        self._codes.restore(part(arrays, "codes"))
-        self._embeddings.restore(part(arrays, "embeddings"))
-        self._kept = KeptLoops.from_state(part(arrays, "kept"))
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
         frames, newest = len(self._odometry) - 1, int(self._kept.end.max(initial=0)) * self._block
         require(len(self._codes) == len(self._embeddings) == frames, f"there are not {frames} place codes")
         require(newest <= frames, f"a loop ends at frame {newest} of {frames}")
-
-    @property
-    def key_frame_shapes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Shapes of the embeddings and of the codes of a key frame."""
-        config = self._pair_head.config
-        return (self._block, config.embedding_size), (self._block + 2 * MARGIN, config.code_length)
 
     def append(self, place_code: np.ndarray) -> None:
         """Take the place code of the next frame; zeros are those of a frame that closes no loops."""

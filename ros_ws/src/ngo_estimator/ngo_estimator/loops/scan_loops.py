@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.data.state_arrays import Arrays, require, taken
-
 EVIDENCE = ("response", "second_peak", "on_lines", "seen_through", "disagreement", "agreeing")
 """Columns of a loop's evidence.
 
@@ -13,15 +11,6 @@ The mean likelihood of the points (0 to 1), the second peak's share of it, the s
 sightings through walls, the distance from the graph's pose in deviations (a third of the window), and the number of
 neighbouring loops that agree.
 """
-
-_ROWS: dict[str, tuple[type, tuple[int, ...]]] = {
-    "pairs": (np.int64, (2,)),
-    "relative": (np.float64, (3,)),
-    "covariance": (np.float64, (3, 3)),
-    "evidence": (np.float64, (len(EVIDENCE),)),
-    "accepted": (np.bool_, ()),
-}
-"""Type and shape of a loop's row in each array of ``ScanLoops``."""
 
 
 @dataclass(frozen=True)
@@ -79,15 +68,3 @@ class ScanLoops:
             np.concatenate((self.evidence, others.evidence)),
             np.concatenate((self.accepted, others.accepted)),
         )
-
-    def state(self) -> Arrays:
-        """All of them, for ``restored``."""
-        return {name: getattr(self, name) for name in _ROWS}
-
-    @staticmethod
-    def restored(arrays: Arrays, keys: int) -> "ScanLoops":
-        """The loops of a ``state()`` between so many key scans; raises ``StateError``."""
-        pairs = taken(arrays, "pairs", np.int64, -1, 2)
-        rows = {name: taken(arrays, name, dtype, len(pairs), *shape) for name, (dtype, shape) in _ROWS.items()}
-        require(bool(((pairs >= 0) & (pairs < keys)).all()), f"a loop joins key scans that are not among the {keys}")
-        return ScanLoops(**rows)

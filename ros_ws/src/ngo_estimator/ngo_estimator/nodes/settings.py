@@ -140,8 +140,8 @@ class NgoNodeSettings(EstimatorSettings):
     )
     iterations_per_step: int = setting(
         1,
-        "Parts of an optimisation at each relative pose, which spreads its time; 0: all of them at the relative "
-        "pose that completes a meta-pose.",
+        "0: a meta-pose is optimised before its pose is published. From 1 on: behind it, from the last solution on, in "
+        "one piece.",
         minimum=0,
         maximum=100,
     )

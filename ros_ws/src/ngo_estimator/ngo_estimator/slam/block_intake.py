@@ -25,6 +25,8 @@ class BlockIntake:
         scale: factor of the graph's variances.
     """
 
+    SAVED = ("solved",)
+
     def __init__(
         self, odometry: OdometryBlocks, nodes: MetaNodes, loops: OnlineLoops | None, overlaps: bool, scale: float
     ) -> None:
@@ -34,7 +36,7 @@ class BlockIntake:
         """The last optimisation, set by its owner: it limits the drift of loops, and tells whether poses are fresh."""
 
     def take(self) -> str:
-        """Take in the newest block; returns a fault in words, or nothing. It costs loops or features, and nothing else."""
+        """Take in the newest block; returns a fault in words, or nothing. A fault costs loops or features alone."""
         works: list[tuple[str, Callable[[int], None]]] = [("taking in a meta-pose", self._odometry.aggregate)]
         if self._loops is not None:
             searches = [self._look_for_places, self._measure_places]

@@ -8,7 +8,7 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
+from ngo_estimator.data.state_arrays import Arrays, StateError, attributes_of, require, with_attributes
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.slam.bridge import bridged
 from ngo_estimator.slam.map_localisation import MapLocalisation
@@ -63,24 +63,19 @@ class PoseGraph(Protocol):
     def frame_poses(self, before: bool = False) -> np.ndarray:
         """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
 
-    def state(self) -> Arrays:
-        """All that later steps depend on."""
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
-
 
 class CorrectedTrajectory(ABC):
     """Takes steps into a log and a graph, and tells what each changed.
 
-    A step is answered by the odometry behind the last corrected pose. The work that it makes due, such as the search for
-    loops and an optimisation, is done by ``correct``: a live node calls it when it has published the answer, in the time
-    until the next step. Where nobody calls it, the next step begins with it. So results do not depend on who calls.
+    A step is answered by the odometry behind the last corrected pose. ``correct`` does the work that it makes due: the
+    search for loops, and an optimisation. A live node calls it when it has published the answer, in the time until the
+    next step. Where nobody calls it, the next step begins with it. So results do not depend on who calls.
 
     Args:
         answers_first: False: the work is done before the step is answered.
     """
 
+    SAVED = ("_log", "_graph", "_online", "_optimized", "_odom")
     _graph: PoseGraph
 
     def __init__(self, answers_first: bool) -> None:
@@ -120,9 +115,7 @@ class CorrectedTrajectory(ABC):
         """
         require(self._log.steps > 0, "the trajectory is empty")
         self._work()
-        own = {"online": self._online.values, "optimized": np.array(self._optimized), "odom": self._odom}
-        arrays = own | under("log", self._log.state()) | under("graph", self._graph.state())
-        return {name: np.array(array, order="C") for name, array in arrays.items()}
+        return attributes_of(self)
 
     def restored(self: AnyTrajectory, arrays: Arrays) -> AnyTrajectory:
         """Another trajectory with these networks and settings, in a ``state()``; this one stays as it is.
@@ -144,12 +137,8 @@ class CorrectedTrajectory(ABC):
         return other
 
     def _restore(self, arrays: Arrays) -> None:
-        self._log.restore(part(arrays, "log"))
-        self._graph.restore(part(arrays, "graph"))
+        with_attributes(self, arrays)
         self._loaded = True
-        self._online.restore(arrays, "online")
-        self._optimized = bool(taken(arrays, "optimized", np.bool_))
-        self._odom = taken(arrays, "odom", np.float64, 3)
         whole = self.trajectory()
         require(whole is not None, "the trajectory is empty")
         assert whole is not None

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
+from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import chained, compose, frames_between_nodes
@@ -62,7 +62,7 @@ class MetaGraph:
         self._nodes = MetaNodes(key_frames)
         self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
         self._loops: OnlineLoops | None = None
-        self._origin_code: np.ndarray | None = None
+        self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
             assert pair_head is not None
             self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.odometry)
@@ -74,7 +74,7 @@ class MetaGraph:
         self._network_every, self._anneal_every = network_every, anneal_every
         self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
-        self._corrections: NetworkCorrections | None = None
+        self._corrections = NetworkCorrections.none()
         self.fault = ""
         """What failed in the last ``work``, in words; empty where nothing did."""
         self.took_s = 0.0
@@ -92,7 +92,8 @@ class MetaGraph:
 
     def begin_at(self, origin_code: np.ndarray | None) -> None:
         """Take the place code of the first frame, where it is known, before the first step."""
-        self._origin_code = origin_code
+        if origin_code is not None:
+            self._origin_code = origin_code
 
     def append(
         self,
@@ -151,7 +152,7 @@ class MetaGraph:
         if self._loops is None or self._odometry.registrations == 0:
             return
         before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
-        self._odometry.register(self._loops.codes(first), before)
+        self._odometry.register(self._loops.codes(first), before if len(before) else None)
 
     @torch.inference_mode()
     def _recall(self) -> None:
@@ -231,7 +232,7 @@ class MetaGraph:
     def _network_is_due(self) -> bool:
         """Whether what the network gave is too old."""
         known = self._corrections
-        return known is None or is_due(self._nodes.blocks - known.last, known.last - known.first, self._network_every)
+        return not known.last or is_due(self._nodes.blocks - known.last, known.last - known.first, self._network_every)
 
     @property
     def _annealing_is_due(self) -> bool:
@@ -298,50 +299,28 @@ class MetaGraph:
             raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
         return self._loops.places(self._nodes.first * self._block, self._nodes.keys, self.frame_poses())
 
-    def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``, when ``work`` is done."""
-        code = self._origin_code
-        arrays = {
-            **self._odometry.state(),
-            **self._nodes.state(),
-            **self._intake.solved.state(),
-            "pose": self._pose,
-            "covariance": self._covariance,
-            "annealed": np.array(self._annealed),
-            "shrunk": np.array(self._shrunk),
-            **{name: getattr(self, name) for name in ("loop_frames", "loop_relative", "loop_std", "loop_weights")},
-            "origin_code": np.zeros(0, np.float32) if code is None else code,
-        }
-        # The window may have left them behind while nothing was optimised: then the network is due.
-        if self._corrections is not None and self._corrections.last > self._nodes.first:
-            arrays |= under("corrections", self._corrections.state())
-        return arrays if self._loops is None else arrays | under("loops", self._loops.state())
+    SAVED = (
+        "_odometry", "_nodes", "_loops", "_intake", "_pose", "_covariance", "_annealed", "_shrunk", "_corrections",
+        "_origin_code", "loop_frames", "loop_relative", "loop_std", "loop_weights",
+    )  # fmt: skip
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
-        self._odometry.restore(arrays)
-        nothing = (self._block, 0)
-        shapes = (nothing, nothing) if self._loops is None else self._loops.key_frame_shapes
-        self._nodes.restore(arrays, *shapes)
-        frames, blocks, iterations = self._odometry.steps, self._nodes.blocks, self._optimizer.config.iterations
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        frames, blocks, loops = self._odometry.steps, self._nodes.blocks, len(self.loop_frames)
         require(blocks == self._odometry.blocks, f"{frames} steps and {blocks} meta-poses do not belong together")
-        self._intake.solved = SolvedGraph.from_state(arrays, blocks)
-        self._pose = taken(arrays, "pose", np.float64, 3)
-        self._covariance = taken(arrays, "covariance", np.float64, 3, 3)
-        self._annealed, self._shrunk = taken_integer(arrays, "annealed"), bool(taken(arrays, "shrunk", np.bool_))
-        self.loop_frames = taken(arrays, "loop_frames", np.int64, -1, 2)
+        of_loops = {len(rows) for rows in (self.loop_relative, self.loop_std, self.loop_weights)}
         known = (self.loop_frames >= 0).all() and (self.loop_frames <= frames).all()
-        require(bool(known), "loops join frames that are not there")
-        for name, shape in (("loop_relative", (3,)), ("loop_std", (3,)), ("loop_weights", ())):
-            setattr(self, name, taken(arrays, name, np.float64, len(self.loop_frames), *shape))
-        code = taken(arrays, "origin_code", np.float32, -1)
-        self._origin_code = code if len(code) else None
-        if self._loops is not None:
-            self._loops.restore(part(arrays, "loops"))
-        if corrections := part(arrays, "corrections"):
-            given = self._corrections = NetworkCorrections.from_state(corrections, iterations)
-            fits = given.first <= self._nodes.first < given.last <= blocks
-            require(fits, f"corrections of the blocks {given.first} to {given.last} are given")
+        require(bool(known) and of_loops == {loops}, "loops join frames that are not there")
+        given, solved = self._corrections, self._intake.solved
+        shape = self._optimizer.config.iterations if given.last else 0, given.last - given.first
+        require(
+            0 <= given.first <= given.last <= blocks
+            and given.adjustment.shape[:2] == given.stiffness.shape[:2] == shape,
+            f"corrections of the blocks {given.first} to {given.last} are given",
+        )
+        require(0 <= solved.first <= solved.last <= blocks, "an optimisation is of nodes that are not there")
+        require_ascending(solved.keys, "keys", blocks + 1)
+        require(0 <= self._annealed <= blocks, f"loops were judged at meta-pose {self._annealed} of {blocks}")
 
 
 def is_due(since: int, seen: int, every: int) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken_integer, under
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import between, carried, compose
 from ngo_estimator.networks.place_encoder import PairHead
@@ -205,39 +205,23 @@ class OdometryBlocks:
             shares[block] = frames >= frame - block * self._block
         return shares
 
-    def _rows(self) -> tuple[dict[str, SlidingRows], dict[str, SlidingRows]]:
-        """Rows of steps, and rows of blocks, by their names in a state."""
-        of_steps = {"relative": self._relative, "log_std": self._log_std, "motion": self._motion}
-        of_blocks = {"steps": self.relative, "std": self.std, "optimized_std": self.optimized_std, "fixed": self.fixed}
-        return of_steps | {"familiar": self._familiar}, of_blocks
+    _OF_STEPS = ("_relative", "_log_std", "_motion", "_familiar")
+    _OF_BLOCKS = ("relative", "std", "optimized_std", "fixed")
+    SAVED = (*_OF_STEPS, *_OF_BLOCKS, "odometry", "_blind", "_joins", "_recalled", "features")
 
-    def state(self) -> Arrays:
-        """All that is kept of steps and blocks, for ``restore``."""
-        arrays = {"odometry": self.odometry.values, "blind": self.blind, "joins": self._joins.values}
-        arrays["recalled"] = np.array(self._recalled)
-        of_steps, of_blocks = self._rows()
-        for name, rows in {**of_steps, **of_blocks, "features": self.features}.items():
-            arrays |= under(name, rows.state())
-        return arrays
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        for name, growing in (("odometry", self.odometry), ("blind", self._blind), ("joins", self._joins)):
-            growing.restore(arrays, name)
-        self._recalled = taken_integer(arrays, "recalled")
-        of_steps, of_blocks = self._rows()
-        for name, rows in {**of_steps, **of_blocks, "features": self.features}.items():
-            rows.restore(part(arrays, name))
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
         steps, blocks, joins = self.steps, self.blocks, self._joins.values
         require(
             steps // self._block == blocks == len(self._blind)
-            and {len(rows) for rows in of_steps.values()} == {steps}
-            and {len(rows) for rows in of_blocks.values()} == {blocks},
+            and {len(getattr(self, name)) for name in self._OF_STEPS} == {steps}
+            and {len(getattr(self, name)) for name in self._OF_BLOCKS} == {blocks},
             f"{steps} steps and {blocks} meta-poses do not belong together",
         )
         require(
             bool((joins > 0).all() and (joins <= steps).all()), "another odometry begins at a frame that is not there"
         )
+        require(self._recalled >= 0, f"frames are recalled from meta-pose {self._recalled} on")
 
 
 def _near(found: np.ndarray, reach: int) -> np.ndarray:

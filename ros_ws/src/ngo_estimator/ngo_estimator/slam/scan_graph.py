@@ -6,7 +6,7 @@ import time
 import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_motion import transformed
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
@@ -15,7 +15,7 @@ from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
-from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection, taken_rows
+from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_matcher import ScanMatcher
@@ -198,29 +198,16 @@ class ScanGraph:
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
-    def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``, when ``work`` is done."""
-        return {
-            **self._chain.state(),
-            **self._selection.state(),
-            **under("scans", self._scans.state()),
-            **under("finder", self._finder.state()),
-            "waiting": np.array(self._waiting),
-            "loop_rows": self._loop_rows,
-            "loop_weights": self.loop_weights,
-        }
+    SAVED = ("_chain", "_scans", "_finder", "_selection", "_waiting", "_loop_rows", "loop_weights")
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
-        self._chain.restore(arrays)
-        self._scans.restore(part(arrays, "scans"))
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
         require(len(self._scans) == self.keys, f"there are not {self.keys} key scans")
-        self._finder.restore(part(arrays, "finder"))
         found = len(self._finder.loops)
-        self._selection.restore(arrays, found)
-        self._loop_rows = taken_rows(arrays, "loop_rows", found)
-        self.loop_weights = taken(arrays, "loop_weights", np.float64, len(self._loop_rows))
-        self._waiting = taken_integer(arrays, "waiting")
+        for rows in (self._selection.rows, self._selection.doubted, self._loop_rows):
+            require(bool(((rows >= 0) & (rows < found)).all()), f"loops are named that are not among the {found}")
+        require(len(self._loop_rows) == len(self.loop_weights), "there are not as many weights as loops")
+        require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
 
     @property
     def loop_frames(self) -> np.ndarray:
