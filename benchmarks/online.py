@@ -124,7 +124,6 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         "first_path_s": first_path_s(world, arguments.seed, cores, logs),
         "end_to_end_frames_per_s": end_to_end(world, arguments),
         **image_to_path(world, arguments),
-        "times_bound": core["update"]["ms"] / core["work"]["bound_ms"],
         **core,
     }
     rounded: dict[str, Any] = _rounded(result)
@@ -211,9 +210,6 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
     row("the core, cpu s in a minute at 10 Hz", lambda r: f"{r['cpu_s_a_minute_at_10_hz']:.2f}")
     errors = ("odometry", "ours", "gtsam_lm", "isam2", "isam2_default")
     row(f"RMSE: {', '.join(errors)} (m)", lambda r: ", ".join(f"{r['rmse_m'][name]:.3f}" for name in errors))
-    row("work of an update: Mflop, MB", lambda r: f"{r['work']['flops'] / 1e6:.0f}, {r['work']['bytes'] / 1e6:.0f}")
-    row("the machine: Gflop/s, GB/s", lambda r: f"{r['work']['gflops']:.0f}, {r['work']['gbytes']:.0f}")
-    row("least time for it (ms), update / that", lambda r: f"{r['work']['bound_ms']:.1f}, {r['times_bound']:.1f}")
     row("from the start of both nodes to the first path (s)", lambda r: f"{r['first_path_s']:.2f}", "4")
     keys = [f"image_to_path_{name}_ms" for name in ("median", "p99")]
     bar = f"p99 {BARS[keys[1]]:.1f}"

@@ -45,7 +45,7 @@ Numbers = dict[str, dict[str, Any]]
 """``{mean, ci95}`` by the name of a number."""
 
 _OURS = ("slam/localisation.py", "slam/evidence.py", "slam/place_matcher.py")
-_BASELINES = ("baselines/particle_filter.py", "scoring/relocalisation_rows.py")
+_BASELINES = ("scoring/relocalisation_rows.py",)
 
 
 @dataclass(frozen=True)

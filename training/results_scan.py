@@ -67,7 +67,7 @@ class Arguments:
     length_m: float = 500.0
     """Way that the robot drives in a building."""
     ablation: int = 5
-    """How many of these get the rows of the ablation and of MRPT; and how many buildings have slipping wheels."""
+    """How many of these get the rows of the ablation; and how many buildings have slipping wheels."""
     mazes: int = 8
     """Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0."""
     frames: int = 2000
@@ -218,7 +218,7 @@ def _measured(arguments: Arguments, table: str, sources: Sequence[DriveSource], 
             asked = {
                 name: row
                 for name, row in rows.items()
-                if (index < ablation or not (row.ablation or row.slow)) and not (table == "logs" and row.needs_truth)
+                if (index < ablation or not row.ablation) and not (table == "logs" and row.needs_truth)
             }
             measured[source.name] = dict(
                 score_drive(source, asked, arguments.weights, cache, known_only=arguments.known)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 
-from benchmarks import equal_errors, long_run, online
+from benchmarks import long_run, online
 from demo.graph import GraphError
 from demo.session import SessionConfig
 
@@ -96,10 +96,3 @@ def test_a_long_run(world: Literal["maze2d", "scan"], tmp_path: Path, capsys: py
 def test_sizes_that_measure_nothing_are_refused(changes: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         online.Arguments(**changes)  # type: ignore[arg-type]
-
-
-def test_equal_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    equal_errors.main(equal_errors.Arguments(worlds=("maze2d",), drives=1, frames=160, out=tmp_path))
-    result = json.loads(capsys.readouterr().out.splitlines()[-1])["maze2d"]
-    assert set(result) == {"odometry", "ours", "at_once", "gtsam_lm", "isam2", "isam2_default", "difference"}
-    assert result["difference"][0] < 1e-4 and result["ours"][0] < 2.0 * result["odometry"][0]

@@ -1,1 +1,1 @@
-"""Other methods in the tables: DeepVO, pose graphs."""
+"""Other methods in the tables: DeepVO, pose graphs, KISS-ICP."""

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.graph.scan_pose_graph import RelativePoses
+from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_recordings.scan_stream import LidarScan
 
 _ANCHOR_STD = 1e-6

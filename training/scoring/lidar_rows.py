@@ -24,7 +24,7 @@ from ngo_estimator.slam import scan_trajectory
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_recordings.scan_stream import WheelPose
-from training.baselines import lidar_peers, mrpt_slam
+from training.baselines import lidar_peers
 from training.baselines.lidar_peers import GraphPeerConfig, KissConfig
 from training.data.lidar_drives import LidarDrive
 from training.scoring import wrong_loops
@@ -232,21 +232,13 @@ def kiss(runs: DriveRuns, config: KissConfig) -> Estimate:
     return Estimate(drive.scan_stamps_ns, poses, len(poses) / (time.process_time() - began), online=poses)
 
 
-def mrpt(runs: DriveRuns, program: mrpt_slam.Program) -> Estimate:
-    """A program of MRPT."""
-    drive = runs.drive
-    found = mrpt_slam.run(program, drive, mrpt_slam.MrptConfig())
-    return Estimate(found.stamps_ns, found.poses_xyyaw, len(drive.scans) / found.took_s)
-
-
 @dataclass(frozen=True)
 class Row:
     """A row: how it estimates, by which settings, and what it needs.
 
     ``code`` are the modules that its numbers follow from, beside those that they import. ``missing`` says in a few
     words what it lacks on this machine, or nothing. Of several estimates, one a seed, the mean error counts. Rows of
-    the ``ablation``, and ``slow`` ones, are measured on some drives of a table alone. One that ``needs_truth`` changes
-    covariances alone.
+    the ``ablation`` are measured on some drives of a table alone. One that ``needs_truth`` changes covariances alone.
     """
 
     estimate: Callable[[DriveRuns], Estimate | list[Estimate]]
@@ -255,7 +247,6 @@ class Row:
     code: tuple[ModuleType, ...] = _PIPELINE
     missing: Callable[[], str] = lambda: ""
     ablation: bool = False
-    slow: bool = False
     needs_truth: bool = False
 
 
@@ -281,12 +272,6 @@ def _fed(solve: Solver, percent: float, **changes: Any) -> Row:
     )
 
 
-def _mrpt(program: mrpt_slam.Program) -> Row:
-    config = mrpt_slam.MrptConfig()
-    missing = partial(mrpt_slam.missing, program)
-    return Row(partial(mrpt, program=program), config, True, (mrpt_slam,), missing, slow=True)
-
-
 def _kiss_missing() -> str:
     return "" if find_spec("kiss_icp") else "KISS-ICP is not installed (requirements/test.txt)"
 
@@ -298,8 +283,6 @@ ROWS: dict[str, Row] = {
     "gtsam_lm": _gtsam(lidar_peers.solve_lm),
     "gtsam_gnc": _gtsam(lidar_peers.solve_gnc),
     "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
-    "icp_slam": _mrpt("icp-slam"),
-    "rbpf_slam": _mrpt("rbpf-slam"),
     "constant_deviations": _ours(True, learned_deviations=False),
     "constant_deviations_without_wheels": _ours(True, learned_deviations=False, wheels=False),
     "without_agreement": _ours(True, graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),

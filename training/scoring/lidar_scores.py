@@ -10,7 +10,6 @@ from types import ModuleType
 import numpy as np
 
 from ngo_common.files import written_whole
-from training.baselines.mrpt_slam import MrptError
 from training.common.source_code import code_digest
 from training.data import lidar_drives
 from training.data.lidar_drives import LidarDrive, TruePoses
@@ -86,7 +85,7 @@ def _scored(runs: DriveRuns, row: Row) -> Scored:
         found = row.estimate(runs)
         estimates = found if isinstance(found, list) else [found]
         each = [_errors(drive, estimate) for estimate in estimates]
-    except (ValueError, MrptError) as error:
+    except ValueError as error:
         return Scored(failed=str(error))
     errors = {key: np.mean([errors[key] for errors in each], axis=0) for key in each[0]}
     estimate = estimates[0]

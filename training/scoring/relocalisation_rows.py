@@ -18,20 +18,16 @@ from ngo_estimator.loops.place_map import PlaceMap
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.place_matcher import PlaceMatcher
-from training.baselines.particle_filter import ParticleFilter, ParticleFilterConfig, RangeMap
 from training.data.worlds import World
 from training.scoring.kidnapped import FRAMES, Features, KnownMap, Row
 from training.scoring.online_estimate import steps_of
 
-RowName = Literal["ours", "nearest_code", "particle_filter", "oracle_place"]
+RowName = Literal["ours", "nearest_code", "oracle_place"]
 
-ROWS: tuple[RowName, ...] = ("ours", "nearest_code", "particle_filter", "oracle_place")
+ROWS: tuple[RowName, ...] = ("ours", "nearest_code", "oracle_place")
 
 LEAST_SIMILARITY = {"maze2d": 0.99, "maze3d": 0.99}
 """Similarity of the nearest code from which on its pose is claimed, as chosen on validation mazes."""
-
-PARTICLE_FILTERS = {"maze2d": ParticleFilterConfig(), "maze3d": ParticleFilterConfig(hit_m=0.5)}
-"""Settings of the particle filter, as chosen on validation mazes."""
 
 _TURN_M = 0.5  # of a place: what a turn of one radian counts where the nearest frame is chosen
 
@@ -58,7 +54,6 @@ def row_of(name: str, networks: Networks, known: KnownMap, second: Features) -> 
     makers = {
         "ours": _ours,
         "nearest_code": _nearest_code,
-        "particle_filter": _particle_filter,
         "oracle_place": _oracle_place,
     }
     return makers[name](networks, known, second)
@@ -114,19 +109,3 @@ def _views(networks: Networks, known: KnownMap, second: Features, earlier: Tenso
         torch.stack([se2.between(poses[earlier], poses[at]) for at in a]).float(),
         torch.stack([se2.between(odometry[at], odometry[later]) for at in b]).float(),
     )
-
-
-def _particle_filter(networks: Networks, known: KnownMap, second: Features) -> Row:
-    config, size = networks.pair_head.config.registration, networks.pair_head.config.code_size
-    assert config is not None
-    angles = config.angles_rad.double().numpy()
-    range_map = RangeMap.of_scans(known.poses, known.codes[:, size:].astype(np.float64), angles)
-    ranges = second["codes"][:, size:].astype(np.float64)
-    farthest = float(max(ranges.max(), known.codes[:, size:].max())) + 1.0
-
-    def claims(start: int) -> list[np.ndarray | None]:
-        filtered = ParticleFilter(PARTICLE_FILTERS[networks.world], range_map, angles, farthest, seed=start)
-        chosen = range(start, start + FRAMES)
-        return [filtered.update(second["relative"][k], ranges[k]) for k in chosen]
-
-    return claims

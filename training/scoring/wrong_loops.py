@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.graph.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.scan_pose_graph import ScanPoseGraph
 from training.baselines.lidar_peers import GraphPeerConfig
 
 _GROUP = 5

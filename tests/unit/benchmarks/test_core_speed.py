@@ -50,5 +50,3 @@ def test_everything_is_measured(cache: Path) -> None:
     assert result["update"]["cpu_ms"] > result["optimize"]["cpu_ms"]
     errors = result["rmse_m"]
     assert max(errors["gtsam_lm"], errors["isam2"], errors["ours"]) < 2.0 * errors["odometry"]
-    assert result["work"]["products"] > 1e6
-    assert result["work"]["sparse"] > 0.0

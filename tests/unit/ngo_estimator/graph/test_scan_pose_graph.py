@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry.planar_motion import compose
-from ngo_estimator.graph.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.scan_pose_graph import ScanPoseGraph
 
 WIDE = 1e6
 """Of the kernel: as good as none."""

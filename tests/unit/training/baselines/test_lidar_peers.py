@@ -7,7 +7,8 @@ import pytest
 
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.graph.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.scan_pose_graph import ScanPoseGraph
 from ngo_recordings.scan_stream import LidarScan
 from training.baselines.lidar_peers import GraphPeerConfig, scan_points, solve_gnc, solve_lm
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.graph.scan_pose_graph import RelativePoses
+from ngo_estimator.graph.relative_poses import RelativePoses
 from training.baselines.lidar_peers import GraphPeerConfig
 from training.scoring.wrong_loops import WrongLoopsConfig, solve_ours, with_wrong_loops
 

@@ -12,8 +12,8 @@ from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import planar_arrays
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, propagated
+from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.scan_loop_thinning import largest_variances
-from ngo_estimator.graph.scan_pose_graph import RelativePoses
 
 
 class KeyScanChain:

@@ -10,7 +10,8 @@ from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_motion import transformed
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
-from ngo_estimator.graph.scan_pose_graph import RelativePoses, ScanPoseGraph
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.scan_pose_graph import ScanPoseGraph
 from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances

@@ -1,0 +1,120 @@
+"""The contract of all that correct a pose graph: a problem goes in, poses and how much each edge is believed come out.
+
+Every sensor states its graph as a ``GraphProblem``; what solves it is a ``Corrector``. Correctors are compared by one
+cost, ``truncated_cost``, so that the better of two solutions can be kept whoever made it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import chi2
+
+from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
+from ngo_estimator.graph.relative_poses import RelativePoses
+
+INLIER_PROBABILITY = 0.99
+"""A right edge's squared residual is below its threshold so often."""
+
+
+@dataclass(frozen=True)
+class GraphProblem:
+    """A pose graph to be corrected.
+
+    ``poses`` ``(nodes, 3)`` (m, m, rad) are where to begin; node 0 stays where it is. ``steps`` join each node to the
+    next, all nodes in one piece. ``loops`` join any two; they need not know the heading, nor the position well.
+    ``trust`` ``(loops,)``, zero to one, is the belief in each loop before the graph was asked. ``similarity``
+    ``(loops, k)`` is what the sensor says of each loop beside its pose, such as the likeness of two places; a corrector
+    that cannot use it ignores it.
+    """
+
+    poses: np.ndarray
+    steps: RelativePoses
+    loops: RelativePoses
+    trust: np.ndarray
+    similarity: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.steps) != len(self.poses) - 1 or len(self.trust) != len(self.loops):
+            raise ValueError(
+                f"there are {len(self.poses)} poses, {len(self.steps)} steps, {len(self.loops)} loops and trust in "
+                f"{len(self.trust)}; expected a step less than poses, and trust in every loop"
+            )
+
+
+@dataclass(frozen=True)
+class CorrectedGraph:
+    """A solution of a ``GraphProblem``.
+
+    ``poses`` ``(nodes, 3)``. ``loop_weights`` ``(loops,)`` and ``step_weights`` ``(nodes - 1,)``, zero to one, say how
+    much each edge is believed. ``cost`` is comparable between solutions of one problem. ``step_scale`` and
+    ``loop_scale`` are how many times as large as stated the variances of steps and loops were found to be.
+    """
+
+    problem: GraphProblem
+    poses: np.ndarray
+    loop_weights: np.ndarray
+    step_weights: np.ndarray
+    cost: float
+    step_scale: float = 1.0
+    loop_scale: float = 1.0
+
+    def information(self, steps: RelativePoses | None = None) -> NormalEquations:
+        """The factorised information of all poses, by the edges that are believed and their scales.
+
+        With ``steps`` these take the place of the problem's, as where a covariance is published that is wider.
+        """
+        steps = self.problem.steps if steps is None else steps
+        believed = self.loop_weights > 0.0
+        return normal_equations(
+            self.poses,
+            (steps, self.step_weights / self.step_scale),
+            (self.problem.loops[believed], self.loop_weights[believed] / self.loop_scale),
+        )
+
+    def covariance(self, nodes: Sequence[int] | np.ndarray, steps: RelativePoses | None = None) -> np.ndarray:
+        """Joint covariance ``(3 n, 3 n)`` of ``n`` nodes' poses in the map, node 0 excepted; see ``information``."""
+        return self.information(steps).covariance(nodes)
+
+
+class Corrector(Protocol):
+    """Corrects pose graphs."""
+
+    def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
+        """Solve a problem; with ``start``, a solution of an earlier state of the same graph, warm.
+
+        Nodes, steps and loops of ``start`` are the first of the problem's, in the same order.
+        """
+
+
+def thresholds(edges: RelativePoses) -> np.ndarray:
+    """Squared whitened residual ``(n,)`` above which an edge is an outlier, by its degrees of freedom."""
+    table = np.concatenate(((1.0,), chi2.ppf(INLIER_PROBABILITY, (1, 2, 3))))
+    limits: np.ndarray = table[edges.degrees]
+    return limits
+
+
+def truncated_cost(problem: GraphProblem, poses: np.ndarray, step_scale: float = 1.0, loop_scale: float = 1.0) -> float:
+    """Truncated least squares: each edge costs its squared residual, and an outlier its threshold.
+
+    What a loop costs is multiplied by its trust, and variances by their scales.
+    """
+    total = 0.0
+    for edges, scale, trust in ((problem.steps, step_scale, 1.0), (problem.loops, loop_scale, problem.trust)):
+        squared = (edges.residuals(poses) ** 2).sum(1) / scale
+        total += float((trust * np.minimum(squared, thresholds(edges))).sum())
+    return total
+
+
+def normal_equations(
+    poses: np.ndarray, *parts: tuple[RelativePoses, np.ndarray], structure: GraphStructure | None = None
+) -> NormalEquations:
+    """The normal equations of edges, each part with weights ``(n,)`` of its information, linearised at these poses.
+
+    ``structure`` is that of all edges in this order; without it, it is worked out.
+    """
+    if structure is None:
+        structure = GraphStructure(np.concatenate([edges.nodes for edges, _ in parts]), len(poses))
+    hessian, gradient = zip(*(edges.equations(poses, weights) for edges, weights in parts), strict=True)
+    return NormalEquations(np.concatenate(hessian), np.concatenate(gradient), structure)
