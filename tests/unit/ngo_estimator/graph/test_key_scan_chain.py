@@ -59,9 +59,9 @@ def test_a_chain_comes_back_from_its_state() -> None:
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda state: {"_frames.rows": state["_frames.rows"][:-1]},
-        lambda state: {"_frames.rows": state["_frames.rows"][::-1].copy()},
-        lambda state: {"_joins.rows": np.array((1,))},
+        lambda state: {"_frames._nodes.rows": state["_frames._nodes.rows"][:-1]},
+        lambda state: {"_frames._nodes.rows": state["_frames._nodes.rows"][::-1].copy()},
+        lambda state: {"_frames._joins.rows": np.array((9,))},
         lambda state: {"_before": np.zeros((4, 3))},
     ],
 )

@@ -31,7 +31,7 @@ def test_a_state_with_loops_of_other_keys_is_refused() -> None:
 
 
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="shapes"):
+    with pytest.raises(ValueError, match="shape"):
         ScanLoops(np.zeros((2, 2)), np.zeros((1, 3)), np.zeros((2, 3, 3)), np.zeros((2, 6)), np.zeros(2, bool))
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ngo_estimator.graph.meta_nodes import MetaNodes
-from ngo_estimator.loops.kept_loops import KeptLoops
+from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.slam.block_intake import BlockIntake
 
 
@@ -17,11 +17,11 @@ class Recorded:
     def __init__(self, fails: str = "") -> None:
         self.asked, self._fails = list[str](), fails
 
-    def _take(self, name: str) -> KeptLoops:
+    def _take(self, name: str) -> PlaceLoops:
         self.asked.append(name)
         if name == self._fails:
             raise ArithmeticError("no\nnumber")
-        return KeptLoops.none()
+        return PlaceLoops.none()
 
     def aggregate(self, block: int) -> None:
         self._take("aggregate")
@@ -29,10 +29,10 @@ class Recorded:
     def look(self, *given: Any) -> None:
         self._take("look")
 
-    def measure(self) -> KeptLoops:
+    def measure(self) -> PlaceLoops:
         return self._take("measure")
 
-    def find_overlaps(self, *given: Any) -> KeptLoops:
+    def find_overlaps(self, *given: Any) -> PlaceLoops:
         return self._take("overlaps")
 
 

@@ -66,7 +66,10 @@ def with_attributes(owner: Saved, arrays: Mapping[str, np.ndarray]) -> Saved:
         elif value is not None:
             values[name] = restore(value, part(arrays, name))
     if dataclasses.is_dataclass(owner) and not isinstance(owner, type):
-        owner = dataclasses.replace(owner, **values)
+        try:
+            owner = dataclasses.replace(owner, **values)
+        except ValueError as error:
+            raise StateError(str(error)) from error
     else:
         for name, value in values.items():
             setattr(owner, name, value)

@@ -180,7 +180,8 @@ class NgoNodeSettings(EstimatorSettings):
     loops_topic: str = topic("ngo/loops", "Loop closures as lines between poses.")
     path_rate_hz: float = setting(
         10.0,
-        "Highest rate of path_topic, trajectory_topic and loops_topic; 0: after every relative pose.",
+        "Highest rate of path_topic, trajectory_topic and loops_topic; 0: after every relative pose and every "
+        "correction.",
         minimum=0.0,
         maximum=1000.0,
         live=True,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from ngo_estimator.graph.meta_nodes import MetaNodes
 from ngo_estimator.graph.solved_graph import SolvedGraph
-from ngo_estimator.loops.kept_loops import KeptLoops
 from ngo_estimator.loops.online_loops import OnlineLoops
+from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
 from ngo_estimator.slam.trajectory_update import fault_of
 
@@ -78,7 +78,7 @@ class BlockIntake:
         if self._loops is not None and self._fresh:
             self._limit_drift(self._loops.find_overlaps(block, nodes.first, nodes.poses, nodes.keys))
 
-    def _limit_drift(self, found: KeptLoops) -> None:
+    def _limit_drift(self, found: PlaceLoops) -> None:
         nodes, std = self._nodes, self._odometry.std
         if self._loops is not None and len(nodes.keys) and len(found):
             limits = self.solved.most_drift(found.start, nodes.first, nodes.poses, std, self._scale)

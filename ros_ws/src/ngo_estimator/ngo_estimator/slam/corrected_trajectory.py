@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,55 +13,11 @@ from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.slam.bridge import bridged
 from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.pose_graph import PoseGraph
 from ngo_estimator.slam.step_log import StepLog, TakenStep
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 
 AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
-
-
-class PoseGraph(Protocol):
-    """The owner of all poses in ``map``, of the newest covariance, and of the loops."""
-
-    loop_weights: np.ndarray
-    took_s: float
-    fault: str
-    """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether there is anything left to optimise."""
-
-    @property
-    def window_fill(self) -> float:
-        """Share of the window that is in use."""
-
-    @property
-    def largest_move_m(self) -> float:
-        """How far the last optimisation moved a node at most."""
-
-    @property
-    def loop_frames(self) -> np.ndarray:
-        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
-
-    @property
-    def loop_relative(self) -> np.ndarray:
-        """Their measurements ``(loops, 3)``."""
-
-    @property
-    def loop_std(self) -> np.ndarray:
-        """Deviations ``(loops, 3)`` of these."""
-
-    def work(self, optimize: bool) -> bool:
-        """Do what the newest frame made due: look for loops, and optimise; returns whether it optimised."""
-
-    def finish(self) -> bool:
-        """Optimise what is left; returns whether there was anything, and it worked."""
-
-    def newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
-
-    def frame_poses(self, before: bool = False) -> np.ndarray:
-        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
 
 
 class CorrectedTrajectory(ABC):
@@ -282,14 +238,14 @@ class CorrectedTrajectory(ABC):
         """The whole trajectory as it is now, or None before the first step."""
         if self._log.steps == 0:
             return None
-        graph, log = self._graph, self._log
+        graph, log, closed = self._graph, self._log, self._graph.closed
         poses, moved = graph.frame_poses(), np.zeros(log.steps + 1)
         if self._optimized:
             before = graph.frame_poses(before=True)
             moved[:-1] = np.linalg.norm((poses - before)[:-1, :2], axis=1)
         arrays = (
             log.stamps_ns.values, poses, log.odometry.values, self._online.values, moved, log.odometry_std.values,
-            graph.loop_frames, graph.loop_weights, graph.loop_relative, graph.loop_std,
+            closed.pairs, closed.weight, closed.relative, closed.std,
         )  # fmt: skip
         return Trajectory(*map(_read_only, arrays))
 
@@ -307,7 +263,7 @@ class CorrectedTrajectory(ABC):
             restarted=restarted,
             gap=gap,
             largest_move_m=graph.largest_move_m if self._optimized else 0.0,
-            closed_loops=int((graph.loop_weights > 0.5).sum()),
+            closed_loops=int((graph.closed.weight > 0.5).sum()),
             window_fill=graph.window_fill,
             fault=self._fault,
         )

@@ -3,7 +3,6 @@
 Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 the first frame, the origin of ``map``.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -13,7 +12,7 @@ import torch
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import chained, compose, frames_between_nodes
+from ngo_estimator.geometry.planar_motion import chained, compose
 from ngo_estimator.graph.key_frames import KeyFrame
 from ngo_estimator.graph.meta_nodes import MetaNodes
 from ngo_estimator.graph.solved_graph import SolvedGraph
@@ -27,8 +26,8 @@ from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_varian
 from ngo_estimator.slam.block_intake import BlockIntake
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
 from ngo_estimator.slam.step_log import StepLog
-from ngo_estimator.slam.trajectory_update import fault_of
 
 _SHRUNK = 1e-5
 """By less (m or rad) are poses those of the solution: a hundredth of what corrections are good to."""
@@ -37,7 +36,7 @@ _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
 
 
-class MetaGraph:
+class MetaGraph(PoseGraph):
     """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
 
     The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
@@ -54,6 +53,7 @@ class MetaGraph:
         anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
+        super().__init__()
         self._optimizer = optimizer
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
@@ -65,20 +65,13 @@ class MetaGraph:
         self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
             assert pair_head is not None
-            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.odometry)
+            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.frames)
         overlaps = optimizer.config.search.overlaps > 0
         self._intake = BlockIntake(self._odometry, self._nodes, self._loops, overlaps, self._scale)
-        self.loop_frames = np.zeros((0, 2), np.int64)
-        """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
-        self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         self._network_every, self._anneal_every = network_every, anneal_every
         self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
         self._corrections = NetworkCorrections.none()
-        self.fault = ""
-        """What failed in the last ``work``, in words; empty where nothing did."""
-        self.took_s = 0.0
-        """Computing time of the last update: taking in a meta-pose, and the optimisation."""
 
     @property
     def window_fill(self) -> float:
@@ -120,31 +113,20 @@ class MetaGraph:
         if self._loops is not None:
             self._loops.append(code)
 
+    @property
+    def _has_new_node(self) -> bool:
+        return self._odometry.steps >= (self._nodes.blocks + 1) * self._block
+
     @torch.inference_mode()
     def work(self, optimize: bool = True) -> bool:
-        """Take in the block that is complete, if there is one, and optimise; returns whether it did.
+        """Take in the block that is complete, if there is one, and optimise; see ``PoseGraph.work``."""
+        return super().work(optimize)
 
-        A fault costs what failed alone: loops, or an optimisation. Every node is then where it was.
-        """
-        self.fault = ""
-        if self._odometry.steps < (self._nodes.blocks + 1) * self._block:
-            return False
-        began = time.perf_counter()
+    def _take_in(self) -> bool:
         self._guarded("the registration of steps", lambda: self._register(self._nodes.blocks * self._block))
         self._nodes.append(self._odometry.complete())
         self.fault = self._intake.take() or self.fault
         self._make_room()
-        optimized = optimize and self._guarded("an optimisation", self._optimise)
-        self.took_s = time.perf_counter() - began
-        return optimized
-
-    def _guarded(self, work: str, do: Callable[[], None]) -> bool:
-        """Do it; returns whether it did not fail."""
-        try:
-            do()
-        except Exception as error:  # numerics of a library, or a fault of ours: the trajectory goes on by odometry
-            self.fault = fault_of(error, work)
-            return False
         return True
 
     def _register(self, first: int) -> None:
@@ -243,24 +225,13 @@ class MetaGraph:
             return True
         return is_due(self._nodes.blocks - self._annealed, self._annealed - first, self._anneal_every)
 
-    @property
-    def unfinished(self) -> bool:
-        """Whether anything is left to optimise when ``work`` is done: never."""
-        return False
-
-    def finish(self) -> bool:
-        """Optimise what is left when no more steps come; there is nothing."""
-        self.fault = ""
-        return False
-
     def _apply(self, result: OptimizedMetaPoses, numbers: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Take the result; how far the last node is from it ``(3,)``, as unfamiliar frames make corrections unsure."""
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
-            self.loop_frames, self.loop_relative = self._loops.edges(numbers)
-            information = result.loop_information[0].double().numpy()
-            self.loop_std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
-            self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(numbers, self.loop_weights, information)
+            weight, information = (of[0].double().numpy() for of in (result.loop_weights, result.loop_information))
+            std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
+            self.closed = ClosedLoops(*self._loops.edges(numbers), std, weight)
+            self._loops.weigh(numbers, weight, information)
         solution = chained(result.meta_relative[-1][0].double().numpy())
         poses = self._shrink(solution)
         self._nodes.move(poses[1:])
@@ -290,8 +261,7 @@ class MetaGraph:
 
     def frame_poses(self, before: bool = False) -> np.ndarray:
         """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
-        odometry = self._odometry
-        return frames_between_nodes(self._nodes.all(before), odometry.odometry.values, self._block, odometry.shares())
+        return self._odometry.frames.poses(self._nodes.all(before))
 
     def places(self) -> PlaceMap:
         """The frames whose place codes are kept; raises ``ValueError`` where none are."""
@@ -301,16 +271,14 @@ class MetaGraph:
 
     SAVED = (
         "_odometry", "_nodes", "_loops", "_intake", "_pose", "_covariance", "_annealed", "_shrunk", "_corrections",
-        "_origin_code", "loop_frames", "loop_relative", "loop_std", "loop_weights",
+        "_origin_code", "closed",
     )  # fmt: skip
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
-        frames, blocks, loops = self._odometry.steps, self._nodes.blocks, len(self.loop_frames)
+        frames, blocks, joined = self._odometry.steps, self._nodes.blocks, self.closed.pairs
         require(blocks == self._odometry.blocks, f"{frames} steps and {blocks} meta-poses do not belong together")
-        of_loops = {len(rows) for rows in (self.loop_relative, self.loop_std, self.loop_weights)}
-        known = (self.loop_frames >= 0).all() and (self.loop_frames <= frames).all()
-        require(bool(known) and of_loops == {loops}, "loops join frames that are not there")
+        require(bool(((joined >= 0) & (joined <= frames)).all()), "loops join frames that are not there")
         given, solved = self._corrections, self._intake.solved
         shape = self._optimizer.config.iterations if given.last else 0, given.last - given.first
         require(

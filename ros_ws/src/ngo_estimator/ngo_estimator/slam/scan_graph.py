@@ -1,7 +1,6 @@
 """The graph of key scans behind the online trajectory of a lidar: a chain of nodes, verified loops, warm starts."""
 
 import math
-import time
 
 import numpy as np
 
@@ -19,8 +18,8 @@ from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
 from ngo_estimator.slam.scan_matcher import ScanMatcher
-from ngo_estimator.slam.trajectory_update import fault_of
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
@@ -32,10 +31,11 @@ _KEYS_PER_SURPRISED = 400
 """The same where a loop surprises."""
 
 
-class ScanGraph:
+class ScanGraph(PoseGraph):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
     def __init__(self, config: ScanGraphConfig) -> None:
+        super().__init__()
         self.config = config
         self._chain = KeyScanChain(np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2)))
         self._scans = KeyScanStore()
@@ -43,13 +43,6 @@ class ScanGraph:
         self._selection = ScanLoopSelection(config)
         self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
-        self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
-        self.loop_weights = np.zeros(0)
-        """Of the loops in the last optimisation ``(loops,)``, zero to one."""
-        self.took_s = 0.0
-        """Computing time of the last optimisation."""
-        self.fault = ""
-        """What failed in the last ``work`` or ``finish``, in words. All is then as it was before, but for the loops."""
 
     @property
     def keys(self) -> int:
@@ -79,38 +72,24 @@ class ScanGraph:
             self._scans.append(key.scan)
             self._is_key = True
 
-    def work(self, optimize: bool = True) -> bool:
-        """Look for loops of a new key scan, and optimise where it is time; returns whether it did.
+    @property
+    def _has_new_node(self) -> bool:
+        return self._is_key
 
-        A fault costs what failed alone: loops, or an optimisation. Every node is then where it was.
-        """
-        self.fault = ""
-        if not self._is_key:
-            return False
+    def _take_in(self) -> bool:
         self._is_key = False
-        try:
-            due = self._look_for_loops()
-        except Exception as error:  # numerics of a library, or a fault of ours
-            self.fault, self._waiting = fault_of(error, "the search for loops"), 0
-            return False
-        return due and optimize and self._optimised(self.config.iterations)
+        if not self._guarded("the search for loops", self._look_for_loops):
+            self._waiting = 0
+        return self._waiting > self._wait
 
-    def _optimised(self, iterations: int) -> bool:
-        """Optimise all nodes; returns whether it did not fail."""
-        self._waiting = 0
-        began = time.perf_counter()
-        try:
-            self._optimise(iterations)
-        except Exception as error:  # see ``work``
-            self.fault = fault_of(error, "an optimisation")
-            return False
-        self.took_s = time.perf_counter() - began
-        return True
-
-    def _look_for_loops(self) -> bool:
-        """Ask for loops of the newest key; returns whether an optimisation is due."""
+    @property
+    def _wait(self) -> int:
+        """Key scans for which a loop waits."""
         # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
-        wait = max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
+        return max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
+
+    def _look_for_loops(self) -> None:
+        """Ask for loops of the newest key."""
         if (self.keys - 1) % self.config.loops.every == 0:
             poses, used = self._chain.nodes, self.used_loops.pairs
             windows = distance_windows(self.config.windows, graph_distances(poses, used, self.keys - 1))
@@ -120,9 +99,8 @@ class ScanGraph:
             believed = self._selection.believed(fresh, found, chain)
             if len(believed):
                 surprises = self._selection.use(believed, found, chain)
-                self._waiting = max(self._waiting, wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
+                self._waiting = max(self._waiting, self._wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
         self._waiting += self._waiting > 0
-        return self._waiting > wait
 
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
@@ -149,11 +127,11 @@ class ScanGraph:
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._chain.steps, measured
 
-    def _optimise(self, iterations: int) -> None:
-        rows = self._selection.rows.copy()
-        steps, measured = self.measurements()
-        graph = ScanPoseGraph(steps, measured, np.ones(len(rows)), self._chain.nodes, self.config.kernel)
-        for _ in range(iterations):
+    def _optimise(self, iterations: int = 0) -> None:
+        self._waiting = 0
+        loops, (steps, measured) = self.used_loops, self.measurements()
+        graph = ScanPoseGraph(steps, measured, np.ones(len(loops)), self._chain.nodes, self.config.kernel)
+        for _ in range(iterations or self.config.iterations):
             graph.iterate()
             if graph.converged:
                 break
@@ -163,7 +141,8 @@ class ScanGraph:
         if not (np.isfinite(graph.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
         self._chain.move(graph.poses, end)
-        self._loop_rows, self.loop_weights = rows, graph.weights
+        variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(graph.weights, 1e-12)[:, None]
+        self.closed = ClosedLoops(self._chain.frames[loops.pairs], loops.relative, np.sqrt(variance), graph.weights)
 
     @property
     def unfinished(self) -> bool:
@@ -178,7 +157,7 @@ class ScanGraph:
     def finish(self) -> bool:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
         self.fault = ""
-        return len(self._selection) > 0 and self._optimised(_MOST_ITERATIONS)
+        return len(self._selection) > 0 and self._guarded("an optimisation", lambda: self._optimise(_MOST_ITERATIONS))
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
@@ -199,30 +178,14 @@ class ScanGraph:
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
-    SAVED = ("_chain", "_scans", "_finder", "_selection", "_waiting", "_loop_rows", "loop_weights")
+    SAVED = ("_chain", "_scans", "_finder", "_selection", "_waiting", "closed")
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
         require(len(self._scans) == self.keys, f"there are not {self.keys} key scans")
         found = len(self._finder.loops)
-        for rows in (self._selection.rows, self._selection.doubted, self._loop_rows):
+        for rows in (self._selection.rows, self._selection.doubted):
             require(bool(((rows >= 0) & (rows < found)).all()), f"loops are named that are not among the {found}")
-        require(len(self._loop_rows) == len(self.loop_weights), "there are not as many weights as loops")
+        joined = self.closed.pairs
+        require(bool((joined >= 0).all()), "loops join frames that are not there")
         require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
-
-    @property
-    def loop_frames(self) -> np.ndarray:
-        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
-        frames: np.ndarray = self._chain.frames[self._finder.loops.pairs[self._loop_rows]]
-        return frames
-
-    @property
-    def loop_relative(self) -> np.ndarray:
-        """What these loops measured ``(loops, 3)``."""
-        return self._finder.loops.relative[self._loop_rows]
-
-    @property
-    def loop_std(self) -> np.ndarray:
-        """Deviations ``(loops, 3)`` of what they measured, in which their weights are accounted for."""
-        variance = np.diagonal(self._finder.loops.covariance, axis1=1, axis2=2)[self._loop_rows]
-        return np.sqrt(variance / np.maximum(self.loop_weights, 1e-12)[:, None])
