@@ -27,7 +27,7 @@ def logs_below(folder: Path) -> dict[str, Path]:
 
 def log_identity(path: Path) -> str:
     """What a drive by this log follows from, in words without its folder."""
-    digests = [hashlib.sha256(part.read_bytes()).hexdigest() for part in (path, _relations_of(path)) if part.is_file()]
+    digests = [hashlib.sha256(part.read_bytes()).hexdigest() for part in (path, relations_of(path)) if part.is_file()]
     return f"log {path.name} {' '.join(digests)}"
 
 
@@ -40,7 +40,7 @@ def log_drive(path: Path) -> LidarDrive:
     """
     drive = read_drive(path)
     if drive.reference is None:
-        raise ValueError(f"{path.name} has neither {_relations_of(path).name} beside it nor poses of a mapper")
+        raise ValueError(f"{path.name} has neither {relations_of(path).name} beside it nor poses of a mapper")
     return drive
 
 
@@ -73,12 +73,13 @@ def read_relations(path: Path) -> Relations:
     return Relations(table[:, :2], table[:, [2, 3, 7]])
 
 
-def _relations_of(path: Path) -> Path:
+def relations_of(path: Path) -> Path:
+    """Where the relations of a log are, if it has any."""
     return path.with_name(path.name.partition(".")[0] + ".relations")
 
 
 def _reference(path: Path, recording: Recording) -> Relations | ReferencePoses | None:
-    if (relations := _relations_of(path)).is_file():
+    if (relations := relations_of(path)).is_file():
         return read_relations(relations)
     if _CORRECTED_TOPIC not in recording.topics:
         return None

@@ -66,7 +66,7 @@ def score_drive(
             continue
         path = cache / f"{source.name}.{name}.npz"
         code = code_digest((*_ALWAYS, *source.code, *row.code))
-        identity = json.dumps([name, identity_of(row.settings), source.identity, code, _weights(row, weights)])
+        identity = json.dumps([name, identity_of(row.settings), source.identity, code, weights_digest(row, weights)])
         known = _read(path, identity)
         if known is None and known_only:
             continue
@@ -95,9 +95,10 @@ def _scored(runs: DriveRuns, row: Row) -> Scored:
 
 
 def _errors(drive: LidarDrive, estimate: Estimate) -> Errors:
-    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses)
+    known = drive.reference is not None
+    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses) if known else {}
     for name, poses in (("online", estimate.online), ("odometry", estimate.odometry)):
-        if poses is not None:
+        if poses is not None and known:
             found = lidar_errors(drive.reference, estimate.stamps_ns, poses)
             errors.update({f"{name}_{key}": values for key, values in found.items()})
     if isinstance(drive.reference, TruePoses) and estimate.online is not None and estimate.covariances is not None:
@@ -112,7 +113,7 @@ def _thinned(poses: np.ndarray) -> np.ndarray:
     return poses[:: max(1, -(-len(poses) // _MOST_DRAWN))]
 
 
-def _weights(row: Row, weights: Path) -> str:
+def weights_digest(row: Row, weights: Path) -> str:
     """A hash of the shipped settings, for a row of our own estimators."""
     if not any(module.__name__.startswith("ngo_estimator.") for module in row.code):
         return ""
