@@ -188,6 +188,14 @@ def test_what_goes_on_after_saving_leaves_the_saved_arrays_as_they_are(tmp_path:
     assert_same(core, loaded)
 
 
+def test_an_array_in_another_order_of_memory_is_read_as_it_was(tmp_path: Path) -> None:
+    array = np.asfortranarray(np.arange(6.0).reshape(3, 2))
+    write_state(tmp_path / "state", {}, {"rows": array, "count": np.array(3)})
+    found = read_state(tmp_path / "state", {})
+    np.testing.assert_array_equal(found["rows"], array)
+    assert found["count"].shape == ()
+
+
 def test_an_empty_trajectory_is_not_saved() -> None:
     with pytest.raises(StateError, match="the trajectory is empty"):
         networks().state()

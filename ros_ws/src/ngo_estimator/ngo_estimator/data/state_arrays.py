@@ -33,7 +33,7 @@ def attributes_of(owner: Any) -> Arrays:
     for name in _saved(owner):
         value = getattr(owner, name)
         if isinstance(value, np.ndarray | int):
-            arrays[name] = np.array(value)
+            arrays[name] = np.array(value, order="C")  # as files hold them
         elif value is not None:
             arrays |= under(name, state_of(value))
     return arrays
