@@ -26,6 +26,7 @@ from training.report import stress_page
 from training.scoring import stress_tables
 from training.scoring.lidar_rows import ROWS
 from training.scoring.lidar_scores import Scored, score_drive
+from training.scoring.stress_bars import stress_bars
 from training.scoring.stress_cells import CLEAN, StressCell, StressLog, cell_numbers
 from training.scoring.stress_tables import StressTable
 
@@ -86,12 +87,14 @@ def main(arguments: Arguments) -> dict[str, Any]:
     record = records.record("results", arguments)
     rows = [name for name in STRESS_ROWS if not ROWS[name].missing()]
     asked = [name for name in rows if name in (arguments.rows or rows)]
+    logs = {} if arguments.logs is None else _logs(arguments, rows, asked)
     result = {
         "command": 'make results WORLD=stress ARGS="--logs FOLDER"',
         "revision": record["revision"],
         "settings": {name: getattr(arguments, name) for name in ("drives", "length", "split")},
-        "logs": {} if arguments.logs is None else _logs(arguments, rows, asked),
+        "logs": logs,
         "tables": {name: _simulated(arguments, name, table, asked) for name, table in _tables(arguments).items()},
+        "bars": [bar.as_json() for bar in stress_bars(logs)],
         "skipped": [f"{name}: {ROWS[name].missing()}" for name in STRESS_ROWS if name not in rows],
     }
     write_at_once(arguments.out / "stress.json", json.dumps(result, indent=2) + "\n")
