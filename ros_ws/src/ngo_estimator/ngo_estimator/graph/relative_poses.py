@@ -64,11 +64,8 @@ class RelativePoses:
         whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
         return whitened
 
-    def equations(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Their part in the normal equations at these poses, as ``NormalEquations`` takes it.
-
-        ``weights`` ``(n,)`` multiply the information.
-        """
+    def whitened_jacobian(self, poses: np.ndarray) -> np.ndarray:
+        """Derivative ``(n, 3, 6)`` of the whitened prediction by the poses of both nodes."""
         start, end = (poses[self.nodes[:, k]] for k in (0, 1))
         cos, sin = np.cos(start[:, 2]), np.sin(start[:, 2])
         x, y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
@@ -77,6 +74,14 @@ class RelativePoses:
         jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, -cos, -cos * x - sin * y
         jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
         jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = cos, sin, -sin, cos
-        whitened = self.root @ jacobian
+        whitened: np.ndarray = self.root @ jacobian
+        return whitened
+
+    def equations(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Their part in the normal equations at these poses, as ``NormalEquations`` takes it.
+
+        ``weights`` ``(n,)`` multiply the information.
+        """
+        whitened = self.whitened_jacobian(poses)
         weighted = (weights[:, None, None] * whitened).mT
         return weighted @ whitened, (weighted @ self.residuals(poses)[..., None])[..., 0]
