@@ -27,7 +27,10 @@ _GROWN = 1.25
 """A solution from nothing is worth its time once there are so many times as many loops as at the last one."""
 
 _MOST_FILLED = 2_000_000
-"""Work of one factorisation above which graduated non-convexity, which needs some fifty of all loops, is left out."""
+"""Blocks that one factorisation may multiply: where loops would fill it, the likeliest of them come first."""
+
+_FEWER = 0.7
+"""How many loops are tried where those before are too many."""
 
 _LEAST_REDUNDANCY = 30.0
 """Degrees of freedom from which on residuals tell a scale."""
@@ -57,21 +60,25 @@ class Robust:
 
 def _from_nothing(problem: GraphProblem) -> CorrectedGraph:
     """The better of two solutions that begin at the chain."""
-    area, rows = map_area(problem.poses), np.arange(len(problem.loops))
-    scale, share, chain = 1.0, 0.5, chain_poses(problem.steps.relative, problem.poses[0])
-    scaled = problem
+    area, scale, share = map_area(problem.poses), 1.0, 0.5
+    chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
     whole = bool((problem.loops.degrees == 3).all())
     if whole:
         scale, share = scale_and_share(ChainUncertainty(problem.steps), problem.loops, area)
         scale = _noticed(scale)
         scaled = _scaled(problem, scale, scale)
-        rows = np.flatnonzero(cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, share) > 0.0)
-    likely = GraphProblem(chain, scaled.steps, scaled.loops[rows], problem.trust[rows])
-    ways = [believe(likely, chain, np.zeros(len(rows), bool), area, share)[0]]
-    if _filled(likely) < _MOST_FILLED:
-        ways.append(graduate(likely, chain)[0])
+    odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, share)
+    rows = np.argsort(-odds, kind="stable")
+    if whole:  # places say too little of each other to rule one out
+        rows = rows[: np.count_nonzero(odds > 0.0)]
+    likely = _affordable(replace(scaled, poses=chain), rows)
+    ways = [graduate(likely, chain)[0], believe(likely, chain, np.zeros(len(likely.loops), bool), area, share)[0]]
     best = min(ways, key=lambda poses: truncated_cost(scaled, poses))
-    return _polished(problem, best, scale, len(problem.loops))
+    solution = _polished(problem, best, scale, len(problem.loops))
+    # Cycles with the chain share its errors, so that they tell a scale roughly; what is left over tells it well.
+    if whole and scale not in (1.0, solution.loop_scale):
+        solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops))
+    return solution
 
 
 def _warm(problem: GraphProblem, start: CorrectedGraph) -> CorrectedGraph:
@@ -85,10 +92,14 @@ def _warm(problem: GraphProblem, start: CorrectedGraph) -> CorrectedGraph:
     return _polished(problem, poses, start.scale, start.loops_from_nothing)
 
 
-def _filled(problem: GraphProblem) -> int:
-    """Work of one factorisation of a graph with all its loops, in blocks."""
-    structure = GraphStructure(np.concatenate((problem.steps.nodes, problem.loops.nodes)), len(problem.poses))
-    return int(np.square(np.diff(structure.blocks.starts)).sum())
+def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
+    """The problem with the first of these loops alone, as many as do not fill its factor."""
+    while True:
+        part = replace(problem, loops=problem.loops[rows], trust=problem.trust[rows], similarity=None)
+        structure = GraphStructure(np.concatenate((part.steps.nodes, part.loops.nodes)), len(part.poses))
+        if np.square(np.diff(structure.blocks.starts)).sum() <= _MOST_FILLED:
+            return part
+        rows = rows[: int(_FEWER * len(rows))]
 
 
 def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int) -> CorrectedGraph:
