@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_place
@@ -28,9 +27,9 @@ from training.data.drive_plan import Drives, drives_of_table
 from training.data.episodes import mirrored_episode
 from training.data.feature_store import NETWORKS_FILE, check_count, check_networks, fill, groups_of, write_row
 from training.data.features import Networks, features_of
-from training.data.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, WorldName, world_named
+from training.data.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, world_named
 from training.recordings.recording_features import features_of_track
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
+from training.recordings.recording_source import DataArguments, open_recorded
 from training.recordings.recording_streams import windows
 from training.recordings.recording_tracks import Part
 
@@ -43,33 +42,21 @@ _BLOCK = PoseAggregationConfig(1).block
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(DataArguments):
     """Settings of the feature store."""
 
-    world: WorldName | None = None
-    """World to train for."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
     trajectories: int = 960
     """Training trajectories, each in a maze that the local network has not seen. Some worlds add a fifth of this
     number, driven by another driver, for the optimizer alone."""
     mirror_drives: bool = False
     """Worlds: whether they are kept a second time, as a mirror shows them, for the memory of the local network."""
-    validation_trajectories: int = 24
-    """Trajectories of the validation split for each table of results."""
-    test_trajectories: int = 0
-    """Trajectories of the test split for each table of results."""
+    validation_trajectories: int = 24  # Trajectories of the validation split for each table of results.
+    test_trajectories: int = 0  # Trajectories of the test split for each table of results.
     weights: Path = records.WEIGHTS
     """Folder with NAME/local_pose_network.safetensors and NAME/place_encoder.safetensors."""
-    out: Path = records.ROOT / "runs"
-    """Folder that gets NAME/features/."""
-    part: int = 0
-    """Number of this process, from 0, where several share the work."""
-    parts: int = 1
-    """Number of processes that share the work."""
-
-    def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
+    out: Path = records.ROOT / "runs"  # Folder that gets NAME/features/.
+    part: int = 0  # Number of this process, from 0, where several share the work.
+    parts: int = 1  # Number of processes that share the work.
 
 
 def planned_drives(arguments: Arguments, world: World) -> dict[str, Drives]:

@@ -95,9 +95,10 @@ def _scored(runs: DriveRuns, row: Row) -> Scored:
 
 
 def _errors(drive: LidarDrive, estimate: Estimate) -> Errors:
-    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses)
+    known = drive.reference is not None
+    errors = lidar_errors(drive.reference, estimate.stamps_ns, estimate.poses) if known else {}
     for name, poses in (("online", estimate.online), ("odometry", estimate.odometry)):
-        if poses is not None:
+        if poses is not None and known:
             found = lidar_errors(drive.reference, estimate.stamps_ns, poses)
             errors.update({f"{name}_{key}": values for key, values in found.items()})
     if isinstance(drive.reference, TruePoses) and estimate.online is not None and estimate.covariances is not None:

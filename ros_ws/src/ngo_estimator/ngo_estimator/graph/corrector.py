@@ -123,5 +123,6 @@ def normal_equations(
     """
     if structure is None:
         structure = GraphStructure(np.concatenate([edges.nodes for edges, _ in parts]), len(poses))
-    hessian, gradient = zip(*(edges.equations(poses, weights) for edges, weights in parts), strict=True)
-    return NormalEquations(np.concatenate(hessian), np.concatenate(gradient), structure)
+    relative = np.concatenate([edges.relative for edges, _ in parts])
+    information = np.concatenate([weights[:, None, None] * edges.information for edges, weights in parts])
+    return NormalEquations(structure, poses, relative, information)

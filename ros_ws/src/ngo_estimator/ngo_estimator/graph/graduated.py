@@ -40,15 +40,14 @@ def graduate(
     if control is None:
         control = 1.0 / max(2.0 * float(squared.max(initial=0.0)) - 1.0, 1e-3)
     step_weights = np.ones(len(problem.steps))
-    rows, structure = np.zeros(0, np.int64), None
+    rows, loops, structure = np.zeros(0, np.int64), problem.loops[:0], None
     for _ in range(_MOST_STAGES):
         weights = problem.trust * _weights(squared, control)
         believed = np.flatnonzero(weights > 0.0)
         if structure is None or len(believed) < _SPARSER * len(rows) or not np.isin(believed, rows).all():
-            rows = believed
-            nodes = np.concatenate((problem.steps.nodes, problem.loops.nodes[rows]))
-            structure = GraphStructure(nodes, len(poses))
-        parts = (problem.steps, step_weights), (problem.loops[rows], weights[rows])
+            rows, loops = believed, problem.loops[believed]
+            structure = GraphStructure(np.concatenate((problem.steps.nodes, loops.nodes)), len(poses))
+        parts = (problem.steps, step_weights), (loops, weights[rows])
         step = normal_equations(poses, *parts, structure=structure).solution()
         poses = poses + step
         squared = (problem.loops.residuals(poses) ** 2).sum(1) / limits

@@ -1,6 +1,7 @@
 """Measured poses of nodes seen from others: the edges of a pose graph, each with a whole information matrix."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -51,6 +52,12 @@ class RelativePoses:
         """The same with covariances so many times as large."""
         return RelativePoses(self.nodes, self.relative, self.root / np.sqrt(variance))
 
+    @cached_property
+    def information(self) -> np.ndarray:
+        """Information matrices ``(n, 3, 3)``, along the axes of the first node."""
+        information: np.ndarray = self.root.mT @ self.root
+        return information
+
     @property
     def degrees(self) -> np.ndarray:
         """How many directions each measurement knows ``(n,)``, 0 to 3."""
@@ -76,12 +83,3 @@ class RelativePoses:
         jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = cos, sin, -sin, cos
         whitened: np.ndarray = self.root @ jacobian
         return whitened
-
-    def equations(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Their part in the normal equations at these poses, as ``NormalEquations`` takes it.
-
-        ``weights`` ``(n,)`` multiply the information.
-        """
-        whitened = self.whitened_jacobian(poses)
-        weighted = (weights[:, None, None] * whitened).mT
-        return weighted @ whitened, (weighted @ self.residuals(poses)[..., None])[..., 0]

@@ -124,12 +124,6 @@ class Loops:
         return dataclasses.replace(self, **per_loop)  # type: ignore[arg-type]
 
     @cached_property
-    def description(self) -> Tensor:
-        """What gates see of each loop beside its residual ``(batch, loops, 6)``: the same under all poses."""
-        beliefs = torch.stack((self.similarity, self.logit / 5.0), dim=-1)
-        return torch.cat((beliefs, self.log_scale, self.spread - self.log_scale), dim=-1)
-
-    @cached_property
     def log_length(self) -> Tensor:
         """Logarithm of how many meta-poses lie on each loop ``(batch, loops)``."""
         length = self.end - self.start + 1 if self.length is None else self.length

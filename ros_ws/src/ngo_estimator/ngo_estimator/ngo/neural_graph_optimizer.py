@@ -17,7 +17,7 @@ from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, Smoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
 from ngo_estimator.ngo.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
-from ngo_estimator.ngo.loop_gates import RobustLoopGate
+from ngo_estimator.ngo.loop_gates import RobustLoopGate, without_contradictions
 from ngo_estimator.ngo.loop_judge import LoopJudge
 from ngo_estimator.ngo.meta_poses import (
     Correction,
@@ -27,7 +27,6 @@ from ngo_estimator.ngo.meta_poses import (
     OptimizedTrajectory,
     Solution,
 )
-from ngo_estimator.ngo.odometry_consistency import without_contradictions
 from ngo_estimator.ngo.pose_aggregation import (
     PoseAggregationConfig,
     block_variances,
@@ -265,19 +264,19 @@ class NeuralGraphOptimizer(AttentionNetwork):
     def _resumed(
         self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
     ) -> Iterator[OptimizedMetaPoses]:
-        from ngo_estimator.ngo import compiled_closing  # see _loop_closing
+        """The result that begins at an earlier solution (the warm start of ``iterate``).
 
+        New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last
+        one. Others keep what an annealing of all loops gave them.
+        """
         adjusted, stiffness = steps.relative.clone(), corrections[-1].stiffness
         adjusted[:, steps.key_frames :] += sum(adjustment for adjustment, _ in corrections)
         if steps.fixed is not None:
             adjusted, stiffness = _without_fixed(steps.relative, adjusted, stiffness, steps.fixed)
-        # Where others must agree with a new loop, all of them are looked at.
-        which = None if self.config.search.least_belief else np.flatnonzero(~solution.known)
-        believed = self._judged(compiled_closing.without_contradictions(loops, steps, which), steps)
-        last = self.config.iterations - 1
-        return compiled_closing.resumed(
-            self.loop_gate, steps, believed, adjusted, stiffness, self.odometry_noise, solution, last
-        )
+        closing = self._loop_closing(steps, loops, solution)
+        iterations = (0, self.config.iterations - 1)
+        relative, step_std = closing.resume(adjusted, stiffness, solution.relative, iterations)
+        yield OptimizedMetaPoses([relative.to(steps.relative.dtype)], step_std, closing.closed)
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
@@ -297,20 +296,25 @@ class NeuralGraphOptimizer(AttentionNetwork):
         found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
         return without_contradictions(found, steps)
 
-    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
-        find_overlaps = partial(self.overlaps, steps, loops)
-        closing, test = LoopClosing, without_contradictions
-        if not torch.is_grad_enabled() and steps.relative.shape[0] == 1 and steps.relative.device.type == "cpu":
-            # The compiler's library takes 100 MB: only those pay for it that optimise.
-            from ngo_estimator.ngo import compiled_closing
-
-            closing, test = compiled_closing.CompiledClosing, compiled_closing.without_contradictions
-        believed = self._judged(test(loops, steps), steps)
-        return closing(self.loop_gate, steps, believed, find_overlaps, self.odometry_noise, self.correction_std)
+    def _loop_closing(self, steps: MetaSteps, loops: Loops, solution: Solution | None = None) -> LoopClosing:
+        # Known loops were tested before; where others must agree with a new one, all are looked at.
+        which = None
+        if solution is not None and not self.config.search.least_belief:
+            which = np.flatnonzero(~solution.known)
+        loops = self._judged(without_contradictions(loops, steps, which), steps)
+        # Where one goes on from a solution, overlaps were found on the way to it.
+        find_overlaps = partial(self.overlaps, steps, loops) if solution is None else _no_overlaps
+        return LoopClosing(
+            self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std, solution
+        )
 
     def _judged(self, loops: Loops, steps: MetaSteps) -> Loops:
         least = self.config.search.least_belief
         return self.loop_judge.judged(loops, steps, least) if least else loops
+
+
+def _no_overlaps(poses: Tensor) -> None:
+    return None
 
 
 def _without_fixed(before: Tensor, after: Tensor, stiffness: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.ngo.loop_residuals import odometry_variances
+from ngo_estimator.ngo.loop_gates import odometry_variances
 
 _BELIEVED = 0.5
 """Weight from which on a loop ties the poses that it joins."""
@@ -39,12 +39,8 @@ def shrunk_corrections(
     poses = nodes.copy()
     first = int(cut.argmax())
     ends = np.arange(first + 1, len(nodes))
-    unknown = odometry_variances(
-        torch.full((1, len(ends)), first),
-        torch.from_numpy(ends)[None],
-        torch.from_numpy(odometry)[None],
-        torch.from_numpy(np.where(cut[:, None], variance, 0.0))[None],
-    )[0].numpy()
+    nodes_after = np.stack((np.full_like(ends, first), ends), axis=-1)
+    unknown = odometry_variances(nodes_after, odometry, np.where(cut[:, None], variance, 0.0))
     changes = np.flatnonzero(np.diff(cut[first:].astype(np.int64))) + first + 1
     bounds = [first, *changes.tolist(), len(nodes) - 1]
     for start, end in zip(bounds[:-1], bounds[1:], strict=True):
