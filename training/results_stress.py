@@ -189,9 +189,9 @@ def _numbers(log: StressLog, cells: Mapping[int, StressCell], clean: StressCell 
     if failed := {str(seed): cell.failed for seed, cell in cells.items() if cell.failed}:
         return {"failed": failed}
     each = {str(seed): cell_numbers(log.relations, cell, clean) for seed, cell in cells.items()}
-    keys = next(iter(each.values()))
-    means = {key: float(np.mean([numbers[key] for numbers in each.values()])) for key in keys}
-    return {**means, "seeds": each}
+    found = list(each.values())
+    keys = [key for key in found[0] if all(key in numbers for numbers in found)]
+    return {**{key: float(np.mean([numbers[key] for numbers in found])) for key in keys}, "seeds": each}
 
 
 if __name__ == "__main__":

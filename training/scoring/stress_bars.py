@@ -38,8 +38,8 @@ def stress_bars(logs: Logs) -> Iterator[Bar]:
                 if key in numbers:
                     most *= 1.0 if row == "ours" else _WITHOUT_WHEELS
                     yield Bar(f"{log}, {change}, {row}, {key}", numbers[key], most=most)
-            both = [rows.get(row, {}).get("translation_m") for row in ("ours", "wheels")]
-            if None not in both:
+            both = [rows[row]["translation_m"] for row in ("ours", "wheels") if "translation_m" in rows.get(row, {})]
+            if len(both) == 2:
                 yield Bar(f"{log}, {change}, ours beside wheels", both[0], most=_HARM * both[1])
 
 
