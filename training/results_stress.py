@@ -128,11 +128,16 @@ def _simulated(arguments: Arguments, name: str, table: StressTable, asked: Seque
         for source in sources:
             rows = {row: kind for row, kind in table.rows.items() if row in asked or not measures}
             folder = arguments.runs / "stress" / name
-            for row, one in score_drive(source, rows, arguments.weights, folder, known_only=not measures):
-                scored.setdefault(row, []).append(one)
-                if measures:
-                    words = one.failed or "  ".join(f"{k} {v:.3f}" for k, v in _scores(one, table.keys).items())
-                    print(f"{name:9s} {source.name:30s} {row:20s} {words}", flush=True)
+            try:
+                for row, one in score_drive(source, rows, arguments.weights, folder, known_only=not measures):
+                    scored.setdefault(row, []).append(one)
+                    if measures:
+                        words = one.failed or "  ".join(f"{k} {v:.3f}" for k, v in _scores(one, table.keys).items())
+                        print(f"{name:9s} {source.name:30s} {row:20s} {words}", flush=True)
+            except (
+                ValueError
+            ) as error:  # a robot that stands for long cannot be carried, or lose its wheels, on its way
+                print(f"{name:9s} {source.name:30s} is left out: {error}", flush=True)
         if scored:
             result[group] = {row: _means(found, table.keys) for row, found in scored.items()}
     return result
