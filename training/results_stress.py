@@ -25,10 +25,11 @@ from training.recordings.lidar_logs import logs_below, relations_of
 from training.report import stress_page
 from training.scoring import stress_tables
 from training.scoring.lidar_rows import ROWS
-from training.scoring.lidar_scores import Scored, score_drive
+from training.scoring.lidar_scores import scored_rows, with_runs
 from training.scoring.stress_bars import stress_bars
 from training.scoring.stress_cells import CLEAN, StressCell, StressLog, cell_numbers
 from training.scoring.stress_tables import StressTable
+from training.scoring.table import Measured, measure
 
 _FIRST_BUILDINGS = {"validation": 12_000, "test": 22_000}
 STRESS_ROWS = ("wheels", "ours", "ours_without_wheels", "kiss_icp")
@@ -124,32 +125,32 @@ def _simulated(arguments: Arguments, name: str, table: StressTable, asked: Seque
     result: dict[str, Any] = {}
     for group, sources in table.groups.items():
         measures = name in arguments.tables and (name != "buildings" or group in (arguments.changes or CHANGES))
-        scored: dict[str, list[Scored]] = {}
+        scored: dict[str, list[Measured]] = {}
         for source in sources:
             rows = {row: kind for row, kind in table.rows.items() if row in asked or not measures}
-            folder = arguments.runs / "stress" / name
+            plan = [(with_runs(source, arguments.weights), scored_rows(rows, arguments.weights))]
             try:
-                for row, one in score_drive(source, rows, arguments.weights, folder, known_only=not measures):
-                    scored.setdefault(row, []).append(one)
-                    if measures:
-                        words = one.failed or "  ".join(f"{k} {v:.3f}" for k, v in _scores(one, table.keys).items())
-                        print(f"{name:9s} {source.name:30s} {row:20s} {words}", flush=True)
-            except (
-                ValueError
-            ) as error:  # a robot that stands for long cannot be carried, or lose its wheels, on its way
+                found = measure(plan, arguments.runs / "stress" / name, known_only=not measures)[source.name]
+            except ValueError as error:  # a robot that stands for long has no moment at which it could be carried
                 print(f"{name:9s} {source.name:30s} is left out: {error}", flush=True)
+                continue
+            for row, one in found.items():
+                scored.setdefault(row, []).append(one)
+                if measures:
+                    words = one.failed or "  ".join(f"{k} {v:.3f}" for k, v in _scores(one, table.keys).items())
+                    print(f"{name:9s} {source.name:30s} {row:20s} {words}", flush=True)
         if scored:
             result[group] = {row: _means(found, table.keys) for row, found in scored.items()}
     return result
 
 
-def _scores(scored: Scored, keys: Sequence[str]) -> dict[str, float]:
+def _scores(scored: Measured, keys: Sequence[str]) -> dict[str, float]:
     """The numbers of one drive that are known."""
     means = {key: float(scored.errors[key].mean()) for key in keys if key in scored.errors}
     return {key: value for key, value in means.items() if np.isfinite(value)}
 
 
-def _means(scored: Sequence[Scored], keys: Sequence[str]) -> dict[str, Any]:
+def _means(scored: Sequence[Measured], keys: Sequence[str]) -> dict[str, Any]:
     each = [_scores(one, keys) for one in scored]
     there = {key: [one[key] for one in each if key in one] for key in keys}
     means = {key: float(np.mean(values)) for key, values in there.items() if values}

@@ -38,9 +38,9 @@ def stress_bars(logs: Logs) -> Iterator[Bar]:
                 if key in numbers:
                     most *= 1.0 if row == "ours" else _WITHOUT_WHEELS
                     yield Bar(f"{log}, {change}, {row}, {key}", numbers[key], most=most)
-            both = [rows[row]["translation_m"] for row in ("ours", "wheels") if "translation_m" in rows.get(row, {})]
-            if len(both) == 2:
-                yield Bar(f"{log}, {change}, ours beside wheels", both[0], most=_HARM * both[1])
+            ours_m, wheels_m = (rows.get(row, {}).get("translation_m") for row in ("ours", "wheels"))
+            if ours_m is not None and wheels_m is not None:
+                yield Bar(f"{log}, {change}, ours beside wheels", ours_m, most=_HARM * wheels_m)
 
 
 def _limit(change: str, numbers: Mapping[str, float], clean: Mapping[str, float]) -> tuple[str, float]:
