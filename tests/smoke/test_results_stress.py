@@ -65,7 +65,7 @@ def test_results_of_a_toy_log(
     assert "people" not in table
     ours = table["scans_bunched"]["ours"]
     numbers = {"translation_m", "rotation_deg", "over_30_s_m", "at_scans_m", "at_scans_deg"}
-    assert numbers | {"best_possible_m", "best_possible_deg", "scans_per_s", "seeds"} == set(ours)
+    assert numbers | {"best_possible_m", "best_possible_deg", "relations", "scans_per_s", "seeds"} == set(ours)
     assert set(ours["seeds"]) == {"0", "1"} and set(table["half_covered"]["ours"]["seeds"]) == {"0"}
     assert ours["translation_m"] == pytest.approx(np.mean([one["translation_m"] for one in ours["seeds"].values()]))
     assert 0.0 < table["clean"]["ours"]["translation_m"] < 0.1 < table["scans_bunched"]["wheels"]["translation_m"]

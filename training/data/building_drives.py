@@ -49,11 +49,11 @@ def poor_wheels_drive(seed: int, length_m: float, most_scans: int = 100_000) -> 
     Scanners that are faster take 10 scans a second.
     """
     rng = np.random.default_rng((seed, 3))
-    common, apart = rng.normal(0.0, 0.03), rng.choice((-1.0, 1.0)) * rng.uniform(0.002, 0.01)
+    common, apart = rng.normal(0.0, 0.03), rng.choice((-1.0, 1.0)) * rng.uniform(0.0002, 0.001)
     wheels = WheelsConfig(
         left_bias=float(np.clip(common + apart, -0.2, 0.2)),
         right_bias=float(np.clip(common - apart, -0.2, 0.2)),
-        wheel_noise=0.02,
+        wheel_noise=0.01,
         slips_per_km=60.0,
         freezes_per_hour=40.0,
         jumps_per_hour=10.0,
