@@ -15,8 +15,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
-from ngo_estimator.frontend.lidar import lidar_odometry
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
+from ngo_estimator.frontend.lidar import front_ends
+from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd, lidar_front_end
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig, LidarStep
 from ngo_estimator.geometry.planar_motion import chained
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.networks.step_scaling import StepScaling
@@ -32,7 +33,7 @@ from training.scoring.wrong_loops import Solver, WrongLoopsConfig, solve_ours, w
 
 _MOST_WALL_POINTS = 60_000  # of a picture
 _NO_KERNEL = 1e6  # deviations: so wide that every residual counts in full
-_PIPELINE = (lidar_odometry, scan_trajectory)
+_PIPELINE = (front_ends, scan_trajectory)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ class DriveRuns:
         if key not in self._fronts:
             settings = changed(read_lidar_file(self._weights, "odometry", LidarOdometryConfig), pipeline.odometry)
             scaling = StepScaling.load(self._weights) if settings.learned_deviation else None
-            odometry = LidarOdometry(settings, self.drive.mounting, scaling)
+            odometry = lidar_front_end(settings, self.drive.mounting, scaling)
             steps: list[LidarStep] = []
             began = time.process_time()
             for record in self.drive.records(pipeline.wheels):
@@ -159,7 +160,7 @@ def _unscaled(step: LidarStep) -> LidarStep:
     )
 
 
-def _take(odometry: LidarOdometry, steps: list[LidarStep], at_end: bool) -> None:
+def _take(odometry: LidarFrontEnd, steps: list[LidarStep], at_end: bool) -> None:
     while True:
         try:
             steps.extend(odometry.ready(at_end))
@@ -182,7 +183,7 @@ def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
         run.online.walls(_MOST_WALL_POINTS),
         {
             "keys": run.online.graph.keys,
-            "loops": len(run.online.graph.loop_weights),
+            "loops": len(run.online.graph.closed),
             "lag_s": run.front.lag_s,
             "unsure": run.front.unsure,
         },

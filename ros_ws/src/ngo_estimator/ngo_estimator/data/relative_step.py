@@ -61,6 +61,8 @@ class RelativeStep:
     at a key scan of a lidar. ``origin_scan``, the lidar's first scan, is in the first step after a start.
     ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one.
     ``unlikeness`` of the newer frame: over 1 it is unlike what the networks learned from, 0 where nobody knows.
+    With ``segment`` no scan measured the motion: the covariance says how little is known, and only loops tie the frames
+    behind it to those before.
     """
 
     stamp_ns: int
@@ -76,6 +78,7 @@ class RelativeStep:
     origin_scan: KeyScan | None = field(default=None, kw_only=True)
     robot_odom_xyyaw: np.ndarray | None = field(default=None, kw_only=True)
     unlikeness: float = field(default=0.0, kw_only=True)
+    segment: bool = field(default=False, kw_only=True)
 
     @property
     def tf_odom_xyyaw(self) -> np.ndarray:

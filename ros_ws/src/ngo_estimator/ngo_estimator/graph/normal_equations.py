@@ -74,6 +74,25 @@ class FactorisedInformation:
         covariance: Array = self._factor.solve(right)[rows].reshape(size, size)
         return 0.5 * (covariance + covariance.T)
 
+    def pair_covariances(self, pairs: Array) -> Array:
+        """Joint covariances ``(n, 6, 6)`` of the poses of pairs ``(n, 2)`` of nodes, zero for node 0.
+
+        Raises:
+            ValueError: no factor joins a pair.
+        """
+        diagonal, lower = self._factor.selected_inverse()
+        rows = np.asarray(pairs) - 1
+        joint = np.zeros((len(rows), 2, 3, 2, 3))
+        for side in (0, 1):
+            known = rows[:, side] >= 0
+            joint[known, side, :, side] = diagonal[self._structure.rank[rows[known, side]]]
+        both = (rows >= 0).all(1)
+        place, first_below = self._structure.places(rows[both])
+        block = lower[place]
+        block[~first_below] = block[~first_below].mT
+        joint[both, 0, :, 1], joint[both, 1, :, 0] = block, block.mT
+        return joint.reshape(-1, 6, 6)
+
     def state(self) -> Arrays:
         """The matrix, for ``from_state``."""
         pairs = np.unique(np.sort(self._structure.pairs, axis=1), axis=0)

@@ -70,3 +70,16 @@ class RelativePoses:
         off[:, 2] = wrap(off[:, 2])
         whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
         return whitened
+
+    def whitened_jacobian(self, poses: np.ndarray) -> np.ndarray:
+        """Derivative ``(n, 3, 6)`` of the whitened prediction by the poses of both nodes."""
+        start, end = (poses[self.nodes[:, k]] for k in (0, 1))
+        cos, sin = np.cos(start[:, 2]), np.sin(start[:, 2])
+        x, y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
+        jacobian = np.zeros((len(self.nodes), 3, 6))
+        jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = -cos, -sin, cos * y - sin * x
+        jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, -cos, -cos * x - sin * y
+        jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
+        jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = cos, sin, -sin, cos
+        whitened: np.ndarray = self.root @ jacobian
+        return whitened

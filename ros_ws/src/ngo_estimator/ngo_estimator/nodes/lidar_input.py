@@ -13,7 +13,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.front_ends import load_front_end
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
@@ -43,7 +43,7 @@ class LidarInput:
 
     def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
         self._node, self._settings, self._publish = node, settings, publish
-        self._core = load_core(LidarOdometry.load, settings)
+        self._core = load_core(load_front_end, settings)
         with compiling(node.get_logger().info):
             warm_up_odometry()
         self._base_frame = settings.framed(settings.base_frame)

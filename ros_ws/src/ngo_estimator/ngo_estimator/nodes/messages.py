@@ -72,6 +72,7 @@ def relative_pose_message(estimate: "RelativeStep", base_frame: str) -> Relative
         key_scan=[] if estimate.key is None else [_key_scan_message(estimate.key.scan, estimate.key)],
         origin_scan=[] if estimate.origin_scan is None else [_key_scan_message(estimate.origin_scan, None)],
         robot_odom=[] if estimate.robot_odom_xyyaw is None else estimate.robot_odom_xyyaw.tolist(),
+        segment=estimate.segment,
     )
 
 
@@ -131,6 +132,7 @@ def relative_step(message: RelativePose) -> "RelativeStep":
         key=_key_scan_step(message.key_scan[0]) if message.key_scan else None,
         origin_scan=_key_scan(message.origin_scan[0]) if message.origin_scan else None,
         robot_odom_xyyaw=np.array(message.robot_odom) if len(message.robot_odom) else None,
+        segment=message.segment,
     )
 
 

@@ -258,7 +258,7 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
 
 def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":
     """Registration of a lidar's scans, with the robot's odometry."""
-    from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+    from ngo_estimator.frontend.lidar.front_ends import load_front_end
     from ngo_estimator.geometry.scan_points import Mounting
     from ngo_estimator.offline.lidar_run import LidarRun
     from ngo_estimator.offline.recorded import Truth
@@ -268,7 +268,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     from ngo_recordings.lidar_description import describe_lidar
     from ngo_recordings.scan_stream import scan_stream
 
-    odometry = LidarOdometry.load(folder, arguments.world)
+    odometry = load_front_end(folder, arguments.world)
     online = ScanTrajectory.load(folder, arguments.world, arguments.iterations_per_step)
     scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
     given = replace(arguments.topics, action="none", twist="none")

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
@@ -29,7 +29,7 @@ class LidarRun:
         mounting: where the scanner sits on the robot.
     """
 
-    def __init__(self, odometry: LidarOdometry, online: ScanTrajectory, mounting: Mounting) -> None:
+    def __init__(self, odometry: LidarFrontEnd, online: ScanTrajectory, mounting: Mounting) -> None:
         self._odometry, self._online, self._mounting = odometry, online, mounting
         self.frames = 0
         """Scans that came."""

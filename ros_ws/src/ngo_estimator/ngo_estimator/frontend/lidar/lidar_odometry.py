@@ -11,6 +11,7 @@ import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep, RelativeStep
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.scan_odometry import ScanEstimate, ScanOdometry, ScanOdometryConfig
 from ngo_estimator.frontend.lidar.standstill import StandstillDetector
 from ngo_estimator.frontend.lidar.swept_scan import SweptScan
@@ -21,6 +22,8 @@ from ngo_estimator.geometry.planar_motion import Array, between, compose, turned
 from ngo_estimator.geometry.scan_points import Mounting, ScanPointsConfig, Sweep, key_scan
 from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_recordings.scan_stream import LidarScan
+
+FRONT_ENDS = ("registration", "mixture")
 
 _FARTHEST_M = 1000.0
 """Stands for a ``range_max`` of zero or infinity, as some drivers publish it."""
@@ -45,7 +48,8 @@ class LidarOdometryConfig:
     A scan waits for wheels at most ``wheel_wait_s``. Wheels that were silent for ``wheel_silence_s`` are not waited
     for. A scan with more than ``most_rays`` rays is refused. ``least_variance_m2`` and ``least_variance_rad2`` are
     the smallest variances of a step. With ``learned_deviation`` a trained network scales the deviations that are
-    published; no pose changes.
+    published; no pose changes. ``front_end`` is ``registration``, which is this one, or ``mixture``, which has its own
+    settings.
     """
 
     points: ScanPointsConfig = field(default_factory=ScanPointsConfig)
@@ -57,8 +61,12 @@ class LidarOdometryConfig:
     least_variance_m2: float = 1e-8
     least_variance_rad2: float = 1e-9
     learned_deviation: bool = False
+    front_end: str = "registration"
+    mixture: MixtureConfig = field(default_factory=MixtureConfig)
 
     def __post_init__(self) -> None:
+        if self.front_end not in FRONT_ENDS:
+            raise ValueError(f"front_end is {self.front_end!r}; expected one of {FRONT_ENDS}")
         positive = (self.wheel_wait_s, self.wheel_silence_s, self.least_variance_m2, self.least_variance_rad2)
         if not all(0.0 < value < math.inf for value in positive) or self.most_rays < 2:
             raise ValueError(

@@ -1,0 +1,91 @@
+"""All numbers of the mixture front end, but those of registration and of making points, which loops share."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from ngo_estimator.geometry.scan_matching import IcpConfig
+from ngo_estimator.geometry.scan_points import ScanPointsConfig
+from ngo_estimator.geometry.score_field import ScoreFieldConfig
+
+
+@dataclass(frozen=True)
+class MixtureConfig:
+    """Settings of the front end; see the comment of each."""
+
+    # Hypotheses of a motion: wheels that are good, wheels that are poor, the last displacement, none, anything.
+    first_weights: tuple[float, ...] = (0.45, 0.2, 0.25, 0.07, 0.03)
+    first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 3.0, 1.0)  # on the deviations below
+    least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.5, 1.0)
+    most_factor: float = 6.0
+    least_weight: float = 0.01
+    still_m: float = 0.01  # deviation of a motion's position where there is none; it grows with way and turn
+    way_share: float = 0.08  # m for each m
+    turn_m: float = 0.05  # m for each rad
+    still_deg: float = 0.3  # the same of its heading
+    turn_share: float = 0.08  # rad for each rad
+    way_rad: float = 0.03  # rad for each m
+    anything: tuple[float, float] = (0.3, 0.3)  # deviation of anything, in usual periods of the scanner (m, rad)
+    most_gap: float = 10.0  # usual periods up to which deviations without wheels grow
+    repeated: float = 8.0  # steps that share an error of the motion
+
+    # Learning, by distance.
+    learn_rate: float = 0.05  # what one match counts at most
+    learn_m: float = 0.2  # way and turn that make it count so much
+    learn_rad: float = 0.2
+    certain_m: float = 4.0  # way and turn that the wheels' calibration counts as known at first
+    certain_rad: float = 3.0
+    remembered_m: float = 100.0  # way after which it is forgotten
+
+    # Search: windows cover all hypotheses, within limits.
+    least_m: float = 0.15  # no hypothesis is surer than this where the place is chosen
+    least_rad: float = 0.15
+    prior_weight: float = 0.04  # of the prior's logarithm against the mean score of search_points
+    search_points: int = 120
+    least_window_m: float = 0.4
+    least_window_deg: float = 10.0
+    most_window_m: float = 2.5
+    most_window_deg: float = 60.0
+    heading_step_deg: float = 1.25
+    apart_m: float = 0.3  # modes closer than this are one
+    apart_deg: float = 6.0
+    margin: float = 3.0  # of log likelihoods, up to which the second mode counts
+
+    # Lost, and segments.
+    lost_share: float = 0.6  # of the usual score, below which a scan fits nowhere
+    lost_m: float = 0.8  # dead reckoning after which a segment begins
+    lost_rad: float = 0.5
+    doubted: float = 3.0  # factor on the deviations of dead reckoning to a new segment
+    silent_s: float = 4.0  # of scans and wheels, after which a segment begins
+    open_m: float = 5.0  # deviations to a segment after silence
+    open_rad: float = 1.0
+
+    # Key scans.
+    key_m: float = 0.3
+    key_deg: float = 15.0
+    new_share: float = 0.8  # of the usual score, below which one comes earlier
+    submap_scans: int = 20
+
+    wheel_wait_s: float = 0.25  # a scan waits so long for wheels
+    most_rays: int = 20_000  # of a scan that is not refused
+
+    cells: ScoreFieldConfig = field(default_factory=ScoreFieldConfig)
+    icp: IcpConfig = field(default_factory=IcpConfig)
+    points: ScanPointsConfig = field(default_factory=ScanPointsConfig)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not _positive(value):
+                raise ValueError(f"{name} is {value}; expected positive numbers")
+        if not all(len(each) == 5 for each in (self.first_weights, self.first_factors, self.least_factors)):
+            raise ValueError(
+                "first_weights, first_factors, least_factors: expected one number for each of 5 hypotheses"
+            )
+        if len(self.anything) != 2:
+            raise ValueError(f"anything is {self.anything}; expected two deviations")
+
+
+def _positive(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(_positive(each) for each in value)
+    return not isinstance(value, int | float) or 0.0 < value < math.inf

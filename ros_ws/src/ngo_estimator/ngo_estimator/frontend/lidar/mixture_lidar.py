@@ -1,0 +1,255 @@
+"""The local estimator of a 2D lidar: scans and wheel odometry in, relative poses and key scans out (no ROS here)."""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep
+from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
+from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry, ScanEstimate
+from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
+from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.planar_motion import Array, compose
+from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan
+from ngo_estimator.networks.step_scaling import STEP_EVIDENCE
+from ngo_recordings.scan_stream import LidarScan
+
+_FARTHEST_M = 1000.0
+"""Stands for a ``range_max`` of zero or infinity, as some drivers publish it."""
+
+_LONGEST_SWEEP_S = 1.0
+"""A scan that claims to have taken longer is wrong about it."""
+
+_LEAST_POINTS = 3
+"""Points without which a scan says nothing."""
+
+_SILENT_S = 1.0
+"""Wheels that were silent for longer are not waited for."""
+
+_LEAST = np.diag((1e-8, 1e-8, 1e-9))
+"""The smallest covariance of a step."""
+
+
+class MixtureLidar:
+    """Turns scans into relative poses, with wheel odometry where the robot has it.
+
+    Scans and wheels are each in order of time, and may arrive in any order against each other.
+    """
+
+    def __init__(self, config: MixtureConfig | None = None, mounting: Mounting | None = None) -> None:
+        self.config = config or MixtureConfig()
+        self.mounting = mounting or Mounting(np.zeros(3))
+        """Where the sensor sits on the robot; may be set until the first scan comes."""
+        self.restarts = 0
+        """How often the stamps jumped back by ``RESTART_AFTER_NS`` or more."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next scan is the new origin of ``odom``."""
+        self._core = MixtureOdometry(self.config)
+        self._wheels: StampedWheels | None = None
+        self._period = UsualPeriod()
+        self._waiting: deque[tuple[LidarScan, float]] = deque()  # with the evened stamp (s)
+        self._held: list[LidarScan] = []  # that may be a bunch
+        self._newest_ns: int | None = None
+        self._last: KeyScan | None = None
+        self._last_s = 0.0
+        self._even_s = 0.0
+        self._twist = np.zeros(3)
+        self._origin: KeyScan | None = None
+        self._robot_odom: Array | None = None
+        self._key_ns = self._origin_ns = 0
+
+    @property
+    def waiting(self) -> int:
+        """How many scans wait."""
+        return len(self._waiting) + len(self._held)
+
+    @property
+    def has_wheels(self) -> bool:
+        """Whether wheel odometry came since the start."""
+        return self._wheels is not None
+
+    @property
+    def lag_s(self) -> float:
+        """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
+        return 0.0 if self._wheels is None else self._wheels.lag_s
+
+    @property
+    def mounting_yaw_rad(self) -> float:
+        """How much further to the left the scanner looks than its mounting says, by the wheels."""
+        forward = self._core.mixture.calibration.matrix[0]
+        return -math.atan2(forward[1], forward[0])
+
+    def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
+        """Take the wheels' pose ``(3,)`` in their own frame.
+
+        A pose that is not newer than the last one is of no use and is left out.
+
+        Raises:
+            ValueError: the pose is not finite, or larger than ``LARGEST_ODOMETRY``. Nothing has changed.
+        """
+        if pose_xyyaw.shape != (3,) or not (np.abs(pose_xyyaw) <= LARGEST_ODOMETRY).all():
+            raise ValueError(f"the wheels' pose is {pose_xyyaw}; expected three numbers up to {LARGEST_ODOMETRY:g}")
+        if self._wheels is None or stamp_ns <= self._wheels.newest_ns - RESTART_AFTER_NS:
+            self._wheels = StampedWheels()
+        self._wheels.add(stamp_ns, pose_xyyaw)
+
+    def add_scan(self, scan: LidarScan) -> None:
+        """Take a scan, which ``ready`` hands on once its wheels are known.
+
+        Raises:
+            DuplicateFrame, LateFrame: it is not newer than the last one, but not as old as after a restart.
+            UnusableImage: it has too many rays.
+        """
+        if len(scan.ranges) > self.config.most_rays:
+            raise UnusableImage(f"the scan has {len(scan.ranges)} rays; expected at most {self.config.most_rays}")
+        newest = self._newest_ns
+        if newest is not None and scan.stamp_ns <= newest:
+            if scan.stamp_ns == newest:
+                raise DuplicateFrame(f"scan at {scan.stamp_ns} ns came twice")
+            if scan.stamp_ns > newest - RESTART_AFTER_NS:
+                raise LateFrame(
+                    f"scan at {scan.stamp_ns} ns is {(newest - scan.stamp_ns) / 1e9:.3f} s older than the last"
+                )
+            wheels = self._wheels
+            self.reset()
+            self.restarts += 1
+            newest = None
+            if wheels is not None and wheels.newest_ns < scan.stamp_ns + RESTART_AFTER_NS:  # of the new run already
+                self._wheels = wheels
+        gap_s = 0.0 if newest is None else (scan.stamp_ns - newest) * 1e-9
+        bunched = newest is not None and self._period.bunched(gap_s)
+        if not bunched:
+            self._release()
+        if newest is not None:
+            self._period.add(gap_s)
+        self._newest_ns = scan.stamp_ns
+        self._held.append(scan)
+        if not bunched and not self._period.late(gap_s):
+            self._release()
+
+    def _release(self) -> None:
+        """Spread the bunch that came evenly over the time since the scan before it."""
+        for number, scan in enumerate(self._held):
+            at_s = self._held[-1].stamp_ns * 1e-9
+            if self._even_s > 0.0:
+                at_s = self._even_s + (number + 1) / len(self._held) * (at_s - self._even_s)
+            self._waiting.append((scan, at_s))
+        if self._held:
+            self._even_s = self._held[-1].stamp_ns * 1e-9
+        self._held.clear()
+
+    def ready(self, at_end: bool = False) -> Iterator[LidarStep]:
+        """The steps to all scans whose wheels are known by now; ``at_end`` no more wheels come.
+
+        Raises:
+            UnusableImage: a scan has no usable ray. It is gone; call again for the next.
+        """
+        newest_s = self._wheels.newest_ns * 1e-9 if self._wheels is not None else 0.0
+        if self._held and (at_end or newest_s > self._held[-1].stamp_ns * 1e-9 + self._period.period_s / 6.0):
+            self._release()
+        while self._waiting and (at_end or self._has_wheels(self._waiting[0][1])):
+            step = self._step(*self._waiting.popleft())
+            if step is not None:
+                yield step
+
+    def _has_wheels(self, at_s: float) -> bool:
+        if self._wheels is None or self._newest_ns is None:
+            return True
+        newest_s = self._wheels.newest_ns * 1e-9
+        until = at_s - self.lag_s + _duration_s(self._waiting[0][0])
+        return (
+            newest_s >= until
+            or newest_s < min(until, self._last_s or until) - _SILENT_S
+            or self._newest_ns * 1e-9 >= at_s + self.config.wheel_wait_s
+        )
+
+    def _step(self, scan: LidarScan, at_s: float) -> LidarStep | None:
+        last, gap_s = self._last, at_s - self._last_s
+        if last is None:
+            key = self._key_scan(scan, None)
+            self._core.begin(key)
+            self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns
+            self._last, self._last_s = key, at_s
+            return None
+        by_wheels = counted = None
+        if self._wheels is not None:
+            by_wheels = self._wheels.motion(self._last_s, at_s, self._core.mixture.calibration.matrix)
+            counted = self._wheels.motion(self._last_s, at_s, np.eye(3))
+        key = self._key_scan(scan, self._sweep(scan, gap_s, by_wheels))
+        silent = gap_s > self.config.silent_s and (by_wheels is None or self._wheels_paused(at_s - gap_s, at_s))
+        estimate = self._core.update(key, by_wheels, counted, gap_s / max(self._period.period_s, 1e-3), silent)
+        if self._wheels is not None and not estimate.unsure:
+            self._wheels.observe_turn(self._last_s, at_s, float(estimate.step[2]))
+        self._last, self._last_s = key, at_s
+        self._twist = estimate.step / max(gap_s, 1e-3)
+        return self._published(key, last, estimate, at_s)
+
+    def _wheels_paused(self, from_s: float, to_s: float) -> bool:
+        return self._wheels is not None and self._wheels.paused(from_s, to_s, self.config.silent_s)
+
+    def _published(self, key: KeyScan, last: KeyScan, estimate: ScanEstimate, at_s: float) -> LidarStep:
+        key_step = None
+        if estimate.is_key:
+            if estimate.walls is not None:
+                key = replace(key, points=key.points[estimate.walls], normals=key.normals[estimate.walls])
+            key_step = KeyScanStep(key, self._key_ns, estimate.since_key, estimate.since_key_covariance + _LEAST)
+            self._key_ns = key.stamp_ns
+        origin, self._origin = self._origin, None
+        nothing = np.zeros(0, np.float32)
+        pose = None if self._wheels is None else self._wheels.pose_at(at_s)
+        if pose is None and self._robot_odom is not None:
+            pose = compose(self._robot_odom, estimate.step)
+        self._robot_odom = pose
+        return LidarStep(
+            stamp_ns=key.stamp_ns,
+            from_stamp_ns=last.stamp_ns,
+            relative_xyyaw=estimate.step,
+            covariance=estimate.step_covariance + _LEAST,
+            origin_stamp_ns=self._origin_ns,
+            odom_xyyaw=estimate.pose,
+            motion_feature=nothing,
+            place_code=nothing,
+            share=estimate.score,
+            unsure=estimate.unsure,
+            evidence=np.zeros(len(STEP_EVIDENCE)),
+            key=key_step,
+            origin_scan=origin,
+            robot_odom_xyyaw=pose,
+            segment=estimate.segment,
+        )
+
+    def _key_scan(self, scan: LidarScan, sweep: Sweep | None) -> KeyScan:
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
+        largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
+        least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
+        try:
+            key = key_scan(
+                scan.stamp_ns, angles, scan.ranges, (least, largest), self.mounting, sweep, self.config.points
+            )
+        except ValueError as error:
+            raise UnusableImage(str(error)) from error
+        if len(key.points) < _LEAST_POINTS:
+            raise UnusableImage(f"the scan has {len(key.points)} usable returns; expected at least {_LEAST_POINTS}")
+        return key
+
+    def _sweep(self, scan: LidarScan, gap_s: float, by_wheels: Array | None) -> Sweep | None:
+        """How the robot moves during the scan, where the scan says how long it takes."""
+        sweep_s = _duration_s(scan)
+        if scan.time_increment == 0.0 or not 0.0 < sweep_s <= 1.2 * gap_s:
+            return None
+        twist = self._twist if by_wheels is None else by_wheels / gap_s
+        return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)
+
+
+def _duration_s(scan: LidarScan) -> float:
+    """How long the sweep lasts (s); 0 where the scan does not say it, or says what cannot be."""
+    duration_s = abs(scan.time_increment) * len(scan.ranges)
+    return duration_s if duration_s <= _LONGEST_SWEEP_S else 0.0

@@ -1,0 +1,90 @@
+"""The last key scans at their poses, as lines to register to and as a score field to search in."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.likelihood_field import joined
+from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points, line_squares
+from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
+from ngo_estimator.geometry.score_field import RayCounts, ScoreField, ScoreFieldConfig
+
+_REDRAWN_M = 4.0
+"""The counts are made anew where the robot is so far from their middle."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    points: Array
+    normals: Array
+    drawn: Array
+    origin: Array
+    ends: Array
+
+
+class RollingSubmap:
+    """At most ``most_scans`` key scans in the odometry's frame; lines and field are made when first asked for."""
+
+    def __init__(self, most_scans: int, config: ScoreFieldConfig) -> None:
+        self._scans: deque[_Placed] = deque()
+        self._most, self._config = most_scans, config
+        self._counts: RayCounts | None = None
+        self._middle = np.zeros(2)
+        self._lines: LineMap | None = None
+        self._field: ScoreField | None = None
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def clear(self) -> None:
+        """Forget all scans."""
+        self._scans.clear()
+        self._counts = self._lines = self._field = None
+
+    def add(self, scan: KeyScan, pose: Array) -> None:
+        """Add a scan whose base frame has the pose ``(3,)``; the oldest leaves where there are too many."""
+        points, normals = transformed(pose, scan.points), rotated(pose[2], scan.normals)
+        sensor = compose(pose, scan.sensor_xyyaw)
+        seen = np.isfinite(scan.ranges)
+        angles, ranges = scan.angles[seen], scan.ranges[seen]
+        ends = transformed(sensor, np.stack((ranges * np.cos(angles), ranges * np.sin(angles)), axis=-1))
+        drawn = joined(points, normals, self._config.cell_m)
+        self._scans.append(_Placed(points, normals, drawn, sensor[:2], ends))
+        if self._counts is not None and np.hypot(*(pose[:2] - self._middle)) < _REDRAWN_M:
+            self._counts.add(sensor[:2], ends)
+        else:
+            self._counts, self._middle = RayCounts(self._config, pose[:2]), pose[:2].copy()
+            for placed in self._scans:
+                self._counts.add(placed.origin, placed.ends)
+        if len(self._scans) > self._most:
+            oldest = self._scans.popleft()
+            self._counts.add(oldest.origin, oldest.ends, -1)
+        self._lines = self._field = None
+
+    def walls(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points ``(n, 2)`` in the odometry's frame are on walls ``(n,)``."""
+        assert self._counts is not None
+        return self._counts.walls(points)
+
+    @property
+    def lines(self) -> LineMap:
+        """The lines of all scans, averaged where they lie on each other."""
+        if self._lines is None:
+            points = np.concatenate([placed.points for placed in self._scans])
+            normals = np.concatenate([placed.normals for placed in self._scans])
+            kept = self.walls(points)
+            points, normals = points[kept], normals[kept]
+            self._lines = line_map_of_points(*averaged_lines(points, normals, line_squares(points, normals)))
+        return self._lines
+
+    @property
+    def field(self) -> ScoreField:
+        """The score field round the newest scans."""
+        if self._field is None:
+            assert self._counts is not None
+            drawn = np.concatenate([placed.drawn for placed in self._scans])
+            self._field = self._counts.field(drawn[self.walls(drawn)])
+        return self._field

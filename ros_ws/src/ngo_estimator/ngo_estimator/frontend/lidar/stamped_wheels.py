@@ -1,0 +1,134 @@
+"""Stamped poses of the wheels, the pose at any time among them, and how late scans are by their clock."""
+
+import numpy as np
+
+from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
+from ngo_estimator.geometry.planar_motion import Array, all_between, chained, wrap
+
+_KEPT = 1024
+_EXTRAPOLATED_S = 0.5
+"""Wheels whose last pose is older are silent."""
+
+_LAGS_S = np.linspace(-0.48, 0.48, 49)
+_REMEMBERED = 0.998
+"""What a turn counts after the next one."""
+
+_LEAST_TURNS = 60.0
+"""Turns after which the lag counts."""
+
+_TURNS_RAD = 0.02
+"""A smaller turn between two scans tells no lag."""
+
+_BETTER = 0.9
+"""The lag must leave so much of what no lag leaves."""
+
+
+class StampedWheels:
+    """Poses by time, in bounded memory; readings that came in a bunch are spread evenly."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((2 * _KEPT, 4))  # s since the first, x, y, unwrapped yaw
+        self._count = self._bunch = 0  # the row before the bunch
+        self._newest_s = 0.0  # as it was stamped
+        self._origin_ns = 0
+        self._period = UsualPeriod()
+        self._pending: list[tuple[float, float, float]] = []
+        self._off = np.zeros(len(_LAGS_S))
+        self._turns = 0.0
+        self.lag_s = 0.0
+        """How much older scans are than their stamps (s); 0 until it is known."""
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the last pose."""
+        return self._origin_ns + round(self._newest_s * 1e9)
+
+    def add(self, stamp_ns: int, pose: Array) -> None:
+        """Take the pose ``(3,)`` in the wheels' own frame; one that is not newer than the last is left out."""
+        if self._count == 0:
+            self._origin_ns = stamp_ns
+            self._rows[0] = 0.0, *pose
+            self._count = 1
+            return
+        stamp_s = (stamp_ns - self._origin_ns) * 1e-9
+        gap_s = stamp_s - self._newest_s
+        if gap_s <= 0.0:
+            return
+        self._period.add(gap_s)
+        if self._count == len(self._rows):
+            self._rows[:_KEPT] = self._rows[_KEPT:].copy()
+            self._count, self._bunch = _KEPT, max(0, self._bunch - _KEPT)
+        last = self._count - 1
+        self._rows[self._count] = stamp_s, pose[0], pose[1], self._rows[last, 3] + wrap(pose[2] - self._rows[last, 3])
+        self._count += 1
+        self._newest_s = stamp_s
+        if self._period.bunched(gap_s):
+            self._rows[self._bunch : self._count, 0] = np.linspace(
+                self._rows[self._bunch, 0], stamp_s, self._count - self._bunch
+            )
+        else:
+            self._bunch = last
+
+    def pose_at(self, stamp_s: float) -> Array | None:
+        """The wheels' pose ``(3,)`` when a scan of this stamp (s since the epoch) was taken; None where they were
+        silent."""
+        rows, at = self._rows[: self._count], stamp_s - self._origin_ns * 1e-9 - self.lag_s
+        if self._count == 0 or at < rows[0, 0] - _EXTRAPOLATED_S or at > rows[-1, 0] + _EXTRAPOLATED_S:
+            return None
+        if self._count == 1:
+            return rows[0, 1:].copy()
+        i = min(max(int(np.searchsorted(rows[:, 0], at)), 1), self._count - 1)
+        before, after = rows[i - 1], rows[i]
+        share = (at - before[0]) / (after[0] - before[0])
+        result: Array = before[1:] + min(max(share, -1.0), 2.0) * (after[1:] - before[1:])
+        return result
+
+    def motion(self, from_s: float, to_s: float, calibration: Array) -> Array | None:
+        """The robot's motion ``(3,)`` between two scans (s since the epoch), each reading's times ``calibration``
+        ``(3, 3)``; None where the wheels were silent."""
+        begin, end = self.pose_at(from_s), self.pose_at(to_s)
+        if begin is None or end is None:
+            return None
+        rows, origin_s = self._rows[: self._count], self._origin_ns * 1e-9 + self.lag_s
+        first, last = np.searchsorted(rows[:, 0], (from_s - origin_s, to_s - origin_s), side="right")
+        poses = np.concatenate((begin[None], rows[first:last, 1:], end[None]))
+        steps: Array = all_between(poses[:-1], poses[1:]) @ calibration
+        result: Array = chained(steps)[-1]
+        return result
+
+    def paused(self, from_s: float, to_s: float, longest_s: float) -> bool:
+        """Whether the wheels told nothing for ``longest_s`` between two stamps (s since the epoch)."""
+        rows, origin_s = self._rows[: self._count, 0], self._origin_ns * 1e-9
+        between = rows[(rows > from_s - origin_s) & (rows < to_s - origin_s)]
+        ends = np.concatenate(([from_s - origin_s], between, [to_s - origin_s]))
+        return bool(np.diff(ends).max() > longest_s)
+
+    def observe_turn(self, from_s: float, to_s: float, turn_rad: float) -> None:
+        """Take how far the robot turned between two scans, by a match, to learn the lag."""
+        self._pending.append((from_s - self._origin_ns * 1e-9, to_s - self._origin_ns * 1e-9, turn_rad))
+        rows = self._rows[: self._count]
+        while self._pending and self._pending[0][1] + _LAGS_S[-1] < self._newest_s:
+            start, end, turn = self._pending.pop(0)
+            if start + _LAGS_S[0] < rows[0, 0]:
+                continue
+            by_wheels = np.interp(end - _LAGS_S, rows[:, 0], rows[:, 3]) - np.interp(
+                start - _LAGS_S, rows[:, 0], rows[:, 3]
+            )
+            if max(abs(turn), float(np.abs(by_wheels).max())) < _TURNS_RAD:
+                continue
+            self._off = _REMEMBERED * self._off + np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
+            self._turns = _REMEMBERED * self._turns + 1.0
+        if len(self._pending) > _KEPT:
+            self._pending.pop(0)
+        if self._turns > _LEAST_TURNS:
+            self.lag_s = self._learned()
+
+    def _learned(self) -> float:
+        best = int(self._off.argmin())
+        middle = int(np.abs(_LAGS_S).argmin())
+        if self._off[best] > _BETTER * self._off[middle] or not 0 < best < len(_LAGS_S) - 1:
+            return 0.0 if not 0 < best < len(_LAGS_S) - 1 else self.lag_s
+        left, here, right = self._off[best - 1 : best + 2]
+        bend = left - 2.0 * here + right
+        shift = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+        return float(_LAGS_S[best] + shift * (_LAGS_S[1] - _LAGS_S[0]))

@@ -1,0 +1,174 @@
+"""The two likeliest poses of a scan in a score field, under a prior of several hypotheses (branch and bound).
+
+The score of a pose is the mean score of its points, and ``weight`` times the logarithm of the prior: that of the
+hypothesis that is likeliest there (a max-mixture: Olson and Agarwal 2013). Blocks of poses have a bound of both; the
+best block is split first (Hess et al. 2016, section V).
+"""
+
+import heapq
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ngo_estimator.geometry.planar_motion import Array, wrap
+from ngo_estimator.geometry.score_field import ScoreField
+
+_MOST_BLOCKS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Hypotheses of a pose: ``means`` ``(k, 3)``, ``deviations`` ``(k, 2)`` (m, rad), ``log_weights`` ``(k,)``, which
+    hold the densities' peaks."""
+
+    means: Array
+    deviations: Array
+    log_weights: Array
+
+    def logs(self, pose: Array) -> Array:
+        """Logarithm ``(k,)`` of the density of each at a pose ``(3,)``."""
+        way = np.hypot(*(self.means[:, :2] - pose[:2]).T) / self.deviations[:, 0]
+        turn = np.abs(np.remainder(self.means[:, 2] - pose[2] + math.pi, 2.0 * math.pi) - math.pi)
+        result: Array = self.log_weights - 0.5 * (way**2 + (turn / self.deviations[:, 1]) ** 2)
+        return result
+
+
+@dataclass(frozen=True)
+class SearchWindow:
+    """A window ``half_m`` and ``half_rad`` to each side of ``centre`` ``(3,)``; headings are ``step_rad`` apart."""
+
+    centre: Array
+    half_m: float
+    half_rad: float
+    step_rad: float
+
+
+def two_modes(
+    field: ScoreField,
+    points: Array,
+    window: SearchWindow,
+    prior: Mixture,
+    weight: float,
+    apart: tuple[float, float],
+    margin: float,
+) -> list[tuple[Array, float]]:
+    """The best pose ``(3,)`` with its total, and the best of those ``apart`` (m, rad) from it.
+
+    The second is there if it is no more than ``margin`` worse. ``points`` ``(n, 2)`` are those of the scan; at least
+    one.
+    """
+    cell = field.config.cell_m
+    half = max(1, math.ceil(window.half_m / cell))
+    turns = max(1, math.ceil(window.half_rad / window.step_rad))
+    headings = window.centre[2] + window.step_rad * np.arange(-turns, turns + 1)
+    means = prior.means - window.centre
+    means[:, 2] = np.array([wrap(float(turn)) for turn in means[:, 2]])
+    found = _modes(
+        field.levels,
+        round(255 * field.config.unknown),
+        points,
+        window.centre[:2] - field.corner,
+        headings - window.centre[2],
+        window.centre[2],
+        half,
+        cell,
+        means,
+        1.0 / prior.deviations**2,
+        prior.log_weights,
+        weight,
+        apart[0] / cell,
+        apart[1],
+        margin,
+        _MOST_BLOCKS,
+    )
+    return [
+        (np.array((window.centre[0] + x * cell, window.centre[1] + y * cell, wrap(float(headings[int(a)])))), total)
+        for total, a, x, y in found
+    ]
+
+
+@njit(cache=True)
+def _sum(level: NDArray[np.uint8], cells: NDArray[np.int32], across: int, up: int, unknown: int) -> int:
+    rows, columns = level.shape
+    total = 0
+    for k in range(len(cells)):
+        column, row = cells[k, 0] + across, cells[k, 1] + up
+        total += level[row, column] if 0 <= column < columns and 0 <= row < rows else unknown
+    return total
+
+
+@njit(cache=True)
+def _log_prior(
+    x: float, y: float, side: float, yaw: float, means: Array, information: Array, logs: Array
+) -> float:  # fmt: skip
+    """The largest over a block whose least corner is (x, y)."""
+    best = -math.inf
+    for k in range(len(means)):
+        dx = max(x - means[k, 0], means[k, 0] - x - side, 0.0)
+        dy = max(y - means[k, 1], means[k, 1] - y - side, 0.0)
+        turn = wrap(yaw - means[k, 2])
+        value = logs[k] - 0.5 * ((dx * dx + dy * dy) * information[k, 0] + turn * turn * information[k, 1])
+        best = max(best, value)
+    return best
+
+
+@njit(cache=True)
+def _modes(
+    levels: NDArray[np.uint8], unknown: int, points: Array, centre: Array, turns: Array, yaw: float, half: int,
+    cell: float, means: Array, information: Array, logs: Array, weight: float, apart: float, apart_rad: float,
+    margin: float, most_blocks: int,
+) -> list[tuple[float, int, int, int]]:  # fmt: skip
+    """Total, heading, column and row of one or two modes."""
+    depth = len(levels) - 1
+    while depth > 0 and (1 << depth) > half + 1:
+        depth -= 1
+    cells = np.empty((len(turns), len(points), 2), np.int32)
+    for a in range(len(turns)):
+        cos, sin = math.cos(yaw + turns[a]), math.sin(yaw + turns[a])
+        for k in range(len(points)):
+            x = cos * points[k, 0] - sin * points[k, 1] + centre[0]
+            y = sin * points[k, 0] + cos * points[k, 1] + centre[1]
+            cells[a, k, 0], cells[a, k, 1] = math.floor(x / cell), math.floor(y / cell)
+    scale = 1.0 / (255.0 * len(points))
+    heap = [(0.0, 0, 0, 0, 0) for _ in range(0)]
+    step = 1 << depth
+    for a in range(len(turns)):
+        for across in range(-half, half + 1, step):
+            for up in range(-half, half + 1, step):
+                total = scale * _sum(levels[depth], cells[a], across, up, unknown)
+                side = (step - 1) * cell
+                total += weight * _log_prior(across * cell, up * cell, side, turns[a], means, information, logs)
+                heap.append((-total, depth, a, across, up))
+    heapq.heapify(heap)
+    result = [(0.0, 0, 0, 0) for _ in range(0)]
+    blocks = 0
+    while len(heap) > 0 and blocks < most_blocks:
+        negative, level, a, across, up = heapq.heappop(heap)
+        if len(result) == 1:
+            best = result[0]
+            if -negative < best[0] - margin:
+                break
+            last = (1 << level) - 1
+            far_x = max(abs(across - best[2]), abs(min(across + last, half) - best[2]))
+            far_y = max(abs(up - best[3]), abs(min(up + last, half) - best[3]))
+            if far_x * far_x + far_y * far_y <= apart * apart and abs(turns[a] - turns[best[1]]) <= apart_rad:
+                continue
+        if level == 0:
+            result.append((-negative, a, across, up))
+            if len(result) == 2:
+                break
+            continue
+        blocks += 1
+        size = 1 << (level - 1)
+        for i in range(2):
+            for j in range(2):
+                column, row = across + i * size, up + j * size
+                if column <= half and row <= half:
+                    total = scale * _sum(levels[level - 1], cells[a], column, row, unknown)
+                    side = (size - 1) * cell
+                    total += weight * _log_prior(column * cell, row * cell, side, turns[a], means, information, logs)
+                    heapq.heappush(heap, (-total, level - 1, a, column, row))
+    return result

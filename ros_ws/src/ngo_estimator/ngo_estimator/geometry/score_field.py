@@ -1,0 +1,185 @@
+"""How well points fit what scans have seen: 1 at walls, 0 where rays passed, between them where nothing is known.
+
+A return where many other scans saw through is no wall: something moves there. Maxima over blocks of cells bound the
+score of many poses at once (Hess et al. 2016, section V).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ngo_estimator.geometry.planar_motion import Array
+
+Counts = NDArray[np.int16]
+Field = NDArray[np.uint8]
+
+_DEPTH = 3
+"""Blocks have up to ``2 ** _DEPTH`` cells a side."""
+
+
+@dataclass(frozen=True)
+class ScoreFieldConfig:
+    """Cells of ``cell_m``, up to ``reach_m`` from the middle. Points ``deviation_m`` from a wall score 0.61. What was
+    never seen scores ``unknown``. A return is no wall where over ``passed`` times as many scans saw through its cell as
+    saw a return in it."""
+
+    cell_m: float = 0.06
+    reach_m: float = 16.0
+    deviation_m: float = 0.10
+    unknown: float = 0.4
+    passed: float = 1.5
+
+    @property
+    def side(self) -> int:
+        """Cells on a side of the field."""
+        return 2 * math.ceil(self.reach_m / self.cell_m)
+
+
+class RayCounts:
+    """In how many scans rays ended in and passed each cell round ``middle`` ``(2,)``; scans can be taken back."""
+
+    def __init__(self, config: ScoreFieldConfig, middle: Array) -> None:
+        self.config = config
+        self.corner = middle - 0.5 * config.side * config.cell_m
+        self.hits = np.zeros((config.side, config.side), np.int16)
+        self.passes = np.zeros((config.side, config.side), np.int16)
+        self._marks, self._mark = np.zeros((config.side, config.side), np.int32), 0
+        self._levels = np.empty((_DEPTH + 1, config.side, config.side), np.uint8)
+        self._kernel = _kernel(config)
+
+    def add(self, origin: Array, ends: Array, times: int = 1) -> None:
+        """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``; ``times`` -1 takes them back."""
+        self._mark += 2
+        _count(
+            self.hits, self.passes, self._marks, origin - self.corner, ends - self.corner, self.config.cell_m, times,
+            self._mark,
+        )  # fmt: skip
+
+    def walls(self, points: Array) -> NDArray[np.bool_]:
+        """Which of the points ``(n, 2)`` are on walls: not more rays passed there than the settings say."""
+        result: NDArray[np.bool_] = _walls(
+            self.hits, self.passes, points - self.corner, self.config.cell_m, self.config.passed
+        )
+        return result
+
+    def field(self, points: Array) -> "ScoreField":
+        """The field with walls at points ``(n, 2)``; it is good until the next one is asked for."""
+        config, levels = self.config, self._levels
+        np.multiply(self.passes <= 0, np.uint8(round(255 * config.unknown)), out=levels[0])
+        _draw(levels[0], points - self.corner, config.cell_m, self._kernel)
+        for h in range(_DEPTH):
+            _pool(levels[h], levels[h + 1], 1 << h)
+        return ScoreField(levels, self.corner, config)
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreField:
+    """Scores ``(depth + 1, rows, columns)`` of 0 to 255; cell ``(row, column)`` of level ``h`` has the largest of the
+    ``2 ** h`` cells from there on in x (columns) and y (rows). The cell [0, 0] begins at ``corner`` ``(2,)``."""
+
+    levels: Field
+    corner: Array
+    config: ScoreFieldConfig
+
+    def score(self, points: Array, pose: Array) -> float:
+        """Mean score (0 to 1) of points ``(n, 2)`` whose frame has the pose ``(3,)``; unknown without a point."""
+        if not len(points):
+            return self.config.unknown
+        unknown = round(255 * self.config.unknown)
+        return float(_score(self.levels[0], points, pose, self.corner, self.config.cell_m, unknown))
+
+
+def _kernel(config: ScoreFieldConfig) -> Field:
+    reach = math.ceil(2.5 * config.deviation_m / config.cell_m)
+    squares = (np.arange(-reach, reach + 1) * config.cell_m / config.deviation_m) ** 2
+    result: Field = np.round(255.0 * np.exp(-0.5 * (squares[:, None] + squares))).astype(np.uint8)
+    return result
+
+
+@njit(cache=True)
+def _count(
+    hits: Counts,
+    passes: Counts,
+    marks: NDArray[np.int32],
+    origin: Array,
+    ends: Array,
+    cell: float,
+    times: int,
+    mark: int,
+) -> None:
+    """Count a scan once in each cell; where one of its rays ended, none passed. Cells get ``mark`` or one more."""
+    rows, columns = hits.shape
+    for k in range(len(ends)):
+        row, column = math.floor(ends[k, 1] / cell), math.floor(ends[k, 0] / cell)
+        if 0 <= row < rows and 0 <= column < columns and marks[row, column] != mark:
+            hits[row, column] += times
+            marks[row, column] = mark
+    for k in range(len(ends)):
+        x, y = ends[k, 0] - origin[0], ends[k, 1] - origin[1]
+        length = math.hypot(x, y)
+        for s in range(int(length / cell - 1.5)):
+            share = s * cell / length
+            row, column = int((origin[1] + share * y) / cell), int((origin[0] + share * x) / cell)
+            if not (0 <= row < rows and 0 <= column < columns):
+                break
+            if marks[row, column] < mark:
+                passes[row, column] += times
+                marks[row, column] = mark + 1
+
+
+@njit(cache=True)
+def _walls(hits: Counts, passes: Counts, points: Array, cell: float, ratio: float) -> NDArray[np.bool_]:
+    rows, columns = hits.shape
+    result = np.ones(len(points), np.bool_)
+    for k in range(len(points)):
+        row, column = math.floor(points[k, 1] / cell), math.floor(points[k, 0] / cell)
+        if not (1 <= row < rows - 1 and 1 <= column < columns - 1):
+            continue
+        ended = 0
+        for r in range(row - 1, row + 2):
+            for c in range(column - 1, column + 2):
+                ended = max(ended, hits[r, c])
+        result[k] = passes[row, column] <= ratio * ended
+    return result
+
+
+@njit(cache=True)
+def _draw(field: Field, points: Array, cell: float, kernel: Field) -> None:
+    rows, columns = field.shape
+    reach = len(kernel) // 2
+    for k in range(len(points)):
+        row, column = math.floor(points[k, 1] / cell), math.floor(points[k, 0] / cell)
+        if not (reach <= row < rows - reach and reach <= column < columns - reach) or field[row, column] == 255:
+            continue
+        for i in range(len(kernel)):
+            for j in range(len(kernel)):
+                r, c = row + i - reach, column + j - reach
+                field[r, c] = max(field[r, c], kernel[i, j])
+
+
+@njit(cache=True)
+def _pool(fine: Field, coarse: Field, step: int) -> None:
+    """The largest of four cells ``step`` apart; at the far edges, which no robot reaches, those that there are."""
+    rows, columns = fine.shape
+    for row in range(rows):
+        other = min(row + step, rows - 1)
+        for c in range(columns - step):
+            coarse[row, c] = max(fine[row, c], fine[row, c + step], fine[other, c], fine[other, c + step])
+        for c in range(columns - step, columns):
+            coarse[row, c] = max(fine[row, c], fine[other, c])
+
+
+@njit(cache=True)
+def _score(field: Field, points: Array, pose: Array, corner: Array, cell: float, unknown: int) -> float:
+    rows, columns = field.shape
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    total = 0
+    for k in range(len(points)):
+        x = cos * points[k, 0] - sin * points[k, 1] + pose[0] - corner[0]
+        y = sin * points[k, 0] + cos * points[k, 1] + pose[1] - corner[1]
+        row, column = math.floor(y / cell), math.floor(x / cell)
+        total += field[row, column] if 0 <= row < rows and 0 <= column < columns else unknown
+    return total / (255.0 * len(points))

@@ -1,0 +1,137 @@
+"""The mixture front end over drives whose truth is known."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ngo_estimator.data.relative_step import check_step
+from ngo_estimator.frontend.lidar.front_ends import lidar_front_end
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
+from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
+from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_recordings.scan_stream import LidarScan, WheelPose
+from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, cast, fan
+
+ANGLES = fan(181, 240.0)
+PERIOD_NS = 100_000_000
+
+
+def way(count: int, x: float = 1.0, y: float = 1.0, yaw: float = 0.2) -> np.ndarray:
+    poses = [np.array((x, y, yaw))]
+    for _ in range(count - 1):
+        poses.append(compose(poses[-1], np.array((0.05, 0.0, 0.03))))
+    return np.array(poses)
+
+
+def scan(room: np.ndarray, pose: np.ndarray, k: int, range_max: float = 30.0) -> LidarScan:
+    noise = np.random.default_rng(k).normal(0.0, 0.005, len(ANGLES))
+    ranges = np.asarray(cast(room, pose, ANGLES) + noise, np.float32)
+    increment = float(ANGLES[1] - ANGLES[0])
+    return LidarScan(10**12 + k * PERIOD_NS, float(ANGLES[0]), increment, ranges, 0.05, range_max, 0.0, "laser")
+
+
+def records(poses: np.ndarray, wheels: bool = True, room: np.ndarray = ROOM) -> list[LidarScan | WheelPose]:
+    result: list[LidarScan | WheelPose] = []
+    for k, pose in enumerate(poses):
+        if wheels:
+            result.append(WheelPose(10**12 + k * PERIOD_NS, between(poses[0], pose)))
+        result.append(scan(room, pose, k))
+    return result
+
+
+def fed(given: Iterable[LidarScan | WheelPose], lidar: MixtureLidar | None = None) -> list[LidarStep]:
+    lidar, steps = lidar or MixtureLidar(), []
+    for record in given:
+        if isinstance(record, WheelPose):
+            lidar.add_wheels(record.stamp_ns, record.pose_xyyaw)
+        else:
+            lidar.add_scan(record)
+        steps += list(lidar.ready())
+    steps += list(lidar.ready(at_end=True))
+    for step in steps:
+        check_step(step, 0, None)
+    return steps
+
+
+def off(steps: list[LidarStep], poses: np.ndarray) -> float:
+    last = between(between(poses[0], poses[-1]), steps[-1].odom_xyyaw)
+    return math.hypot(last[0], last[1]) + abs(last[2])
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+def test_a_drive_through_a_room_is_measured_again_and_alike(wheels: bool) -> None:
+    poses = way(50)
+    steps, again = fed(records(poses, wheels)), fed(records(poses, wheels))
+    assert len(steps) == 49 and off(steps, poses) < 0.05
+    assert not any(step.unsure or step.segment for step in steps)
+    for a, b in zip(steps, again, strict=True):
+        np.testing.assert_array_equal(a.odom_xyyaw, b.odom_xyyaw)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_wheels_that_stand_still_do_not_hold_a_robot_that_drives() -> None:
+    poses = way(50)
+    given = [replace(each, pose_xyyaw=np.zeros(3)) if isinstance(each, WheelPose) else each for each in records(poses)]
+    assert off(fed(given), poses) < 0.05
+
+
+def test_bunched_stamps_cost_nothing() -> None:
+    """Every fifth scan is in time; the four before it are stamped just before it."""
+    poses = way(60)
+    bunched = [
+        replace(each, stamp_ns=10**12 + (-(-k // 5) * 5) * PERIOD_NS - (-k % 5) * 1_000_000)
+        for k, each in enumerate(scan(ROOM, pose, k) for k, pose in enumerate(poses))
+    ]
+    driven = [WheelPose(10**12 + k * PERIOD_NS, between(poses[0], pose)) for k, pose in enumerate(poses)]
+    both = sorted([*bunched, *driven], key=lambda each: each.stamp_ns)
+    steps = fed(both)
+    assert [step.stamp_ns for step in steps] == [each.stamp_ns for each in bunched[1:]]
+    assert off(steps, poses) < 0.05
+
+
+def test_a_corridor_leaves_the_way_along_it_to_the_wheels() -> None:
+    poses = np.stack((0.1 * np.arange(30), np.zeros(30), np.zeros(30)), -1)
+    given = [
+        replace(each, range_max=8.0) if isinstance(each, LidarScan) else each for each in records(poses, room=HALLWAY)
+    ]
+    steps = fed(given)
+    assert off(steps, poses) < 0.05
+    last = steps[-1].covariance
+    assert last[0, 0] > 20.0 * last[1, 1]
+
+
+def test_a_robot_that_was_carried_while_all_was_silent_begins_a_segment() -> None:
+    there = records(way(20))
+    away = [
+        replace(each, stamp_ns=each.stamp_ns + 30 * 1_000_000_000) for each in records(way(20, x=3.0, y=4.5, yaw=2.0))
+    ]
+    steps = fed([*there, *away])
+    segments = [k for k, step in enumerate(steps) if step.segment]
+    assert segments == [19]
+    assert steps[19].key is not None and steps[19].covariance[0, 0] > 10.0
+
+
+def test_scans_that_cannot_be_used_are_refused() -> None:
+    lidar, first = MixtureLidar(), scan(ROOM, way(1)[0], 10)
+    lidar.add_scan(first)
+    with pytest.raises(DuplicateFrame):
+        lidar.add_scan(first)
+    with pytest.raises(LateFrame):
+        lidar.add_scan(replace(first, stamp_ns=first.stamp_ns - 1))
+    with pytest.raises(UnusableImage):
+        lidar.add_scan(replace(first, ranges=np.zeros(20_001, np.float32)))
+    with pytest.raises(ValueError, match="expected three numbers"):
+        lidar.add_wheels(first.stamp_ns, np.full(3, np.nan))
+    lidar.add_scan(replace(first, stamp_ns=first.stamp_ns - 2 * 10**9))
+    assert lidar.restarts == 1
+
+
+def test_a_setting_chooses_the_front_end() -> None:
+    assert isinstance(lidar_front_end(LidarOdometryConfig(front_end="mixture")), MixtureLidar)
+    assert isinstance(lidar_front_end(LidarOdometryConfig()), LidarOdometry)
+    with pytest.raises(ValueError, match="front_end"):
+        LidarOdometryConfig(front_end="other")
