@@ -85,9 +85,9 @@ class GoldenLidarDrive:
 
     def run(self, weights: Path = SHIPPED) -> Run:
         """Both estimators over the drive, with the settings in a folder."""
-        first, increment, *limits = self.scanner.tolist()
+        first, increment, shortest, longest, from_ray_to_ray_s = self.scanner.tolist()
         scans = tuple(
-            LidarScan(stamp_ns, first, increment, ranges, *limits, "laser")
+            LidarScan(stamp_ns, first, increment, ranges, shortest, longest, from_ray_to_ray_s, "laser")
             for stamp_ns, ranges in zip(self.stamps_ns.tolist(), self.ranges_m, strict=True)
         )
         wheels = tuple(map(WheelPose, self.wheel_stamps_ns.tolist(), self.wheel_poses.astype(np.float64)))
