@@ -14,30 +14,25 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, save_checkpoint
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
+from training.common.training import save_weights
 from training.data.episodes import simulate
 from training.data.features import features_of
 from training.data.worlds import VALIDATION_SEEDS, WorldName, world_named
 from training.scoring.online_estimate import steps_of
-
-_OWN = ("format", "network", "world", "sha256", "config")
 
 
 @dataclass(frozen=True)
 class Arguments:
     """Settings of a calibration."""
 
-    world: WorldName
-    """World whose optimizer is calibrated."""
-    trajectories: int = 12
-    """Trajectories, each in a validation maze of its own."""
-    frames: int = 0
-    """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors; the optimizer's description gets the factor."""
+    world: WorldName  # World whose optimizer is calibrated.
+    trajectories: int = 12  # Trajectories, each in a validation maze of its own.
+    frames: int = 0  # Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000).
+    weights: Path = records.WEIGHTS  # Folder with WORLD/*.safetensors; the optimizer's description gets the factor.
 
 
 def main(arguments: Arguments) -> float:
@@ -57,8 +52,7 @@ def main(arguments: Arguments) -> float:
             found.append(normalized_errors(core, features))
     scale = float(np.mean(np.concatenate(found)))
     optimizer.config = dataclasses.replace(plain, covariance_scale=scale)
-    details = {key: value for key, value in description.items() if key not in _OWN}
-    save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, world.name, details)
+    save_weights(folder, optimizer, OPTIMIZER, records.kept_details(description))
     print(f"{world.name}: squared errors are {scale:.2f} times the covariance, which gets this factor")
     return scale
 

@@ -33,10 +33,8 @@ class Arguments:
     files: tyro.conf.Positional[tuple[Path, ...]]
     """Files ending in .mcap or .db3, or folders of rosbag2; several count as one recording."""
     topics: Annotated[TopicArguments, tyro.conf.arg(name="")] = field(default_factory=TopicArguments)
-    out: Path | None = None
-    """Picture to draw, a .png; not given: beside the first file."""
-    json: bool = False
-    """Print one JSON object instead of the report."""
+    out: Path | None = None  # Picture to draw, a .png; not given: beside the first file.
+    json: bool = False  # Print one JSON object instead of the report.
 
 
 def main(arguments: Arguments) -> Report:

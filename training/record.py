@@ -26,12 +26,9 @@ _LOOK_S = 0.2
 class Arguments:
     """Settings of a recording."""
 
-    out: Path
-    """A new file ending in .mcap, or a new folder."""
-    topics: tuple[str, ...] = ()
-    """Topics to record; none: all of the graph, including later ones."""
-    seconds: float = 0.0
-    """Duration; 0: until Ctrl-C."""
+    out: Path  # A new file ending in .mcap, or a new folder.
+    topics: tuple[str, ...] = ()  # Topics to record; none: all of the graph, including later ones.
+    seconds: float = 0.0  # Duration; 0: until Ctrl-C.
 
     def __post_init__(self) -> None:
         if self.seconds < 0.0:

@@ -26,12 +26,9 @@ _WARM_UP = 16  # batches: the processes have started, the simulator is compiled,
 class Arguments:
     """Settings of a measurement."""
 
-    world: Literal["maze2d", "maze3d"]
-    """World to measure."""
-    workers: int = 1
-    """Processes that simulate; 0: this one."""
-    seconds: float = 10.0
-    """How long to measure each stream."""
+    world: Literal["maze2d", "maze3d"]  # World to measure.
+    workers: int = 1  # Processes that simulate; 0: this one.
+    seconds: float = 10.0  # How long to measure each stream.
 
 
 def main(arguments: Arguments) -> dict[str, float]:

@@ -9,16 +9,14 @@ after a stop.
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import lightning
 import numpy as np
 import torch
 from torch import Tensor
 
-from ngo_estimator.checkpoint import save_checkpoint
 from ngo_estimator.geometry import se2
 from training.baselines.deepvo import DEEPVO, DeepVO, DeepVOConfig, trajectory_steps
 from training.baselines.graph_settings import fit_calibration
@@ -26,13 +24,14 @@ from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.step_losses import step_losses, step_metrics, windows_within
 from training.common.trainer_arguments import TrainerArguments
+from training.common.training import Figures, OverallTraining, save_weights
 from training.data import episodes
 from training.data.batches import ALL, Batch, Share, mirrored, relative_poses, seen_from_first
 from training.data.data_module import StreamedData
 from training.data.episodes import images_of, simulate
 from training.data.streams import PairStream
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.train_local import episode_pairs
+from training.train_local import typical_steps
 
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
@@ -42,32 +41,17 @@ if TYPE_CHECKING:
 class Arguments(TrainerArguments):
     """Settings of a training of DeepVO."""
 
-    world: Literal["maze3d"]
-    """World to train for."""
-    width: float = 0.25
-    """Channels of the convolutions and units of the LSTM layers, as a fraction of DeepVO's."""
-    epochs: int = 8
-    """Passes of new data."""
-    datapoints: int = 200_000
-    """Frame pairs in an epoch, of all processes."""
-    steps: int = 40
-    """Steps of a stretch."""
-    batch_size: int = 8
-    """Stretches in a step of the optimiser, in each process."""
-    learning_rate: float = 5e-4
-    """Highest learning rate of the one-cycle schedule."""
-    validation_mazes: int = 8
-    """Mazes of the validation split that each epoch is measured on."""
-    calibration_mazes: int = 64
-    """Mazes that no network has seen, on which the output is calibrated."""
-    workers: int = 1
-    """Processes that simulate for each one that trains."""
-    seed: int = 0
-    """Seed of the initial weights."""
-    out: Path = records.ROOT / "runs"
-    """Folder that gets WORLD/deepvo.safetensors."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of checkpoints and logs."""
+    world: Literal["maze3d"]  # World to train for.
+    width: float = 0.25  # Channels of the convolutions and units of the LSTM layers, as a fraction of DeepVO's.
+    epochs: int = 8  # Passes of new data.
+    datapoints: int = 200_000  # Frame pairs in an epoch, of all processes.
+    steps: int = 40  # Steps of a stretch.
+    batch_size: int = 8  # Stretches in a step of the optimiser, in each process.
+    learning_rate: float = 5e-4  # Highest learning rate of the one-cycle schedule.
+    validation_mazes: int = 8  # Mazes of the validation split that each epoch is measured on.
+    calibration_mazes: int = 64  # Mazes that no network has seen, on which the output is calibrated.
+    workers: int = 1  # Processes that simulate for each one that trains.
+    out: Path = field(default=records.ROOT / "runs", kw_only=True)  # Folder that gets WORLD/deepvo.safetensors.
 
 
 class StretchStream(PairStream):
@@ -106,36 +90,26 @@ class StretchStream(PairStream):
             yield mirrored(batch) if count % 2 else batch
 
 
-class DeepVOTraining(lightning.LightningModule):
+class DeepVOTraining(OverallTraining):
     """The local network's loss, over stretches; on the validation split, errors of whole episodes."""
 
     def __init__(self, arguments: Arguments, network: DeepVO, error_windows: tuple[int, ...]) -> None:
-        super().__init__()
-        self.arguments, self.network, self.error_windows = arguments, network, error_windows
-        self.validation: list[tuple[Tensor, Tensor]] = []
+        super().__init__(arguments)
+        self.network, self.error_windows = network, error_windows
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         relative, _state = self.network(batch["images"])
         std = self.network.relative_std
         loss, _likelihood = step_losses(
             relative, std.log().expand_as(relative), batch["relative"], std, self.error_windows
         )
-        self.log("pose_loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
-        return loss
+        return loss, {"pose_loss": loss}
 
-    def validation_step(self, batch: Batch, _: int) -> None:
-        with torch.autocast(self.device.type, enabled=False):
-            self.validation.append((trajectory_steps(self.network, batch["images"]), batch["relative"]))
+    def estimates(self, batch: Batch) -> tuple[Tensor, ...]:
+        return trajectory_steps(self.network, batch["images"]), batch["relative"]
 
-    def on_validation_epoch_end(self) -> None:
-        relative, truth = (torch.cat(parts) for parts in zip(*self.validation, strict=True))
-        self.validation.clear()
-        metrics = {f"validation_{name}": value for name, value in _metrics(relative, truth).items()}
-        self.log_dict(metrics, prog_bar=True, sync_dist=True)
-
-    def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-4)
-        return runs.one_cycle(optimizer, self.trainer)
+    def overall(self, *columns: Tensor) -> Figures:
+        return {f"validation_{name}": value for name, value in _metrics(*columns).items()}
 
 
 def validation_episodes(world: World, mazes: int) -> list[Batch]:
@@ -172,17 +146,16 @@ def calibrated(network: DeepVO, world: World, seeds: list[int]) -> DeepVOConfig:
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
     world = world_named(arguments.world)
-    folder = arguments.runs / world.name / DEEPVO
+    windows = windows_within(arguments.steps, world.error_windows)
     run = runs.Run(
-        folder,
+        arguments.runs / world.name / DEEPVO,
         "train_deepvo",
         arguments,
         arguments.epochs,
-        arguments.seed,
         datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
-        settings={"error_windows": list(windows_within(arguments.steps, world.error_windows)), **world.stream_settings},
+        settings={"error_windows": list(windows), **world.stream_settings},
     )
-    some = torch.cat([pairs["relative"] for pairs in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
+    some = typical_steps(world)
     config = DeepVOConfig(
         world.image,
         arguments.width,
@@ -190,7 +163,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         relative_std=(float(some[:, 0].std()), float(some[:, 1].std()), float(some[:, 2].std())),
         symmetric=world.mirrors,
     )
-    training = DeepVOTraining(arguments, DeepVO(config), windows_within(arguments.steps, world.error_windows))
+    training = DeepVOTraining(arguments, DeepVO(config), windows)
 
     def stream(epoch: int, share: Share) -> StretchStream:
         a = arguments
@@ -206,9 +179,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     final.load_state_dict(network.state_dict())
     parts = [(trajectory_steps(final, batch["images"]), batch["relative"]) for batch in data.validation]
     metrics = _metrics(*(torch.cat(column) for column in zip(*parts, strict=True)))
-    details = {"training": run.finish(metrics), "metrics": {"validation": metrics}}
-    save_checkpoint(arguments.out / world.name / f"{DEEPVO}.safetensors", final, DEEPVO, world.name, details)
-    print("validation", {name: round(value, 5) for name, value in metrics.items()})
+    save_weights(arguments.out / world.name, final, DEEPVO, run.ended(metrics))
     return metrics
 
 

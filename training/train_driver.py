@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
@@ -29,6 +28,7 @@ from tqdm import tqdm
 from ngo_common.files import written_whole
 from ngo_sim.policy_network import SHIPPED, PolicyConfig
 from training.common import records
+from training.common.command_line import run_command
 from training.common.records import write_at_once
 from training.data.worlds import World, world_named
 from training.driver.driver_network import Features, MirroredPolicy, export
@@ -42,44 +42,27 @@ CHECKPOINT = "last.pt"
 class Arguments:
     """Settings of a training of the driver."""
 
-    lessons: int = 12
-    """Rounds of lessons before the reinforcement learning."""
-    lesson_decisions: int = 500
-    """Decisions of each environment in a lesson."""
-    lesson_updates: int = 300
-    """Updates after a lesson."""
-    lesson_learning_rate: float = 1e-3
-    """Learning rate of the first lesson; it falls linearly."""
+    lessons: int = 12  # Rounds of lessons before the reinforcement learning.
+    lesson_decisions: int = 500  # Decisions of each environment in a lesson.
+    lesson_updates: int = 300  # Updates after a lesson.
+    lesson_learning_rate: float = 1e-3  # Learning rate of the first lesson; it falls linearly.
     decisions: int = 500_000
     """Decisions of the reinforcement learning, of all environments together; each holds its action for three frames."""
-    environments: int = 16
-    """Mazes that are driven through side by side."""
-    steps: int = 128
-    """Decisions of each environment between two rounds of updates."""
-    batch_size: int = 256
-    """Decisions in an update."""
-    passes: int = 4
-    """How often a round goes through its decisions."""
-    episode_frames: int = 600
-    """Frames in one maze."""
-    mazes: int = 16
-    """Mazes of one size that an environment makes at a time."""
-    learning_rate: float = 3e-4
-    """Learning rate at the beginning; it falls linearly to zero."""
-    discount: float = 0.98
-    """Discount of a reward one decision later."""
+    environments: int = 16  # Mazes that are driven through side by side.
+    steps: int = 128  # Decisions of each environment between two rounds of updates.
+    batch_size: int = 256  # Decisions in an update.
+    passes: int = 4  # How often a round goes through its decisions.
+    episode_frames: int = 600  # Frames in one maze.
+    mazes: int = 16  # Mazes of one size that an environment makes at a time.
+    learning_rate: float = 3e-4  # Learning rate at the beginning; it falls linearly to zero.
+    discount: float = 0.98  # Discount of a reward one decision later.
     entropy: float = 0.005
     """Weight of the entropy of the actions in the loss at the beginning; it falls linearly to zero."""
-    checkpoint_decisions: int = 50_000
-    """Decisions between two checkpoints."""
-    threads: int = 1
-    """Threads that the network is trained with."""
-    seed: int = 0
-    """Seed of the weights, the mazes and the actions."""
-    out: Path = SHIPPED
-    """File that gets the weights; its JSON lies beside it."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of checkpoints and logs."""
+    checkpoint_decisions: int = 50_000  # Decisions between two checkpoints.
+    threads: int = 1  # Threads that the network is trained with.
+    seed: int = 0  # Seed of the weights, the mazes and the actions.
+    out: Path = SHIPPED  # File that gets the weights; its JSON lies beside it.
+    runs: Path = records.ROOT / "runs"  # Folder of checkpoints and logs.
 
     def __post_init__(self) -> None:
         for name in (
@@ -258,18 +241,10 @@ def load_state(folder: Path, record: dict[str, Any]) -> dict[str, Any] | None:
     """The last checkpoint of a folder, None where there is none; RunError where its run had other arguments."""
     if not (folder / CHECKPOINT).exists():
         return None
-    then = json.loads((folder / "run.json").read_text())["arguments"]
-    now = json.loads(json.dumps(record["arguments"]))
-    if differing := sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name)):
-        given = ", ".join(f"{name} {now.get(name)}" for name in differing)
-        expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
-        raise records.RunError(
-            f"{folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, or the "
-            "folder removed to begin anew"
-        )
+    records.check_same_run(folder, record["arguments"], json.loads((folder / "run.json").read_text())["arguments"])
     state: dict[str, Any] = torch.load(folder / CHECKPOINT, weights_only=True)
     return state
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    run_command(main, Arguments, __doc__)

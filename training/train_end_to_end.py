@@ -8,11 +8,10 @@ learns loops alone, and its ranges stay. The result is a set of weights of its o
 continue after a stop.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -24,7 +23,6 @@ from ngo_estimator.checkpoint import (
     load_local,
     load_optimizer,
     load_place,
-    save_checkpoint,
 )
 from ngo_estimator.data.weights_file import CheckpointError, load_description
 from ngo_estimator.geometry import se2
@@ -35,6 +33,7 @@ from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics, windows_within
 from training.common.trainer_arguments import TrainerArguments
+from training.common.training import Figures, Training, save_weights
 from training.data.batches import Batch, Share
 from training.data.data_module import StreamedData
 from training.data.streams import TrajectoryStream
@@ -47,37 +46,21 @@ from training.train_optimizer import trajectory_loss
 class Arguments(TrainerArguments):
     """Settings of a training of all networks together."""
 
-    world: Literal["maze2d", "maze3d"]
-    """World to train for."""
-    steps: int = 512
-    """Steps of a trajectory."""
-    epochs: int = 8
-    """Passes of new data."""
-    batches: int = 128
-    """Batches in an epoch, of all processes."""
-    batch_size: int = 2
-    """Trajectories in a step of the optimiser, in each process; at most 8."""
-    learning_rate: float = 1e-4
-    """Highest learning rate of aggregation and optimizer."""
-    encoder_learning_rate: float = 2e-5
-    """Highest learning rate of the local pose network, the place encoder and its pair head."""
-    local_weight: float = 1.0
-    """Weight of the local network's own loss, which keeps the odometry as good as it was."""
-    validation_trajectories: int = 16
-    """Trajectories of the validation split that each epoch is measured on."""
-    workers: int = 1
-    """Processes that simulate for each one that trains."""
-    seed: int = 0
-    """Seed of whatever is drawn at random."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/ as the stages made it: the three networks to start from."""
-    out: Path = records.ROOT / "runs" / "end_to_end"
-    """Folder that gets WORLD/ with the three networks."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of checkpoints and logs."""
+    world: Literal["maze2d", "maze3d"]  # World to train for.
+    steps: int = 512  # Steps of a trajectory.
+    epochs: int = 8  # Passes of new data.
+    batches: int = 128  # Batches in an epoch, of all processes.
+    batch_size: int = 2  # Trajectories in a step of the optimiser, in each process; at most 8.
+    learning_rate: float = 1e-4  # Highest learning rate of aggregation and optimizer.
+    encoder_learning_rate: float = 2e-5  # Highest learning rate of the local network, the place encoder and pair head.
+    local_weight: float = 1.0  # Weight of the local network's own loss, which keeps the odometry as good as it was.
+    validation_trajectories: int = 16  # Trajectories of the validation split that each epoch is measured on.
+    workers: int = 1  # Processes that simulate for each one that trains.
+    weights: Path = records.WEIGHTS  # Folder with WORLD/ as the stages made it: the three networks to start from.
+    out: Path = field(default=records.ROOT / "runs" / "end_to_end", kw_only=True)  # Folder that gets WORLD/.
 
 
-class EndToEndTraining(lightning.LightningModule):
+class EndToEndTraining(Training):
     """The optimizer's loss on corrected trajectories, and the local network's own loss as an anchor."""
 
     def __init__(
@@ -90,8 +73,9 @@ class EndToEndTraining(lightning.LightningModule):
         scale_rad: float,
         error_windows: tuple[int, ...] = (1,),
     ) -> None:
-        super().__init__()
-        self.arguments, self.scale_m, self.scale_rad, self.error_windows = arguments, scale_m, scale_rad, error_windows
+        super().__init__(arguments)
+        self.scale_m, self.scale_rad, self.error_windows = scale_m, scale_rad, error_windows
+        self.local_weight, self.encoder_learning_rate = arguments.local_weight, arguments.encoder_learning_rate
         self.local, self.place, self.optimizer = local, place, optimizer
         self.requires_grad_(True)
         self.place.requires_grad_(optimizer.config.loops)  # the paper's form has no use for them
@@ -120,7 +104,7 @@ class EndToEndTraining(lightning.LightningModule):
             result = self.optimizer(*steps, motion, loops)
         return relative, log_std, result
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         relative, log_std, result = self(batch)
         block = self.optimizer.block
         truth = se2.r2g(batch["relative"])[:, block - 1 :: block]
@@ -129,35 +113,26 @@ class EndToEndTraining(lightning.LightningModule):
         pose_loss, likelihood = step_losses(
             relative, log_std, batch["relative"], self.local.relative_std, self.error_windows
         )
-        loss = corrected + self.arguments.local_weight * (pose_loss + LIKELIHOOD_WEIGHT * likelihood)
-        figures = {"loss": loss, "trajectory_loss": corrected, "pose_loss": pose_loss, "likelihood": likelihood}
-        self.log_dict(
-            figures, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True, batch_size=len(batch["action"])
-        )
-        return loss
+        loss = corrected + self.local_weight * (pose_loss + LIKELIHOOD_WEIGHT * likelihood)
+        return loss, {"loss": loss, "trajectory_loss": corrected, "pose_loss": pose_loss, "likelihood": likelihood}
 
-    def validation_step(self, batch: Batch, _: int) -> None:
-        figures = {f"validation_{name}": value for name, value in self.figures(batch).items()}
-        self.log_dict(figures, on_epoch=True, prog_bar=True, sync_dist=True, batch_size=len(batch["action"]))
-
-    def figures(self, batch: Batch) -> dict[str, float]:
+    def figures(self, batch: Batch) -> Figures:
         """Mean errors of trajectories before and after correction (RMSE; m, deg), and the errors of single steps."""
-        with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
-            relative, log_std, result = self(batch)
+        relative, log_std, result = self(batch)
         truth = se2.r2g(batch["relative"])
-        figures: dict[str, float] = {}
-        for name, poses in (("odometry", se2.r2g(relative)), ("corrected", result.poses)):
-            figures |= {key: float(value) for key, value in rmse_figures(name, poses, truth).items()}
+        poses = {"odometry": se2.r2g(relative), "corrected": result.poses}
+        rmse = [rmse_figures(name, of_one, truth) for name, of_one in poses.items()]
         steps = step_metrics(*(value.flatten(0, 1) for value in (relative, log_std, batch["relative"])))
-        return {**figures, **{f"step_{name}": value for name, value in steps.items()}}
+        figures = {name: float(value) for of_one in rmse for name, value in of_one.items()}
+        figures |= {f"step_{name}": value for name, value in steps.items()}
+        return {f"validation_{name}": value for name, value in figures.items()}
 
-    def configure_optimizers(self) -> Any:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         encoders = [p for network in (self.local, self.place) for p in network.parameters() if p.requires_grad]
-        groups = [
-            {"params": list(self.optimizer.parameters()), "lr": self.arguments.learning_rate},
-            {"params": encoders, "lr": self.arguments.encoder_learning_rate},
+        groups: list[dict[str, Any]] = [
+            {"params": list(self.optimizer.parameters()), "lr": self.arguments.learning_rate}
         ]
-        return runs.one_cycle(torch.optim.AdamW(groups, weight_decay=1e-4), self.trainer)
+        return [*groups, {"params": encoders, "lr": self.encoder_learning_rate}]
 
 
 @torch.no_grad()
@@ -165,7 +140,9 @@ def measure(training: EndToEndTraining, batches: list[Batch]) -> dict[str, float
     """Means of the figures over batches, on the CPU."""
     training.cpu()
     figures = [training.figures(batch) for batch in batches]
-    return {name: sum(f[name] for f in figures) / len(figures) for name in figures[0]}
+    return {
+        name.removeprefix("validation_"): float(sum(f[name] for f in figures)) / len(figures) for name in figures[0]
+    }
 
 
 def main(arguments: Arguments) -> dict[str, float]:
@@ -187,7 +164,6 @@ def main(arguments: Arguments) -> dict[str, float]:
         "train_end_to_end",
         arguments,
         arguments.epochs,
-        arguments.seed,
         datapoints=lambda batch: batch["relative"].shape[0] * batch["relative"].shape[1],
         settings=world.stream_settings,
     )
@@ -209,26 +185,17 @@ def main(arguments: Arguments) -> dict[str, float]:
     if not run.is_first:
         return {}
     metrics = measure(training, data.validation)
+    ended = run.ended(metrics)
+    stages = {LOCAL: local_description, PLACE: place_description, OPTIMIZER: description}
     details = {
-        "training": run.finish(metrics),
-        "metrics": {"validation": metrics, "validation_of_stages": before},
-        "stages_sha256": {
-            LOCAL: local_description["sha256"],
-            PLACE: place_description["sha256"],
-            OPTIMIZER: description["sha256"],
-        },
+        **ended,
+        "metrics": {**ended["metrics"], "validation_of_stages": before},
+        "stages_sha256": {kind: described["sha256"] for kind, described in stages.items()},
     }
-    save_checkpoint(out / f"{LOCAL}.safetensors", local, LOCAL, world.name, details)
-    save_checkpoint(out / f"{PLACE}.safetensors", place, PLACE, world.name, details)
+    save_weights(out, local, LOCAL, details)
+    save_weights(out, place, PLACE, details)
     trained_with = load_description(out / f"{PLACE}.safetensors", PLACE)["sha256"]
-    save_checkpoint(
-        out / f"{OPTIMIZER}.safetensors",
-        optimizer,
-        OPTIMIZER,
-        world.name,
-        {"place_encoder_sha256": trained_with, **details},
-    )
-    print("validation", {name: (round(before[name], 5), round(value, 5)) for name, value in metrics.items()})
+    save_weights(out, optimizer, OPTIMIZER, {"place_encoder_sha256": trained_with, **details})
     return metrics
 
 

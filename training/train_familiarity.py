@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
-from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load_place, save_checkpoint
+from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load_place
 from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.familiarity import (
@@ -37,13 +36,15 @@ from ngo_estimator.networks.familiarity import (
 )
 from training.common import records
 from training.common.command_line import run_command
+from training.common.training import save_weights
 from training.data.batches import action_histories, relative_poses, seen_from_first
 from training.data.episodes import simulate
 from training.data.faults import FAULTS, SensedDrive, faulted
 from training.data.features import Networks
-from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, WorldName, world_named
-from training.recordings.recording_source import RecordedArguments, check_source, open_recorded
-from training.scoring.honesty import estimates_of, odometry_covariances, within
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
+from training.recordings.recording_source import DataArguments, open_recorded
+from training.scoring.honesty import estimates_of, odometry_covariances
+from training.scoring.metrics import within
 
 FACTORS = (0.7, 1.0, 1.4, 2.0)
 """Factors that are tried. Less than the first is not honest on Doom maps that nothing was trained on."""
@@ -58,28 +59,18 @@ _CHUNK = 64
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(DataArguments):
     """Settings of the fit."""
 
-    world: WorldName | None = None
-    """World of the networks."""
-    recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings that the networks were trained on instead."""
-    drives: int = 64
-    """Worlds: drives that are fitted to, each in a maze that the local network has not seen."""
-    limit_drives: int = 32
-    """Worlds: validation drives that give the limits."""
-    fault_drives: int = 4
-    """Drives that get each fault."""
-    frames: int = 400
-    """Frames of a drive."""
-    weights: Path = records.WEIGHTS
-    """Folder with NAME/*.safetensors, which gets NAME/familiarity.safetensors."""
-    out: Path = records.ROOT / "runs"
-    """Folder of recordings that were read."""
+    drives: int = 64  # Worlds: drives that are fitted to, each in a maze that the local network has not seen.
+    limit_drives: int = 32  # Worlds: validation drives that give the limits.
+    fault_drives: int = 4  # Drives that get each fault.
+    frames: int = 400  # Frames of a drive.
+    weights: Path = records.WEIGHTS  # Folder with NAME/*.safetensors, which gets NAME/familiarity.safetensors.
+    out: Path = records.ROOT / "runs"  # Folder of recordings that were read.
 
     def __post_init__(self) -> None:
-        check_source(self.world, self.recordings)
+        super().__post_init__()
         if min(self.drives, self.limit_drives, self.fault_drives) < 1 or self.frames < 2 * _WINDOWS[0]:
             raise ValueError(
                 f"drives, limit_drives, fault_drives, frames are {self.drives}, {self.limit_drives}, "
@@ -101,7 +92,7 @@ class Seen:
 
 def main(arguments: Arguments) -> Familiarity:
     """Fit, write ``familiarity.safetensors`` and its JSON, and return it."""
-    name = arguments.world or arguments.recordings.name
+    name = arguments.name
     folder = arguments.weights / name
     (local, about_local), (place, about_place) = load_local(folder, name), load_place(folder, name)
     networks = Networks(local, place)
@@ -129,7 +120,7 @@ def main(arguments: Arguments) -> Familiarity:
         "training": records.record("train_familiarity", arguments),
         "metrics": {"validation": {f"within_three_deviations_{kind}": share for kind, share in shares.items()}},
     }
-    save_checkpoint(folder / f"{FAMILIARITY}.safetensors", familiarity, FAMILIARITY, name, details)
+    save_weights(folder, familiarity, FAMILIARITY, details)
     limits = {kind: round(limit, 3) for kind, limit in zip(DISTANCES, familiarity.config.limits, strict=True)}
     print(f"{name}: limits {limits}, factor {disagreement}, within three deviations {shares}")
     if missed := dishonest(shares):

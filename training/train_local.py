@@ -14,28 +14,28 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import lightning
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
-from ngo_estimator.checkpoint import LOCAL, load_local, save_checkpoint
+from ngo_estimator.checkpoint import LOCAL, load_local
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
-from training.common import records, runs
+from training.common import runs
 from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics
+from training.common.training import Figures, OverallTraining, save_weights
 from training.data.batches import ACTION_HISTORY, Batch, Share, action_histories, relative_poses
 from training.data.data_module import StreamedData
 from training.data.data_source import Domain
 from training.data.episodes import images_of, simulate
 from training.data.streams import PairStream
-from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.recordings.recording_source import SourceArguments, open_recorded, told_to
+from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World
+from training.recordings.recording_source import SourceArguments, open_source, told_to
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
@@ -47,32 +47,16 @@ CALIBRATION_MAZES = 64
 class Arguments(SourceArguments):
     """Settings of a training of the local pose network."""
 
-    without_action: bool = False
-    """Worlds: whether the network sees images alone, without the actions."""
-    action_history: int | None = None
-    """Number of latest actions that the network is told; none: the world's number, or twelve for recordings."""
-    error_windows: tuple[int, ...] | None = None
-    """Worlds: lengths of the windows of steps over which the loss sums errors; none: the world's."""
-    width: float = 0.25
-    """Channels of the convolutions, as a fraction of FlowNetS's."""
-    epochs: int = 8
-    """Passes of new data."""
-    datapoints: int = 200_000
-    """Frame pairs in an epoch, of all processes. Of recordings, each pair counts at most twice."""
-    batch_size: int = 256
-    """Frame pairs in a step of the optimiser, in each process; less on small recordings."""
-    learning_rate: float = 2e-3
-    """Highest learning rate of the one-cycle schedule."""
-    validation_mazes: int = 8
-    """Mazes of the validation split that each epoch is measured on."""
-    workers: int = 1
-    """Processes that simulate for each one that trains."""
-    seed: int = 0
-    """Seed of the initial weights."""
-    out: Path = records.WEIGHTS
-    """Folder that gets NAME/local_pose_network.safetensors."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of checkpoints and logs."""
+    without_action: bool = False  # Worlds: whether the network sees images alone, without the actions.
+    action_history: int | None = None  # Latest actions that the network is told; none: the world's, recordings: 12.
+    error_windows: tuple[int, ...] | None = None  # Worlds: steps over which the loss sums errors; none: the world's.
+    width: float = 0.25  # Channels of the convolutions, as a fraction of FlowNetS's.
+    epochs: int = 8  # Passes of new data.
+    datapoints: int = 200_000  # Frame pairs in an epoch, of all processes; each pair of recordings twice at most.
+    batch_size: int = 256  # Frame pairs in a step of the optimiser, in each process; less on small recordings.
+    learning_rate: float = 2e-3  # Highest learning rate of the one-cycle schedule.
+    validation_mazes: int = 8  # Mazes of the validation split that each epoch is measured on.
+    workers: int = 1  # Processes that simulate for each one that trains.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,71 +71,39 @@ class Arguments(SourceArguments):
             raise ValueError(f"error_windows is {given}; expected numbers of steps, each at least 1, of a world")
 
 
-class LocalTraining(lightning.LightningModule):
+class LocalTraining(OverallTraining):
     """The training of a local network by ``step_losses`` of single steps and of windows."""
 
     def __init__(self, arguments: Arguments, network: LocalPoseNetwork, error_windows: tuple[int, ...] = (1,)) -> None:
-        super().__init__()
-        self.arguments, self.network, self.error_windows = arguments, network, error_windows
-        self.validation: list[tuple[Tensor, Tensor, Tensor]] = []
+        super().__init__(arguments)
+        self.network, self.error_windows = network, error_windows
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         pose_loss, likelihood = stretch_losses(self.network, batch, self.error_windows)
-        self.log_dict(
-            {"pose_loss": pose_loss, "likelihood": likelihood},
-            on_step=False,
-            on_epoch=True,
-            prog_bar=True,
-            sync_dist=True,
-        )
-        return pose_loss + LIKELIHOOD_WEIGHT * likelihood
+        return pose_loss + LIKELIHOOD_WEIGHT * likelihood, {"pose_loss": pose_loss, "likelihood": likelihood}
 
-    def validation_step(self, batch: Batch, _: int) -> None:
-        with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
-            mean, log_std = estimated(self.network, batch)[:2]
-        self.validation.append((mean, log_std, batch["relative"]))
+    def estimates(self, batch: Batch) -> tuple[Tensor, ...]:
+        return *estimated(self.network, batch)[:2], batch["relative"]
 
-    def on_validation_epoch_end(self) -> None:
-        mean, log_std, truth = (torch.cat(parts) for parts in zip(*self.validation, strict=True))
-        self.validation.clear()
-        loss = float(step_losses(mean, log_std, truth, self.network.relative_std)[0])
-        self.log("validation_loss", loss, on_epoch=True, sync_dist=True)
-        metrics = {f"validation_{k}": v for k, v in step_metrics(mean, log_std, truth).items()}
-        self.log_dict(metrics, prog_bar=True, sync_dist=True)
-
-    def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-4)
-        return runs.one_cycle(optimizer, self.trainer)
+    def overall(self, *columns: Tensor) -> Figures:
+        mean, log_std, truth = columns
+        loss = step_losses(mean, log_std, truth, self.network.relative_std)[0]
+        metrics = step_metrics(mean, log_std, truth)
+        return {"validation_loss": loss, **{f"validation_{name}": value for name, value in metrics.items()}}
 
 
-def simulated_world(arguments: Arguments) -> World:
-    """The world that the arguments name, with their changes."""
-    world = world_named(str(arguments.world))
-    if arguments.action_history is not None:
-        world = dataclasses.replace(world, action_history=arguments.action_history)
+def with_changes(domain: Domain, arguments: Arguments) -> Domain:
+    """The domain with the changes that the arguments ask for."""
+    changes: dict[str, Any] = {} if arguments.action_history is None else {"action_history": arguments.action_history}
     if arguments.error_windows is not None:
-        world = dataclasses.replace(world, error_windows=arguments.error_windows)
-    return dataclasses.replace(world, actions=0, mirrored_actions=()) if arguments.without_action else world
-
-
-class Steps(Protocol):
-    """A source of pairs of consecutive frames."""
-
-    def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
-        """The pairs of an epoch, for one of the processes that train together."""
-
-    def validation(self) -> list[Batch]:
-        """The validation pairs of each epoch."""
-
-    def unseen(self) -> list[Batch]:
-        """The pairs that calibrate the network's output."""
-
-    def typical(self) -> Tensor:
-        """Typical relative poses ``(n, 3)`` of the training."""
+        changes["error_windows"] = arguments.error_windows
+    if arguments.without_action:
+        changes |= {"actions": 0, "mirrored_actions": ()}
+    return dataclasses.replace(domain, **changes)
 
 
 class SimulatedSteps:
-    """Pairs from the mazes of a world, each used once."""
+    """Pairs from the mazes of a world, each used once, in the form of ``RecordedSteps``."""
 
     def __init__(self, arguments: Arguments, world: World) -> None:
         self.arguments, self.world = arguments, world
@@ -166,7 +118,12 @@ class SimulatedSteps:
         return episode_pairs(self.world, list(OPTIMIZER_TRAIN_SEEDS[-CALIBRATION_MAZES:]))
 
     def typical(self) -> Tensor:
-        return torch.cat([p["relative"] for p in episode_pairs(self.world, list(TRAIN_SEEDS[:8]))])
+        return typical_steps(self.world)
+
+
+def typical_steps(world: World) -> Tensor:
+    """Relative poses ``(n, 3)`` of drives through mazes of the training."""
+    return torch.cat([pairs["relative"] for pairs in episode_pairs(world, list(TRAIN_SEEDS[:8]))])
 
 
 def episode_pairs(world: World, seeds: list[int]) -> list[Batch]:
@@ -228,14 +185,9 @@ def calibrated(network: LocalPoseNetwork, pairs: list[Batch], steps: int = 1) ->
         mean[i], std[i], bias[i] = float(scale * mean[i]), float(scale * std[i]), float(scale * bias[i] + rest)
         fits[:, i] = scale * estimates[:, i] + rest
         log_std[:, i] += math.log(scale)
+    fitted_values = {"relative_mean": tuple(mean), "relative_std": tuple(std), "relative_bias": tuple(bias)}
     deviation = lasting_deviation((fits - truth).split(lengths), log_std.mul(2.0).exp().split(lengths), steps)
-    return dataclasses.replace(
-        network.config,
-        relative_mean=(mean[0], mean[1], mean[2]),
-        relative_std=(std[0], std[1], std[2]),
-        relative_bias=(bias[0], bias[1], bias[2]),
-        deviation_scale=deviation,
-    )
+    return dataclasses.replace(network.config, **fitted_values, deviation_scale=deviation)  # type: ignore[arg-type]
 
 
 def lasting_deviation(errors: Sequence[Tensor], variances: Sequence[Tensor], steps: int) -> tuple[float, float, float]:
@@ -254,79 +206,50 @@ def _sums(values: Tensor, steps: int) -> Tensor:
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
-    recorded = open_recorded(arguments.recordings, arguments.runs) if arguments.world is None else None
-    steps: Steps
-    lasting = 1
-    if recorded is None:
-        world = simulated_world(arguments)
-        domain: Domain = world
-        steps = SimulatedSteps(arguments, world)
-        windows, lasting = world.error_windows, world.deviation_steps
-        of_steps = {"action_history": world.action_history, "error_windows": list(windows)}
-        settings: dict[str, Any] | None = {**of_steps, **world.stream_settings}
-    else:
-        domain = recorded.domain
-        if arguments.action_history is not None:
-            domain = dataclasses.replace(domain, action_history=arguments.action_history)
-        steps = RecordedSteps(recorded, arguments.datapoints, arguments.batch_size)
-        windows, settings = (1,), None  # pairs of recordings are shuffled one by one
+    source = open_source(arguments)
+    domain = with_changes(source.domain, arguments)
+    settings: dict[str, Any] | None = None
+    steps: SimulatedSteps | RecordedSteps
+    if isinstance(domain, World):
+        steps = SimulatedSteps(arguments, domain)
+        of_steps = {"action_history": domain.action_history, "error_windows": list(domain.error_windows)}
+        settings = {**of_steps, **domain.stream_settings}
+    elif source.recorded is not None:
+        steps = RecordedSteps(source.recorded, arguments.datapoints, arguments.batch_size)
     kind = "local-no_action" if arguments.without_action else "local"
     run = runs.Run(
         arguments.runs / domain.name / kind,
         "train_local",
         arguments,
         arguments.epochs,
-        arguments.seed,
-        best=None if recorded is None else "validation_loss",
-        data=None if recorded is None else recorded.sha256,
+        best="validation_loss",
+        data=source.sha256,
         settings=settings,
     )
     network, begun = initial_network(arguments, domain, steps)
-    training = LocalTraining(arguments, network, windows)
+    training = LocalTraining(arguments, network, domain.error_windows)
     data = StreamedData(steps.pairs, steps.validation, arguments.workers)
     run.fit(training, data)
     if not run.is_first:
         return {}
     training.cpu()
-    final = LocalPoseNetwork(calibrated(training.network, steps.unseen(), lasting)).eval()
-    final.load_state_dict(training.network.state_dict())
-    metrics = measure(final, data.validation, RPE_STEPS if recorded is None else 0)
-    about = {} if recorded is None else {"data": recorded.about}
-    details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
-    save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", final, LOCAL, domain.name, details)
-    print("validation", {name: round(value, 5) for name, value in metrics.items()})
+    final = LocalPoseNetwork(calibrated(network, steps.unseen(), domain.deviation_steps)).eval()
+    final.load_state_dict(network.state_dict())
+    metrics = measure(final, data.validation, RPE_STEPS if source.recorded is None else 0)
+    save_weights(arguments.out / domain.name, final, LOCAL, {**run.ended(metrics, begun), **source.about})
     return metrics
 
 
-def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple[LocalPoseNetwork, dict[str, str]]:
+def initial_network(
+    arguments: Arguments, domain: Domain, steps: SimulatedSteps | RecordedSteps
+) -> tuple[LocalPoseNetwork, dict[str, str]]:
     """A fresh network or that of ``--from-weights``, and the entry of the JSON that names these weights.
 
     Raises ``RecordingError`` where those weights take other images, or are told other things of a step.
     """
-    folder = arguments.recordings.from_weights
-    if folder is not None:
-        network, description = load_local(folder)
-        config = network.config
-        if (config.actions, config.twist) != (domain.actions, domain.twist):
-            raise RecordingError(
-                f"{folder} takes {told_to(config)}, {domain.name} has {told_to(domain)}; expected the same "
-                "(--action none, --twist none leave them out)"
-            )
-        if config.image != domain.image:
-            raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")
-        wanted = domain.action_history if domain.actions else 1
-        if config.action_history not in (1, wanted):
-            raise RecordingError(f"{folder} is told the latest {config.action_history} actions; expected 1 or {wanted}")
-        # Calibrated they are anew; a memory was of the steps of these weights.
-        changes: dict[str, Any] = {"deviation_scale": (1.0, 1.0, 1.0), "relative_bias": (0.0, 0.0, 0.0), "memory": None}
-        changes["action_history"] = wanted
-        if domain.mirrors:
-            changes |= {"symmetric": True, "mirrored_actions": domain.mirrored_actions}
-        changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s, **changes))
-        # What takes earlier actions into account is new where the weights know none.
-        kept = {name: value for name, value in network.state_dict().items() if not name.startswith("memory.")}
-        changed.load_state_dict(changed.state_dict() | kept)
-        return changed, {"began_with_sha256": description["sha256"]}
+    wanted = domain.action_history if domain.actions else 1
+    if arguments.recordings.from_weights is not None:
+        return _begun_network(arguments.recordings.from_weights, domain, wanted)
     some = steps.typical()
     config = LocalPoseConfig(
         image=domain.image,
@@ -340,9 +263,32 @@ def initial_network(arguments: Arguments, domain: Domain, steps: Steps) -> tuple
         mirrored_actions=domain.mirrored_actions,
         twist=domain.twist,
         twist_scale=domain.twist_scale,
-        action_history=domain.action_history if domain.actions else 1,
+        action_history=wanted,
     )
     return LocalPoseNetwork(config), {}
+
+
+def _begun_network(folder: Path, domain: Domain, wanted: int) -> tuple[LocalPoseNetwork, dict[str, str]]:
+    network, description = load_local(folder)
+    config = network.config
+    if (config.actions, config.twist) != (domain.actions, domain.twist):
+        raise RecordingError(
+            f"{folder} takes {told_to(config)}, {domain.name} has {told_to(domain)}; expected the same "
+            "(--action none, --twist none leave them out)"
+        )
+    if config.image != domain.image:
+        raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")
+    if config.action_history not in (1, wanted):
+        raise RecordingError(f"{folder} is told the latest {config.action_history} actions; expected 1 or {wanted}")
+    # Calibrated they are anew; a memory was of the steps of these weights.
+    changes: dict[str, Any] = {"deviation_scale": (1.0, 1.0, 1.0), "relative_bias": (0.0, 0.0, 0.0), "memory": None}
+    if domain.mirrors:
+        changes |= {"symmetric": True, "mirrored_actions": domain.mirrored_actions}
+    changed = LocalPoseNetwork(dataclasses.replace(config, period_s=domain.period_s, action_history=wanted, **changes))
+    # What takes earlier actions into account is new where the weights know none.
+    kept = {name: value for name, value in network.state_dict().items() if not name.startswith("memory.")}
+    changed.load_state_dict(changed.state_dict() | kept)
+    return changed, {"began_with_sha256": description["sha256"]}
 
 
 @torch.no_grad()

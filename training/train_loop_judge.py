@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_place, save_checkpoint
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.graph.gauss_newton import pick
 from ngo_estimator.loops.loop_closure import LoopSearch
@@ -30,6 +30,7 @@ from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, Neura
 from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.common import records
 from training.common.command_line import run_command
+from training.common.training import descend, save_weights
 from training.data.doom_drives import doom_episodes
 from training.data.features import Networks, features_of
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, world_named
@@ -56,18 +57,12 @@ _FLOOR_M, _FLOOR_RAD = 0.01, 0.002
 class Arguments:
     """Settings of a training of the judge."""
 
-    drives: int = 70
-    """Drives to learn from."""
-    frames: int = 1000
-    """Frames of a drive."""
-    steps: int = 300
-    """Steps of the optimiser, each over all loops."""
-    learning_rate: float = 5e-3
-    """Learning rate at first; it falls to zero."""
-    seed: int = 0
-    """Seed of the initial weights."""
-    weights: Path = records.WEIGHTS
-    """Folder with doom/*.safetensors, which gets the optimizer."""
+    drives: int = 70  # Drives to learn from.
+    frames: int = 1000  # Frames of a drive.
+    steps: int = 300  # Steps of the optimiser, each over all loops.
+    learning_rate: float = 5e-3  # Learning rate at first; it falls to zero.
+    seed: int = 0  # Seed of the initial weights.
+    weights: Path = records.WEIGHTS  # Folder with doom/*.safetensors, which gets the optimizer.
 
     def __post_init__(self) -> None:
         if not 0 < self.drives <= _MOST_DRIVES:
@@ -141,13 +136,14 @@ def learn(loops: Judged, steps: int, learning_rate: float, seed: int = 0) -> Loo
     judge.mean.copy_(loops.evidence.mean(0))
     judge.std.copy_(loops.evidence.std(0) + 1e-3)
     weight = loops.weight / loops.weight.mean()
-    optimizer = torch.optim.AdamW(judge.parameters(), lr=learning_rate, weight_decay=_WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 1e-3, steps)
-    for _ in range(steps):
-        optimizer.zero_grad()
-        (loss_of(judge, loops) * weight).mean().backward()
-        optimizer.step()
-        schedule.step()
+    descend(
+        judge.parameters(),
+        lambda _: (loss_of(judge, loops) * weight).mean(),
+        steps,
+        lambda optimizer: torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 1e-3, steps),
+        lr=learning_rate,
+        weight_decay=_WEIGHT_DECAY,
+    )
     return judge.eval()
 
 
@@ -160,8 +156,8 @@ def main(arguments: Arguments) -> None:
     """Learn, print and write."""
     torch.set_num_threads(1)
     folder, world = arguments.weights / "doom", world_named("doom")
-    networks = Networks(load_local(folder, "doom")[0], load_place(folder, "doom")[0])
-    place_sha256 = load_place(folder, "doom")[1]["sha256"]
+    place, described = load_place(folder, "doom")
+    networks = Networks(load_local(folder, "doom")[0], place)
     optimizer = untrained(folder).eval()
     drives = []
     for seed in tqdm(OPTIMIZER_TRAIN_SEEDS[_FIRST_SEED : _FIRST_SEED + arguments.drives], desc="drives"):
@@ -175,8 +171,8 @@ def main(arguments: Arguments) -> None:
     optimizer.loop_judge.load_state_dict(judge.state_dict())
     metrics = {"loops": len(loops.off), "true": float(loops.true.double().mean())}
     training = {**records.record("train_loop_judge", arguments), "metrics": metrics}
-    details = {"place_encoder_sha256": place_sha256, "judge": training, "metrics": {}}
-    save_checkpoint(folder / f"{OPTIMIZER}.safetensors", optimizer, OPTIMIZER, "doom", details)
+    details = {"place_encoder_sha256": described["sha256"], "judge": training, "metrics": {}}
+    save_weights(folder, optimizer, OPTIMIZER, details)
     print(f"{metrics['loops']} loops, {metrics['true']:.0%} true")
 
 

@@ -9,46 +9,31 @@ after a stop.
 """
 
 import dataclasses
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-import lightning
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, load_smoother, save_checkpoint
+from ngo_estimator.checkpoint import OPTIMIZER, load_local, load_optimizer, load_place, load_smoother
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.ngo.loop_closing import OVERLAPS_AFTER
-from ngo_estimator.ngo.neural_graph_optimizer import (
-    NeuralGraphOptimizer,
-    NeuralGraphOptimizerConfig,
-)
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
 from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.precision import Precision
+from training.common.training import Figures, Training, save_weights
 from training.data.batches import Batch
 from training.data.data_source import Domain
 from training.data.feature_store import training_stores
-from training.data.trajectories import (
-    StoredTrajectories,
-    StretchData,
-    correction_scale,
-    loops_of,
-    rmse_figures,
-)
-from training.data.worlds import world_named
-from training.recordings.recording_source import (
-    NO_LOOPS,
-    RecordedData,
-    SourceArguments,
-    open_recorded,
-)
+from training.data.trajectories import StoredTrajectories, correction_scale, loops_of, rmse_figures, stretch_data
+from training.recordings.recording_source import NO_LOOPS, SourceArguments, open_source
 
 HEADING_WEIGHT = 0.3
 RELATIVE_WEIGHT = 0.05
@@ -62,35 +47,19 @@ class Arguments(SourceArguments):
 
     form: Literal["loops", "gauss_newton", "paper"] = "loops"
     """loops: attention, convolution and loop closures. gauss_newton: loop closures alone. paper: no loop closures."""
-    iterations: int = 5
-    """Attend-optimise iterations."""
+    iterations: int = 5  # Attend-optimise iterations.
     smoothing: bool | None = None
     """Whether the smoother of ``train_smoother`` smooths the odometry before loops are closed; none: the world's
     default, and no smoothing for recordings."""
-    width: int = 64
-    """Channels of aggregation and optimizer."""
-    loops_per_pose: int | None = None
-    """Loop candidates of a meta-pose; none: the world's default."""
-    max_loops: int | None = None
-    """Loop candidates of a trajectory; none: the world's default."""
-    epochs: int | None = None
-    """Epochs, over which the learning rate falls to zero; none: the world's default."""
-    steps: int = 40
-    """Steps of the optimiser in an epoch; of recordings at most one for each stretch."""
-    batch_size: int = 8
-    """Trajectories in a step."""
-    learning_rate: float = 1e-3
-    """Highest learning rate."""
-    seed: int = 0
-    """Seed of initial weights and of the order of the data."""
-    precision: Precision = field(default="32-true", kw_only=True)
-    """Arithmetic of the network; loops are always closed in float64."""
-    weights: Path = records.WEIGHTS
-    """Folder with NAME's other networks."""
-    out: Path = records.WEIGHTS
-    """Folder that gets NAME/neural_graph_optimizer.safetensors."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of the feature stores, checkpoints and logs."""
+    width: int = 64  # Channels of aggregation and optimizer.
+    loops_per_pose: int | None = None  # Loop candidates of a meta-pose; none: the world's default.
+    max_loops: int | None = None  # Loop candidates of a trajectory; none: the world's default.
+    epochs: int | None = None  # Epochs, over which the learning rate falls to zero; none: the world's default.
+    steps: int = 40  # Steps of the optimiser in an epoch; of recordings at most one for each stretch.
+    batch_size: int = 8  # Trajectories in a step.
+    learning_rate: float = 1e-3  # Highest learning rate.
+    precision: Precision = field(default="32-true", kw_only=True)  # Of the network; loops are closed in float64.
+    weights: Path = records.WEIGHTS  # Folder with NAME's other networks.
 
 
 def trajectory_loss(
@@ -123,8 +92,10 @@ def step_loss(relative: Tensor, truth: Tensor, std: Tensor) -> Tensor:
     return huber_loss(step, torch.zeros_like(step), delta=1.0)
 
 
-class OptimizerTraining(lightning.LightningModule):
+class OptimizerTraining(Training):
     """``trajectory_loss`` on stretches of trajectories; on the validation split, errors of whole ones."""
+
+    weight_decay = 1e-3
 
     def __init__(
         self,
@@ -133,9 +104,8 @@ class OptimizerTraining(lightning.LightningModule):
         domain: Domain,
         registration: RegistrationConfig | None = None,
     ) -> None:
-        super().__init__()
-        self.arguments, self.optimizer, self.domain = arguments, optimizer, domain
-        self.registration = registration
+        super().__init__(arguments)
+        self.optimizer, self.domain, self.registration = optimizer, domain, registration
         if optimizer.config.smoother is not None:
             optimizer.smoother.requires_grad_(False)  # it has learned what it can, at a rate of its own
 
@@ -143,61 +113,38 @@ class OptimizerTraining(lightning.LightningModule):
         loops = loops_of(batch, self.registration)
         return self.optimizer(batch["relative"], batch["log_std"], batch["motion"], loops)
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
-        block = self.optimizer.block
-        loss = trajectory_loss(
-            self(batch).meta_relative,
-            batch["truth"][:, block - 1 :: block],
-            self.optimizer.correction_std,
-            self.domain.loss_scale_m,
-            self.domain.loss_scale_rad,
-        )
-        self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
-        return loss
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        optimizer, scales = self.optimizer, (self.domain.loss_scale_m, self.domain.loss_scale_rad)
+        truth = batch["truth"][:, optimizer.block - 1 :: optimizer.block]
+        loss = trajectory_loss(self(batch).meta_relative, truth, optimizer.correction_std, *scales)
+        return loss, {"loss": loss}
 
-    def validation_step(self, batch: Batch, _: int) -> None:
+    def figures(self, batch: Batch) -> Figures:
         estimates = {"odometry": se2.r2g(batch["odometry"]), "corrected": self(batch).poses}
         if self.optimizer.config.smoother is not None:
             steps, _ = self.optimizer.smoother(batch["relative"], batch["log_std"], batch["motion"])
             estimates["smoothed"] = se2.r2g(steps)
-        for name, poses in estimates.items():
-            figures = rmse_figures(name, poses, batch["truth"])
-            self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(poses), sync_dist=True)
+        figures = [rmse_figures(name, poses, batch["truth"]) for name, poses in estimates.items()]
+        return {name: value for of_one in figures for name, value in of_one.items()}
 
-    def configure_optimizers(self) -> Any:
-        slow: list[nn.Parameter] = []
-        fast: list[nn.Parameter] = []
-        for name, parameter in self.optimizer.named_parameters():
-            if not parameter.requires_grad:
-                continue
-            # A single number that starts from zero.
-            (fast if name == "place_gain" else slow).append(parameter)
+    def parameter_groups(self) -> list[dict[str, Any]]:
         rate = self.arguments.learning_rate
-        groups: list[dict[str, Any]] = [{"params": slow}]
-        if fast:
-            groups.append({"params": fast, "lr": 20.0 * rate, "weight_decay": 0.0})
-        optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=1e-3)
-        return runs.one_cycle(optimizer, self.trainer)
+        learning = {name: p for name, p in self.optimizer.named_parameters() if p.requires_grad}
+        fast = [learning.pop("place_gain")] if "place_gain" in learning else []  # a single number, from zero
+        groups: list[dict[str, Any]] = [{"params": list(learning.values()), "lr": rate}]
+        return [*groups, {"params": fast, "lr": 20.0 * rate, "weight_decay": 0.0}] if fast else groups
 
 
-class Choices(NamedTuple):
-    """Arguments with a default of their own in each domain."""
-
-    smoothing: bool
-    loops_per_pose: int
-    max_loops: int
-    epochs: int
-
-
-def choices(arguments: Arguments, domain: Domain) -> Choices:
+def with_choices(arguments: Arguments, domain: Domain) -> Arguments:
     """The given arguments, and the domain's defaults for all others."""
-    given = arguments
-    return Choices(
-        domain.smoothing and given.form != "paper" if given.smoothing is None else given.smoothing,
-        domain.loops_per_pose if given.loops_per_pose is None else given.loops_per_pose,
-        domain.max_loops if given.max_loops is None else given.max_loops,
-        domain.optimizer_epochs if given.epochs is None else given.epochs,
-    )
+    defaults: dict[str, Any] = {
+        "smoothing": domain.smoothing and arguments.form != "paper",
+        "loops_per_pose": domain.loops_per_pose,
+        "max_loops": domain.max_loops,
+        "epochs": domain.optimizer_epochs,
+    }
+    missing = {name: value for name, value in defaults.items() if getattr(arguments, name) is None}
+    return dataclasses.replace(arguments, **missing)
 
 
 def config_of(
@@ -215,7 +162,7 @@ def config_of(
     if arguments.form == "paper":
         return NeuralGraphOptimizerConfig.paper_form(aggregation, **changes)
     place, _ = load_place(arguments.weights / domain.name, domain.name)
-    chosen = choices(arguments, domain)
+    chosen: Any = with_choices(arguments, domain)
     search = LoopSearch(
         per_pose=chosen.loops_per_pose,
         most=chosen.max_loops,
@@ -226,42 +173,32 @@ def config_of(
         overlaps=0 if place.config.registration is None or arguments.iterations <= OVERLAPS_AFTER else domain.overlaps,
     )
     return NeuralGraphOptimizerConfig(
-        aggregation=aggregation,
-        search=search,
-        network=arguments.form == "loops",
-        **changes,
+        aggregation=aggregation, search=search, network=arguments.form == "loops", **changes
     )
 
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    name = arguments.world or arguments.recordings.name
-    folder = arguments.weights / name
-    local, local_description = load_local(folder, name)
-    recorded: RecordedData | None = None
-    if arguments.world is None:
-        recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
-    domain = world_named(name) if recorded is None else recorded.domain
-    chosen = choices(arguments, domain)
-    arguments = replace(arguments, **chosen._asdict())  # a run's record says what was trained
-    place, place_description = load_place(folder, domain.name)
-    about: dict[str, Any] = {"place_encoder_sha256": place_description["sha256"]}
-    smooths: dict[str, Any] = {}
-    if recorded is not None:
-        about["data"] = recorded.about
-    if NO_LOOPS in place_description:
-        return _without_loops(arguments, domain, about, str(place_description[NO_LOOPS]))
+    name, folder = arguments.name, arguments.weights / arguments.name
+    local, of_local = load_local(folder, name)
+    source = open_source(arguments, (local, of_local))
+    domain = source.domain
+    arguments = with_choices(arguments, domain)  # a run's record says what was trained
+    place, of_place = load_place(folder, name)
+    about = {"place_encoder_sha256": of_place["sha256"], **source.about}
+    if NO_LOOPS in of_place:
+        return _without_loops(arguments, domain, about, str(of_place[NO_LOOPS]))
     if arguments.smoothing and arguments.form != "paper" and place.config.registers_odometry:
         raise records.RunError(
-            f"smoothing is asked for in {domain.name}, whose odometry is registered; expected one of the two, as what "
+            f"smoothing is asked for in {name}, whose odometry is registered; expected one of the two, as what "
             "smooths odometry learned from steps that are not"
         )
-    features = arguments.runs / domain.name / "features"
-    stores = training_stores(features, domain.optimizer_stores, domain, local_description, place_description)
-    smoother: OdometrySmoother | None = None
+    features = arguments.runs / name / "features"
+    stores = training_stores(features, domain.optimizer_stores, domain, of_local, of_place)
+    smoother, smooths = None, {}
     if arguments.smoothing:
-        smoother, described = load_smoother(folder, domain.name)
-        smooths["odometry_smoother_sha256"] = described["sha256"]
+        smoother, of_smoother = load_smoother(folder, name)
+        smooths = {"odometry_smoother_sha256": of_smoother["sha256"]}
     began = arguments.recordings.from_weights
     optimizer = None if began is None else begun_optimizer(began, smoother, place.config.registration is not None)
     made_of = None if smoother is None else smoother.config
@@ -269,14 +206,14 @@ def main(arguments: Arguments) -> dict[str, float]:
     search = config.search if config.loops else None
     block = PoseAggregationConfig(1).block
     train, validation = (StoredTrajectories(some, search, place.pair_head, block) for some in stores)
+    assert arguments.epochs is not None
     run = runs.Run(
-        arguments.runs / domain.name / f"optimizer-{arguments.form}-{arguments.iterations}-seed{arguments.seed}",
+        arguments.runs / name / f"optimizer-{arguments.form}-{arguments.iterations}-seed{arguments.seed}",
         "train_optimizer",
         arguments,
-        chosen.epochs,
-        arguments.seed,
-        best=None if recorded is None else "corrected_m",
-        data=None if recorded is None else recorded.sha256,
+        arguments.epochs,
+        best="corrected_m",
+        data=source.sha256,
         settings={
             "loss_scale": domain.loss_scale,
             "search": dataclasses.asdict(search) if search is not None else None,
@@ -288,23 +225,21 @@ def main(arguments: Arguments) -> dict[str, float]:
         fresh = NeuralGraphOptimizer(config_of(arguments, domain, correction_scale(train), made_of))
         optimizer = fresh.with_smoother(smoother)
     training = OptimizerTraining(arguments, optimizer, domain, place.config.registration)
-    few = recorded is not None
-    data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
+    few = source.recorded is not None
+    data = stretch_data(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)
     metrics = run.validate(training, data)
     if not run.is_first:
         return {}
-    details = {**about, **smooths, "training": run.finish(metrics), "metrics": {"validation": metrics}}
-    print("validation", {name: round(value, 4) for name, value in metrics.items()})
-    without = min(metrics[name] for name in ("odometry_m", "smoothed_m") if name in metrics)
-    if recorded is not None and metrics["corrected_m"] > (1.0 - _LEAST_GAIN) * without:
+    details = {**about, **smooths, **run.ended(metrics)}
+    without = min(metrics[of] for of in ("odometry_m", "smoothed_m") if of in metrics)
+    if few and metrics["corrected_m"] > (1.0 - _LEAST_GAIN) * without:
         why = (
             f"on the validation part the corrected path ({metrics['corrected_m']:.3f} m) is not {_LEAST_GAIN:.0%} "
             f"better than the odometry ({without:.3f} m): record more, with more places seen again"
         )
         return {**metrics, **_without_loops(arguments, domain, about, why)}
-    path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
-    save_checkpoint(path, optimizer.cpu(), OPTIMIZER, domain.name, details)
+    save_weights(arguments.out / name, optimizer.cpu(), OPTIMIZER, details)
     return metrics
 
 
@@ -328,8 +263,7 @@ def _without_loops(arguments: Arguments, domain: Domain, about: dict[str, Any], 
     aggregation = config_of(arguments, domain, (1.0, 1.0, 1.0)).aggregation
     optimizer = NeuralGraphOptimizer(NeuralGraphOptimizerConfig.paper_form(aggregation, iterations=1))
     details = {NO_LOOPS: why, **about, "training": records.record("train_optimizer", arguments), "metrics": {}}
-    path = arguments.out / domain.name / f"{OPTIMIZER}.safetensors"
-    save_checkpoint(path, optimizer, OPTIMIZER, domain.name, details)
+    save_weights(arguments.out / domain.name, optimizer, OPTIMIZER, details)
     return {}
 
 

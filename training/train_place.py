@@ -10,32 +10,25 @@ continue after a stop.
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-import lightning
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import IterableDataset
 
-from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
+from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.place_encoder import PlaceConfig
 from training.common import records, runs
 from training.common.command_line import run_command
+from training.common.training import Figures, Training, save_weights
 from training.data.batches import Batch, Share
 from training.data.data_module import StreamedData
 from training.data.data_source import Domain
 from training.data.streams import PlaceStream
-from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.recordings.recording_source import (
-    NO_LOOPS,
-    RecordedData,
-    SourceArguments,
-    open_recorded,
-    trained_local,
-)
+from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS, World
+from training.recordings.recording_source import NO_LOOPS, SourceArguments, open_source, trained_local
 from training.recordings.recording_streams import RecordedPlaces
 
 
@@ -43,29 +36,16 @@ from training.recordings.recording_streams import RecordedPlaces
 class Arguments(SourceArguments):
     """Settings of a training of the place encoder."""
 
-    width: float = 0.19
-    """Channels of the convolutions, as a fraction of FlowNetS's."""
-    epochs: int = 10
-    """Passes of new data."""
-    batches: int = 256
-    """Batches in an epoch, of all processes; of recordings with few places less."""
-    pairs_a_maze: int = 24
-    """Pairs of frames from each of the 8 mazes of a batch; of recordings 8 times as many from one."""
-    learning_rate: float = 1.5e-3
-    """Highest learning rate of the one-cycle schedule."""
-    validation_batches: int = 16
-    """Batches of the validation split that each epoch is measured on."""
-    workers: int = 1
-    """Processes that simulate for each one that trains."""
-    seed: int = 0
-    """Seed of the initial weights."""
-    out: Path = records.WEIGHTS
-    """Folder that gets NAME/place_encoder.safetensors."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of checkpoints and logs."""
+    width: float = 0.19  # Channels of the convolutions, as a fraction of FlowNetS's.
+    epochs: int = 10  # Passes of new data.
+    batches: int = 256  # Batches in an epoch, of all processes; of recordings with few places less.
+    pairs_a_maze: int = 24  # Pairs of frames from each of the 8 mazes of a batch; 8 times as many from one recording.
+    learning_rate: float = 1.5e-3  # Highest learning rate of the one-cycle schedule.
+    validation_batches: int = 16  # Batches of the validation split that each epoch is measured on.
+    workers: int = 1  # Processes that simulate for each one that trains.
 
 
-class PlaceTraining(lightning.LightningModule):
+class PlaceTraining(Training):
     """Symmetric InfoNCE between the two frames of each place, and the pair head's likelihood and same-place loss.
 
     Frames of a maze that lie near each other without being a pair count neither for nor against. Where codes hold
@@ -73,10 +53,11 @@ class PlaceTraining(lightning.LightningModule):
     """
 
     BRIGHTNESS = 0.15
+    weight_decay = 1e-3
 
     def __init__(self, arguments: Arguments, domain: Domain, networks: PlaceNetworks) -> None:
-        super().__init__()
-        self.arguments, self.domain, self.networks = arguments, domain, networks
+        super().__init__(arguments)
+        self.domain, self.networks, self.seed = domain, networks, arguments.seed
         self.log_temperature = nn.Parameter(torch.tensor(2.5))
 
     def forward(self, batch: Batch, augment: bool) -> dict[str, Tensor]:
@@ -131,41 +112,18 @@ class PlaceTraining(lightning.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         # The brightness of the pictures is random: a resumed training must draw what an unbroken one would have drawn.
-        torch.manual_seed((self.arguments.seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
+        torch.manual_seed((self.seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         figures = self(batch, augment=True)
-        self.log_dict(figures, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
-        return figures["loss"]
+        return figures["loss"], figures
 
-    def validation_step(self, batch: Batch, _: int) -> None:
-        with torch.autocast(self.device.type, enabled=False):  # in the arithmetic of the estimator
-            figures = self(batch, augment=False)
-        self.log_dict(
-            {f"validation_{k}": v for k, v in figures.items()},
-            on_epoch=True,
-            prog_bar=True,
-            batch_size=len(batch["a"]),
-            sync_dist=True,
-        )
-
-    def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-3)
-        return runs.one_cycle(optimizer, self.trainer)
-
-
-class Places(Protocol):
-    """A source of pairs of frames of one place."""
-
-    def pairs(self, epoch: int, share: Share) -> IterableDataset[Batch]:
-        """The pairs of an epoch, for one of the processes that train together."""
-
-    def validation(self) -> list[Batch]:
-        """The validation pairs of each epoch."""
+    def figures(self, batch: Batch) -> Figures:
+        return {f"validation_{name}": value for name, value in self(batch, augment=False).items()}
 
 
 class SimulatedPlaces:
-    """Pairs from the mazes of a world."""
+    """Pairs from the mazes of a world, in the form of ``RecordedPlaces``."""
 
     def __init__(self, arguments: Arguments, world: World) -> None:
         self.arguments, self.world = arguments, world
@@ -185,31 +143,30 @@ def main(arguments: Arguments) -> dict[str, float]:
 
     There are none where recordings hold too few places.
     """
-    recorded: RecordedData | None = None
-    if arguments.world is None:
-        local = trained_local(arguments.out, arguments.recordings.name)
-        recorded = open_recorded(arguments.recordings, arguments.runs, local)
-    places: Places
-    if recorded is None:
-        world = world_named(str(arguments.world))
-        domain: Domain = world
-        places = SimulatedPlaces(arguments, world)
-    else:
-        domain = recorded.domain
-        found = RecordedPlaces(recorded, arguments.batches, 8 * arguments.pairs_a_maze, arguments.validation_batches)
-        places = found
-        if found.too_few is not None:
-            _write_untrained(arguments, recorded, found.too_few)
+    source = open_source(arguments, None if arguments.world else trained_local(arguments.out, arguments.name))
+    domain, out = source.domain, arguments.out / arguments.name
+    settings: dict[str, Any] | None = None
+    places: SimulatedPlaces | RecordedPlaces
+    if isinstance(domain, World):
+        places, settings = SimulatedPlaces(arguments, domain), settings_of(domain)
+    elif source.recorded is not None:
+        a = arguments
+        places = RecordedPlaces(source.recorded, a.batches, 8 * a.pairs_a_maze, a.validation_batches)
+        if places.too_few is not None:
+            # The encoder as it was, which the estimator needs to run, and which tells the optimizer to close no loops.
+            print(f"places are not learned: {places.too_few}")
+            networks, begun = initial_networks(arguments, domain)
+            entries = {"training": {**records.record("train_place", arguments), **begun}, "metrics": {}}
+            save_weights(out, networks, PLACE, {NO_LOOPS: places.too_few, **entries, **source.about})
             return {}
     run = runs.Run(
         arguments.runs / domain.name / "place",
         "train_place",
         arguments,
         arguments.epochs,
-        arguments.seed,
-        best=None if recorded is None else "validation_loss",
-        data=None if recorded is None else recorded.sha256,
-        settings=settings_of(world) if recorded is None else None,
+        best="validation_loss",
+        data=source.sha256,
+        settings=settings,
     )
     networks, begun = initial_networks(arguments, domain)
     training = PlaceTraining(arguments, domain, networks)
@@ -221,11 +178,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     with torch.no_grad():
         figures = [training(batch, augment=False) for batch in data.validation]
     metrics = {name: float(torch.stack([f[name] for f in figures]).mean()) for name in figures[0]} if figures else {}
-    about = {} if recorded is None else {"data": recorded.about}
-    details = {"training": {**run.finish(metrics), **begun}, **about, "metrics": {"validation": metrics}}
-    path = arguments.out / domain.name / f"{PLACE}.safetensors"
-    save_checkpoint(path, training.networks, PLACE, domain.name, details)
-    print("validation", {name: round(value, 4) for name, value in metrics.items()})
+    save_weights(out, networks, PLACE, {**run.ended(metrics, begun), **source.about})
     return metrics
 
 
@@ -261,16 +214,6 @@ def initial_networks(arguments: Arguments, domain: Domain) -> tuple[PlaceNetwork
             f"{domain.registration}, that of {domain.name}"
         )
     return networks.requires_grad_(True).train(), {"began_with_sha256": description["sha256"]}
-
-
-def _write_untrained(arguments: Arguments, recorded: RecordedData, why: str) -> None:
-    """The encoder as it was, which the estimator needs to run, and which tells the optimizer to close no loops."""
-    print(f"places are not learned: {why}")
-    networks, begun = initial_networks(arguments, recorded.domain)
-    training = {**records.record("train_place", arguments), **begun}
-    details = {NO_LOOPS: why, "training": training, "data": recorded.about, "metrics": {}}
-    path = arguments.out / recorded.domain.name / f"{PLACE}.safetensors"
-    save_checkpoint(path, networks, PLACE, recorded.domain.name, details)
 
 
 if __name__ == "__main__":

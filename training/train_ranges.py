@@ -11,18 +11,20 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import trange
+from torch.optim.lr_scheduler import OneCycleLR
 
-from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint
+from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place
 from ngo_estimator.networks.place_encoder import SeenRanges
 from training.common import records
 from training.common.command_line import run_command
+from training.common.training import descend, save_weights
 from training.data.doom_drives import doom_episodes
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS
 
@@ -34,7 +36,6 @@ _SMALLEST_M, _LARGEST_M = 0.05, 140.0
 _BRIGHTNESS = 0.15
 _WEIGHT_DECAY = 1e-2
 """Of little variety heads learn the maps by heart: with a tenth of it, ranges of other maps were 21.4 % off, not 20."""
-_OWN = ("format", "network", "world", "sha256", "config")  # of a description, which each file has of its own
 
 Frames = tuple[Tensor, Tensor]
 """Images ``(n, height, width, channels)``, and the ranges of each ``(n, rays)`` (m)."""
@@ -44,24 +45,15 @@ Frames = tuple[Tensor, Tensor]
 class Arguments:
     """Settings of a training of ranges."""
 
-    from_weights: Path = records.WEIGHTS / "maze3d"
-    """Folder with a place encoder that sees ranges."""
-    drives: int = 400
-    """Drives to learn from, half of them on training maps."""
-    frames: int = 1000
-    """Frames of a drive."""
-    every: int = 5
-    """One frame of so many is learned from."""
-    steps: int = 4200
-    """Steps of the optimiser."""
-    batch_size: int = 128
-    """Frames in a step."""
-    learning_rate: float = 1.5e-3
-    """Highest learning rate; it falls to zero."""
-    seed: int = 0
-    """Seed of the order of the data."""
-    weights: Path = records.WEIGHTS
-    """Folder with doom/place_encoder.safetensors, which is written anew."""
+    from_weights: Path = records.WEIGHTS / "maze3d"  # Folder with a place encoder that sees ranges.
+    drives: int = 400  # Drives to learn from, half of them on training maps.
+    frames: int = 1000  # Frames of a drive.
+    every: int = 5  # One frame of so many is learned from.
+    steps: int = 4200  # Steps of the optimiser.
+    batch_size: int = 128  # Frames in a step.
+    learning_rate: float = 1.5e-3  # Highest learning rate; it falls to zero.
+    seed: int = 0  # Seed of the order of the data.
+    weights: Path = records.WEIGHTS  # Folder with doom/place_encoder.safetensors, which is written anew.
 
 
 class Watch:
@@ -119,22 +111,18 @@ def learn(networks: PlaceNetworks, frames: Frames, arguments: Arguments) -> None
     images, ranges = frames
     encoder = networks.encoder.requires_grad_(False)
     head = encoder.ranges.requires_grad_(True).train()
-    optimizer = torch.optim.AdamW(head.parameters(), lr=arguments.learning_rate, weight_decay=_WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, arguments.learning_rate, arguments.steps, pct_start=0.05, cycle_momentum=False
-    )
-    for step in trange(arguments.steps, desc="ranges"):
+
+    def loss(step: int) -> Tensor:
         chosen = torch.randint(len(images), (arguments.batch_size,))
         image, target = images[chosen], ranges[chosen]
         if step % 2:
             image, target = image.flip(-2), target.flip(-1)
         gain = 1.0 + _BRIGHTNESS * (2.0 * torch.rand(len(image), 1, 1, 1) - 1.0)
-        likelihood, _ = loss_of(head(encoder.early((image * gain).clamp(0, 255).to(torch.uint8))), target)
-        optimizer.zero_grad()
-        likelihood.mean().backward()
-        torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
+        return loss_of(head(encoder.early((image * gain).clamp(0, 255).to(torch.uint8))), target)[0].mean()
+
+    rate, steps = arguments.learning_rate, arguments.steps
+    schedule = partial(OneCycleLR, max_lr=rate, total_steps=steps, pct_start=0.05, cycle_momentum=False)
+    descend(head.parameters(), loss, steps, schedule, largest_norm=1.0, lr=rate, weight_decay=_WEIGHT_DECAY)
     networks.eval().requires_grad_(False)
 
 
@@ -164,9 +152,8 @@ def main(arguments: Arguments) -> dict[str, float]:
     first = OPTIMIZER_TRAIN_SEEDS[_FIRST_SEED]
     learn(networks, driven(range(first, first + arguments.drives), arguments, networks), arguments)
     metrics = measured(networks, driven(VALIDATION_SEEDS[:16], arguments, networks))
-    kept = {name: value for name, value in described.items() if name not in _OWN}
     about = {**records.record("train_ranges", arguments), "began_with_sha256": began["sha256"], "metrics": metrics}
-    save_checkpoint(folder / f"{PLACE}.safetensors", networks, PLACE, "doom", {**kept, "ranges": about})
+    save_weights(folder, networks, PLACE, {**records.kept_details(described), "ranges": about})
     print("validation", {name: round(value, 4) for name, value in metrics.items()})
     return metrics
 

@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor
 
-from ngo_estimator.checkpoint import LOCAL, SMOOTHER, load_local, load_place, load_smoother, save_checkpoint
+from ngo_estimator.checkpoint import LOCAL, SMOOTHER, load_local, load_place, load_smoother
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
@@ -28,12 +27,12 @@ from training.common import records, runs
 from training.common.command_line import run_command
 from training.common.precision import Precision
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, windows_within
+from training.common.training import Figures, Training, save_weights
 from training.data.batches import Batch
 from training.data.data_source import MIRRORED_STORE, TRAIN_STORE
 from training.data.feature_store import training_stores
-from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
-from training.data.worlds import world_named
-from training.recordings.recording_source import RecordedData, SourceArguments, open_recorded
+from training.data.trajectories import StoredTrajectories, correction_scale, rmse_figures, stretch_data
+from training.recordings.recording_source import SourceArguments, open_source
 from training.train_local import lasting_deviation
 
 ERROR_WINDOWS = (1, 4, 16)
@@ -42,44 +41,32 @@ ERROR_WINDOWS = (1, 4, 16)
 _STORES = (TRAIN_STORE,)  # another driver's ways cost more on the first one's than they are worth
 _BLOCK = PoseAggregationConfig(1).block
 _LARGEST_OF_MEMORY = 2.0  # a robot that slides along a wall moves sideways faster than it usually does
-_OWN = ("format", "network", "world", "sha256", "config")  # of a description, which each file has of its own
 
 
 @dataclass(frozen=True)
 class Arguments(SourceArguments):
     """Settings of a training of the odometry smoother."""
 
-    memory: bool = False
-    """Whether it sees earlier steps alone, and becomes the memory of the local network."""
-    epochs: int = 300
-    """Epochs; the learning rate falls to zero over all of them."""
-    steps: int = 40
-    """Steps of the optimiser in an epoch; of recordings at most one for each stretch, or eight."""
-    batch_size: int = 8
-    """Trajectories in a step."""
-    learning_rate: float = 3e-3
-    """Highest learning rate."""
-    seed: int = 0
-    """Seed of initial weights and of the order of the data."""
-    precision: Precision = field(default="32-true", kw_only=True)
-    """Arithmetic of the network."""
-    weights: Path = records.WEIGHTS
-    """Folder with NAME's local network and place encoder, of which the features are."""
-    out: Path = records.WEIGHTS
-    """Folder that gets NAME/odometry_smoother.safetensors, or the local network with its memory."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of the feature stores, checkpoints and logs."""
+    memory: bool = False  # Whether it sees earlier steps alone, and becomes the memory of the local network.
+    epochs: int = 300  # Epochs; the learning rate falls to zero over all of them.
+    steps: int = 40  # Steps of the optimiser in an epoch; of recordings at most one for each stretch, or eight.
+    batch_size: int = 8  # Trajectories in a step.
+    learning_rate: float = 3e-3  # Highest learning rate.
+    precision: Precision = field(default="32-true", kw_only=True)  # Arithmetic of the network.
+    weights: Path = records.WEIGHTS  # Folder with NAME's local network and place encoder, of which the features are.
 
 
-class SmootherTraining(lightning.LightningModule):
+class SmootherTraining(Training):
     """Errors of smoothed steps and meta-poses; on the validation split, errors of whole trajectories by odometry.
 
     ``step_std`` and ``meta_std`` (m, m, rad) are the errors of steps and meta-poses that are not smoothed.
     """
 
+    weight_decay = 1e-3
+
     def __init__(self, arguments: Arguments, smoother: OdometrySmoother, step_std: Tensor, meta_std: Tensor) -> None:
-        super().__init__()
-        self.arguments, self.smoother = arguments, smoother
+        super().__init__(arguments)
+        self.smoother = smoother
         self.register_buffer("step_std", step_std, persistent=False)
         self.register_buffer("meta_std", meta_std, persistent=False)
         self.step_std: Tensor
@@ -88,20 +75,14 @@ class SmootherTraining(lightning.LightningModule):
     def forward(self, batch: Batch) -> Any:
         return self.smoother(batch["relative"], batch["log_std"], batch["motion"])
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         relative, log_std = self(batch)
         loss = smoothing_loss(relative, log_std, batch["truth"], self.step_std, self.meta_std)
-        self.log("loss", loss, on_step=False, on_epoch=True, prog_bar=True, sync_dist=True)
-        return loss
+        return loss, {"loss": loss}
 
-    def validation_step(self, batch: Batch, _: int) -> None:
-        for name, relative in (("odometry", batch["relative"]), ("smoothed", self(batch)[0])):
-            figures = rmse_figures(name, se2.r2g(relative), batch["truth"])
-            self.log_dict(figures, on_epoch=True, prog_bar=True, batch_size=len(relative), sync_dist=True)
-
-    def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.arguments.learning_rate, weight_decay=1e-3)
-        return runs.one_cycle(optimizer, self.trainer)
+    def figures(self, batch: Batch) -> Figures:
+        odometry, smoothed = (se2.r2g(relative) for relative in (batch["relative"], self(batch)[0]))
+        return rmse_figures("odometry", odometry, batch["truth"]) | rmse_figures("smoothed", smoothed, batch["truth"])
 
 
 def smoothing_loss(relative: Tensor, log_std: Tensor, truth: Tensor, step_std: Tensor, meta_std: Tensor) -> Tensor:
@@ -124,55 +105,47 @@ def smoothing_loss(relative: Tensor, log_std: Tensor, truth: Tensor, step_std: T
 
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, write the weights, and return the validation metrics (in the first process, which does so)."""
-    name = arguments.world or arguments.recordings.name
-    folder = arguments.weights / name
-    local, local_description = load_local(folder, name)
+    name = arguments.name
+    folder, out = arguments.weights / name, arguments.out / name
+    local, described = load_local(folder, name)
     if arguments.memory and local.config.memory is not None:
         raise records.RunError(
             f"the local network in {folder} has a memory already; expected one as train_local wrote it"
         )
-    recorded: RecordedData | None = None
-    if arguments.world is None:
-        recorded = open_recorded(arguments.recordings, arguments.runs, (local, local_description))
-    domain = world_named(name) if recorded is None else recorded.domain
-    place, place_description = load_place(folder, domain.name)
-    features = arguments.runs / domain.name / "features"
-    mirrored = (features / MIRRORED_STORE).exists()
-    learned_from = (*_STORES, MIRRORED_STORE) if mirrored else _STORES
-    stores = training_stores(features, learned_from, domain, local_description, place_description)
+    source = open_source(arguments, (local, described))
+    place, of_place = load_place(folder, name)
+    features = arguments.runs / name / "features"
+    learned_from = (*_STORES, MIRRORED_STORE) if (features / MIRRORED_STORE).exists() else _STORES
+    stores = training_stores(features, learned_from, source.domain, described, of_place)
     train, validation = (StoredTrajectories(some, None, place.pair_head, _BLOCK) for some in stores)
-    made_with = {"local_pose_network_sha256": local_description["sha256"]}
+    made_with = {"local_pose_network_sha256": described["sha256"]}
     run = runs.Run(
-        arguments.runs / domain.name / f"{'memory' if arguments.memory else 'smoother'}-seed{arguments.seed}",
+        arguments.runs / name / f"{'memory' if arguments.memory else 'smoother'}-seed{arguments.seed}",
         "train_smoother",
         arguments,
         arguments.epochs,
-        arguments.seed,
-        best=None if recorded is None else "smoothed_m",
-        data=None if recorded is None else recorded.sha256,
+        best="smoothed_m",
+        data=source.sha256,
         settings={"error_windows": ERROR_WINDOWS, "stores": learned_from, "trajectories": len(train), **made_with},
     )
     scales = (torch.tensor(correction_scale(train, steps)) for steps in (1, train.block))
     smoother, begun = initial_smoother(arguments, local.config)
     training = SmootherTraining(arguments, smoother, *scales)
-    data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, recorded is not None)
+    few = source.recorded is not None
+    data = stretch_data(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)
     metrics = run.validate(training, data)
     if not run.is_first:
         return {}
     smoother.cpu()
-    about: dict[str, Any] = {"training": {**run.finish(metrics), **begun}, "metrics": {"validation": metrics}}
+    details = {**made_with, **run.ended(metrics, begun)}
     if arguments.memory:
-        lasting = 1 if recorded is not None else world_named(name).deviation_steps
+        lasting = source.domain.deviation_steps
         remembering = with_memory(local, smoother, data.validation, lasting)
-        of_memory = {**made_with, **about, "deviation_steps": lasting}
-        details = {k: v for k, v in local_description.items() if k not in _OWN} | {"memory": of_memory}
-        save_checkpoint(arguments.out / domain.name / f"{LOCAL}.safetensors", remembering, LOCAL, domain.name, details)
+        of_memory = {"memory": {**details, "deviation_steps": lasting}}
+        save_weights(out, remembering, LOCAL, records.kept_details(described) | of_memory)
     else:
-        details = {**made_with, **({} if recorded is None else {"data": recorded.about}), **about}
-        path = arguments.out / domain.name / f"{SMOOTHER}.safetensors"
-        save_checkpoint(path, smoother, SMOOTHER, domain.name, details, half=True)
-    print("validation", {name: round(value, 4) for name, value in metrics.items()})
+        save_weights(out, smoother, SMOOTHER, {**details, **source.about}, half=True)
     return metrics
 
 

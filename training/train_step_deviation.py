@@ -16,15 +16,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.optim.lr_scheduler import OneCycleLR
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import save_checkpoint
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.networks.step_deviation import StepDeviation
 from ngo_estimator.networks.step_scaling import STEP_DEVIATION, StepDeviationConfig
 from training.common import records
 from training.common.command_line import run_command
+from training.common.training import descend, save_weights
 from training.data.lidar_steps import KeySteps, building_steps, log_steps
 from training.data.step_windows import WINDOWS, StepWindows, figures, negative_log_likelihood, windows_of
 
@@ -45,24 +47,15 @@ class Arguments:
 
     buildings: int = 10
     """Buildings to train on, and again so many with rooms that repeat; validation takes half of each number."""
-    without_wheels: int = 5
-    """How many more of each are driven without wheels."""
-    length_m: float = 160.0
-    """Way in each building."""
-    logs: tuple[Path, ...] = ()
-    """CARMEN logs with a mapper's poses to train on, beside the buildings."""
-    log_share: int = 3
-    """How often a log's stretches count."""
-    steps: int = 1200
-    """Steps of the optimiser."""
-    learning_rate: float = 1e-2
-    """Highest learning rate."""
-    seed: int = 0
-    """Seed of initial weights and of the order of the data."""
-    out: Path = records.WEIGHTS
-    """Folder that gets scan/step_deviation.safetensors."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of stored steps."""
+    without_wheels: int = 5  # How many more of each are driven without wheels.
+    length_m: float = 160.0  # Way in each building.
+    logs: tuple[Path, ...] = ()  # CARMEN logs with a mapper's poses to train on, beside the buildings.
+    log_share: int = 3  # How often a log's stretches count.
+    steps: int = 1200  # Steps of the optimiser.
+    learning_rate: float = 1e-2  # Highest learning rate.
+    seed: int = 0  # Seed of initial weights and of the order of the data.
+    out: Path = records.WEIGHTS  # Folder that gets scan/step_deviation.safetensors.
+    runs: Path = records.ROOT / "runs"  # Folder of stored steps.
 
 
 Data = dict[int, StepWindows]
@@ -94,7 +87,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         "training": {**records.record("train_step_deviation", arguments), "seconds": round(time.monotonic() - began)},
         "metrics": {"validation": metrics},
     }
-    save_checkpoint(arguments.out / WORLD / f"{STEP_DEVIATION}.safetensors", network, STEP_DEVIATION, WORLD, details)
+    save_weights(arguments.out / WORLD, network, STEP_DEVIATION, details)
     print("validation", {name: round(value, 3) for name, value in metrics.items()})
     return metrics
 
@@ -126,20 +119,18 @@ def fitted(data: Data, arguments: Arguments) -> tuple[StepDeviation, float]:
     torch.manual_seed(arguments.seed)
     random = np.random.default_rng(arguments.seed)
     network = StepDeviation(StepDeviationConfig())
-    optimizer = torch.optim.AdamW(network.parameters(), lr=arguments.learning_rate, weight_decay=1e-3)
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, arguments.learning_rate, total_steps=arguments.steps)
-    losses = []
-    for _ in tqdm(range(arguments.steps), "train", unit="step"):
+
+    def loss_of(_: int) -> Tensor:
         loss = torch.zeros(())
         for steps, windows in data.items():
             some = windows[torch.from_numpy(random.permutation(len(windows))[: _BATCH[steps]])]
             loss = loss + negative_log_likelihood(some, network(some.evidence)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        rate.step()
-        losses.append(loss.item())
-    return network, float(np.mean(losses[-max(1, arguments.steps // 10) :]))
+        return loss
+
+    rate, steps = arguments.learning_rate, arguments.steps
+    schedule = partial(OneCycleLR, max_lr=rate, total_steps=steps)
+    losses = descend(network.parameters(), loss_of, steps, schedule, lr=rate, weight_decay=1e-3)
+    return network, float(np.mean(losses[-max(1, steps // 10) :]))
 
 
 def _stored(folder: Path, name: str, make: Callable[[], KeySteps]) -> KeySteps:

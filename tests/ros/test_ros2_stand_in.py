@@ -20,10 +20,10 @@ TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 from ros2_stand_in import cli  # noqa: E402
-from ros2_stand_in.errors import CommandError  # noqa: E402
-from ros2_stand_in.message_text import echo_text, message_class, message_to_yaml, select_field  # noqa: E402
-from ros2_stand_in.parameters import parse_value  # noqa: E402
-from ros2_stand_in.topics import RateWindow  # noqa: E402
+from ros2_stand_in.cli import CommandError  # noqa: E402
+from ros2_stand_in.graph import interface  # noqa: E402
+from ros2_stand_in.services import parse_value  # noqa: E402
+from ros2_stand_in.topics import RateWindow, echo_text  # noqa: E402
 
 ROS2 = TOOLS / "ros2"
 TIMEOUT_S = 60.0
@@ -144,44 +144,44 @@ def test_run_says_what_is_not_there(prefix: Path, package: str, executable: str,
 
 def test_a_message_is_printed_as_yaml_in_block_style() -> None:
     header = Header(stamp=Time(sec=1, nanosec=2), frame_id="odom")
-    assert echo_text(header, None, 128) == "stamp:\n  sec: 1\n  nanosec: 2\nframe_id: odom\n---"
-    assert echo_text(Header(), None, 128).splitlines()[-2] == "frame_id: ''"
-    assert message_to_yaml(Header(frame_id="größe")).splitlines()[-1] == "frame_id: größe"
+    assert echo_text(header) == "stamp:\n  sec: 1\n  nanosec: 2\nframe_id: odom\n---"
+    assert echo_text(Header()).splitlines()[-2] == "frame_id: ''"
+    assert echo_text(Header(frame_id="größe")).splitlines()[-2] == "frame_id: größe"
 
 
 def test_arrays_of_every_kind_are_lists_and_end_with_dots_past_the_limit() -> None:
     message = RelativePose(
         covariance=np.arange(9.0), motion_feature=[0.5, 1.5], place_code=np.ones(200, dtype=np.float32).tolist()
     )
-    text = message_to_yaml(message, truncate_length=128)
+    text = echo_text(message, truncate_length=128)
     assert "covariance:\n- 0.0\n- 1.0\n" in text
     assert "motion_feature:\n- 0.5\n- 1.5\n" in text
     assert "- 1.0\n- '...'\nunlikeness: 0.0\nfrom_place_code: []\n" in text
     assert text.count("\n- 1.0") == 128 + 1
-    assert message_to_yaml(message, truncate_length=None).count("\n- 1.0") == 200 + 1
-    empty = message_to_yaml(RelativePose())
+    assert echo_text(message).count("\n- 1.0") == 200 + 1
+    empty = echo_text(RelativePose())
     assert "motion_feature: []\nplace_code: []\nunlikeness: 0.0\nfrom_place_code: []\n" in empty
 
 
 def test_messages_within_arrays_are_printed_in_full() -> None:
-    path = message_class("nav_msgs/msg/Path")(poses=[PoseStamped()])
-    lines = message_to_yaml(path).splitlines()
+    path = interface("nav_msgs/msg/Path", "msg")(poses=[PoseStamped()])
+    lines = echo_text(path).splitlines()
     assert lines[5:8] == ["poses:", "- header:", "    stamp:"]
 
 
 def test_a_field_is_a_message_a_number_or_an_array() -> None:
     message = PoseWithCovariance()
     message.pose.position.x = 2.5
-    assert echo_text(message, "pose.position", 128) == "x: 2.5\ny: 0.0\nz: 0.0\n---"
-    assert echo_text(message, "pose.position.x", 128) == "2.5\n---"
+    assert echo_text(message, "pose.position") == "x: 2.5\ny: 0.0\nz: 0.0\n---"
+    assert echo_text(message, "pose.position.x") == "2.5\n---"
     with pytest.raises(CommandError, match=r"Invalid field 'pose\.speed'"):
-        select_field(message, "pose.speed")
+        echo_text(message, "pose.speed")
 
 
 @pytest.mark.parametrize("name", ["Header", "std_msgs/Header", "std_msgs/msg/Nothing", "nothing/msg/Header", "//"])
 def test_a_wrong_type_name_is_refused(name: str) -> None:
     with pytest.raises(CommandError, match="invalid"):
-        message_class(name)
+        interface(name, "msg")
 
 
 # Rates

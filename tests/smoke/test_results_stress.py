@@ -3,6 +3,7 @@
 import gzip
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from ngo_sim.building2d import Building2d
 from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.lidar import ScannerConfig
 from training import results_stress
+from training.data import building_drives
 from training.data.lidar_changes import CHANGES
 from training.results_stress import Arguments
 from training.scoring import stress_cells
@@ -63,7 +65,7 @@ def test_results_of_a_toy_log(
     assert "people" not in table
     ours = table["scans_bunched"]["ours"]
     numbers = {"translation_m", "rotation_deg", "over_30_s_m", "at_scans_m", "at_scans_deg"}
-    assert numbers | {"best_possible_m", "best_possible_deg", "scans_per_s", "seeds"} == set(ours)
+    assert numbers | {"best_possible_m", "best_possible_deg", "relations", "scans_per_s", "seeds"} == set(ours)
     assert set(ours["seeds"]) == {"0", "1"} and set(table["half_covered"]["ours"]["seeds"]) == {"0"}
     assert ours["translation_m"] == pytest.approx(np.mean([one["translation_m"] for one in ours["seeds"].values()]))
     assert 0.0 < table["clean"]["ours"]["translation_m"] < 0.1 < table["scans_bunched"]["wheels"]["translation_m"]
@@ -71,7 +73,8 @@ def test_results_of_a_toy_log(
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == (2 + 1) * len(there)  # one of the changes is the same for every seed
     page = (tmp_path / "docs" / "results_stress.md").read_text()
-    assert "## toy" in page and all(f"`{name}`" in page for name in CHANGES)
+    assert {bar["name"] for bar in result["bars"]} >= {"toy, half_covered, ours, translation_m"}
+    assert "## Bars" in page and "## toy" in page and all(f"`{name}`" in page for name in CHANGES)
 
     def no_run(*_: object) -> None:
         raise AssertionError("a cell was measured again")
@@ -82,10 +85,43 @@ def test_results_of_a_toy_log(
     assert results_stress.main(replace(arguments, logs_named=("other",)))["logs"] == result["logs"]
 
 
+@pytest.mark.timeout(600)
+def test_simulated_tables_of_one_tiny_drive_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(building_drives, "FloorPlanConfig", partial(FloorPlanConfig, scale=0.3))
+    arguments = Arguments(
+        tables=("buildings", "loops", "joins"),
+        changes=("half_covered",),
+        drives=1,
+        length=0.04,
+        split="validation",
+        out=tmp_path / "out",
+        docs=tmp_path / "docs",
+        runs=tmp_path / "runs",
+    )
+    result = results_stress.main(arguments)
+    assert json.loads((tmp_path / "out" / "stress.json").read_text()) == result
+    tables = result["tables"]
+    assert set(tables["buildings"]) == {"half_covered"}
+    ours = tables["buildings"]["half_covered"]["ours"]
+    assert ours["drives"] == 1 and 0.0 < ours["ate_m"] < 0.5 and 0.0 <= ours["within_three_deviations"] <= 1.0
+    assert tables["loops"]["poor_wheels"]["wheels"]["largest_m"] > tables["loops"]["poor_wheels"]["ours"]["largest_m"]
+    assert set(tables["joins"]) == {"aliased", "two_buildings"}
+    joins = tables["joins"]["two_buildings"]["ours"]
+    assert joins["each"]["wrong_loops"] == [joins["wrong_loops"]]
+    page = (tmp_path / "docs" / "results_stress.md").read_text()
+    assert "## Wrong joins" in page and "## A car's loop" not in page
+    again = results_stress.main(replace(arguments, tables=("joins",)))
+    assert again["tables"] == tables
+
+
 def test_names_that_do_not_exist_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="changes has wheels_square; expected among clean"):
         Arguments(logs=tmp_path, changes=("wheels_square",))
     with pytest.raises(ValueError, match="rows has gtsam_lm"):
         Arguments(logs=tmp_path, rows=("gtsam_lm",))
+    with pytest.raises(ValueError, match="the table of car needs --car"):
+        Arguments(tables=("car",))
+    with pytest.raises(ValueError, match="drives, length are 0"):
+        Arguments(logs=tmp_path, drives=0)
     with pytest.raises(ValueError, match="no log with relations"):
         results_stress.main(Arguments(logs=tmp_path))

@@ -125,6 +125,8 @@ def test_commands_are_right(page: Path) -> None:
         script = re.match(r"python -m (\w[\w.]+)|python ([\w/]+)\.py|ros2 run ngo_estimator (run_recording)", command)
         if script:
             module = script[1] or (script[2] or "").replace("/", ".") or f"ngo_estimator.nodes.{script[3]}"
+            if task := re.match(r"python -m training\.train ([a-z_]+)", command):
+                module = f"training.train_{task[1]}"
             source = source_of(module)
             flags = re.findall(r"\s--([a-z][\w-]*)", command) if source else []
             wrong += [f"{command}: {flag}" for flag in flags if flag.removeprefix("no-") not in options(source)]

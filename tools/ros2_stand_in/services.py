@@ -1,28 +1,39 @@
-"""`ros2 service list` and `call`, `ros2 lifecycle get` and `set`."""
+"""`ros2 service call`, `ros2 param` and `ros2 lifecycle`."""
 
-import importlib
+import datetime
 import sys
 from typing import Any
 
 import yaml
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.parameter import get_parameter_value
 
-from ros2_stand_in.errors import CommandError
-from ros2_stand_in.graph import call, command_node, is_hidden, poll, require_node, settle, spin_while
-from ros2_stand_in.message_text import is_message
+from ros2_stand_in.cli import CommandError
+from ros2_stand_in.graph import (
+    call,
+    command_node,
+    interface,
+    is_hidden,
+    node_names,
+    poll,
+    settle,
+    spin_while,
+)
 
-
-def service_class(type_name: str) -> Any:
-    """The class of `package/srv/Name`; CommandError where it cannot be found."""
-    parts = type_name.split("/")
-    if len(parts) == 2:
-        parts.insert(1, "srv")
-    if len(parts) != 3 or not all(parts):
-        raise CommandError("The passed service type is invalid")
-    try:
-        return getattr(importlib.import_module(".".join(parts[:-1])), parts[-1])
-    except (ImportError, AttributeError):
-        raise CommandError("The passed service type is invalid") from None
+_LABELS = {
+    1: ("Boolean value is", "bool"),
+    2: ("Integer value is", "integer"),
+    3: ("Double value is", "double"),
+    4: ("String value is", "string"),
+    5: ("Byte values are", "byte_array"),
+    6: ("Boolean values are", "bool_array"),
+    7: ("Integer values are", "integer_array"),
+    8: ("Double values are", "double_array"),
+    9: ("String values are", "string_array"),
+}
+"""Of each type of a parameter: the real command's label, and the field of its value."""
 
 
 def fill(message: Any, values: Any) -> None:
@@ -33,7 +44,7 @@ def fill(message: Any, values: Any) -> None:
         if name not in message.get_fields_and_field_types():
             raise CommandError(f"Failed to populate field: '{type(message).__name__}' object has no attribute '{name}'")
         field = getattr(message, name)
-        if is_message(field):
+        if hasattr(field, "get_fields_and_field_types"):
             fill(field, value)
             continue
         try:
@@ -42,19 +53,9 @@ def fill(message: Any, values: Any) -> None:
             raise CommandError(f"Failed to populate field: {error}") from None
 
 
-def print_services() -> int:
-    """`ros2 service list`."""
-    with command_node() as node:
-        found = settle(node, lambda: sorted(name for name, _ in node.get_service_names_and_types()))
-    for name in found:
-        if not is_hidden(name):
-            print(name)
-    return 0
-
-
 def call_service(service: str, type_name: str, values: str) -> int:
     """`ros2 service call SERVICE TYPE [VALUES]`."""
-    service_type = service_class(type_name)
+    service_type = interface(type_name, "srv")
     request = service_type.Request()
     try:
         fill(request, yaml.safe_load(values) or {})
@@ -73,32 +74,87 @@ def call_service(service: str, type_name: str, values: str) -> int:
     return 0
 
 
+def parse_value(text: str) -> ParameterValue:
+    """A value as the command line gives it: of the type that YAML takes it for, else a string."""
+    try:
+        if not isinstance(yaml.safe_load(text), (dict, datetime.date)):
+            return get_parameter_value(text)
+    except yaml.YAMLError:
+        pass
+    # No YAML, or something that no parameter can hold.
+    return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
+
+
+def _absolute(node_name: str) -> str:
+    return node_name if node_name.startswith("/") else f"/{node_name}"
+
+
+def set_parameter(node_name: str, parameter_name: str, value: str) -> int:
+    """`ros2 param set NODE PARAMETER VALUE`; the exit code is 0 also where the node refuses, as the real command's."""
+    request = SetParameters.Request(parameters=[Parameter(name=parameter_name, value=parse_value(value))])
+    with command_node() as node:
+        (result,) = call(node, SetParameters, f"{_absolute(node_name)}/set_parameters", request).results
+    reason = f": {result.reason}" if result.reason else ""
+    if result.successful:
+        print(f"Set parameter successful{reason}")
+    else:
+        print(f"Setting parameter failed{reason}", file=sys.stderr)
+    return 0
+
+
+def print_parameters(node_name: str | None) -> int:
+    """`ros2 param list [NODE]`."""
+    with command_node() as node:
+        names = [_absolute(node_name)] if node_name else []
+        if not node_name:
+            settle(node)
+            offered = dict(node.get_service_names_and_types())  # a node may do without parameter services
+            found = [name for name in node_names(node) if not is_hidden(name)]
+            names = [name for name in found if f"{name}/list_parameters" in offered]
+        for name in names:
+            response = call(node, ListParameters, f"{name}/list_parameters", ListParameters.Request())
+            print(
+                *([] if node_name else [f"{name}:"]), *(f"  {one}" for one in sorted(response.result.names)), sep="\n"
+            )
+    return 0
+
+
+def print_parameter(node_name: str, parameter_name: str, hide_type: bool) -> int:
+    """`ros2 param get NODE PARAMETER`."""
+    request = GetParameters.Request(names=[parameter_name])
+    with command_node() as node:
+        response = call(node, GetParameters, f"{_absolute(node_name)}/get_parameters", request)
+    if not response.values or response.values[0].type == ParameterType.PARAMETER_NOT_SET:
+        raise CommandError("Parameter not set")
+    (value,) = response.values
+    label, field = _LABELS[value.type]
+    content = getattr(value, f"{field}_value")
+    print(content if hide_type else f"{label}: {content}")
+    return 0
+
+
 def print_state(node_name: str) -> int:
     """`ros2 lifecycle get NODE`."""
     with command_node() as node:
-        state = call(node, GetState, f"{require_node(node, node_name)}/get_state", GetState.Request()).current_state
-        print(f"{state.label} [{state.id}]")
+        state = call(node, GetState, f"{_absolute(node_name)}/get_state", GetState.Request()).current_state
+    print(f"{state.label} [{state.id}]")
     return 0
 
 
 def change_state(node_name: str, transition: str) -> int:
     """`ros2 lifecycle set NODE TRANSITION`, which is a label or a number."""
+    name, ask = _absolute(node_name), GetAvailableTransitions.Request()
     with command_node() as node:
-        name = require_node(node, node_name)
-        available = call(
-            node, GetAvailableTransitions, f"{name}/get_available_transitions", GetAvailableTransitions.Request()
-        ).available_transitions
-        chosen = [
-            entry.transition for entry in available if transition in (entry.transition.label, str(entry.transition.id))
-        ]
+        found = call(node, GetAvailableTransitions, f"{name}/get_available_transitions", ask).available_transitions
+        available = [entry.transition for entry in found]
+        chosen = [one for one in available if transition in (one.label, str(one.id))]
         if not chosen:
-            known = "\n".join(f"- {entry.transition.label} [{entry.transition.id}]" for entry in available)
+            known = "\n".join(f"- {one.label} [{one.id}]" for one in available)
             raise CommandError(f"Unknown transition requested, available ones are:\n{known}")
         request = ChangeState.Request(transition=chosen[0])
         # A node may load networks before it answers.
         response = call(node, ChangeState, f"{name}/change_state", request, timeout_s=60.0)
-        if not response.success:
-            print("Transitioning failed", file=sys.stderr)
-            return 1
-        print("Transitioning successful")
+    if not response.success:
+        raise CommandError("Transitioning failed")
+    print("Transitioning successful")
     return 0

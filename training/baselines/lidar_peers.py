@@ -43,10 +43,18 @@ class GraphPeerConfig:
 
 def solve_lm(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
     """Poses ``(nodes, 3)`` by Levenberg-Marquardt with Cauchy kernels, from ``start`` ``(nodes, 3)``."""
-    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(config.cauchy)
+    return solve_with(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(config.cauchy), steps, loops, start, config.robust_steps
+    )
+
+
+def solve_with(
+    kernel: Any | None, steps: RelativePoses, loops: RelativePoses, start: np.ndarray, robust_steps: bool = False
+) -> np.ndarray:
+    """Poses ``(nodes, 3)`` by Levenberg-Marquardt with one of GTSAM's kernels, or with none: least squares."""
     graph = gtsam.NonlinearFactorGraph()
     _anchor(graph, start)
-    _add(graph, steps, kernel if config.robust_steps else None)
+    _add(graph, steps, kernel if robust_steps else None)
     _add(graph, loops, kernel)
     return _poses(gtsam.LevenbergMarquardtOptimizer(graph, _values(start), _lm()).optimize())
 

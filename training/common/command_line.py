@@ -3,7 +3,7 @@
 import logging
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import tyro
@@ -15,13 +15,18 @@ from training.common.records import RunError
 Arguments = TypeVar("Arguments")
 
 
-def run_command(main: Callable[[Arguments], object], arguments: type[Arguments], description: str | None) -> None:
-    """Run ``main`` with the command line's arguments.
+def run_command(
+    main: Callable[[Arguments], object],
+    arguments: type[Arguments],
+    description: str | None,
+    flags: Sequence[str] | None = None,
+) -> None:
+    """Run ``main`` with the flags, by default the command line's.
 
     Ends with one line on stderr where recordings, weights or a run cannot be used.
     """
     quiet_framework()
-    given = tyro.cli(arguments, description=description)
+    given = tyro.cli(arguments, description=description, args=flags)
     try:
         main(given)
     except (RecordingError, CheckpointError, RunError) as error:

@@ -1,6 +1,7 @@
 """Where trainings write, and what their results record of how they were made. Without the framework of trainings."""
 
 import dataclasses
+import json
 import shlex
 import subprocess
 from collections.abc import Iterator
@@ -11,6 +12,14 @@ from ngo_common.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 WEIGHTS = ROOT / "ros_ws" / "src" / "ngo_estimator" / "weights"
+
+
+_OWN = ("format", "network", "world", "sha256", "config")
+
+
+def kept_details(description: dict[str, Any]) -> dict[str, Any]:
+    """A description of weights but for what each file has of its own: the details to write other weights with."""
+    return {name: value for name, value in description.items() if name not in _OWN}
 
 
 class RunError(ValueError):
@@ -33,6 +42,17 @@ def revision() -> str:
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return commit + ("+changes" if changes.strip() else "")
+
+
+def check_same_run(folder: Path, now: dict[str, Any], then: dict[str, Any]) -> None:
+    """Raise ``RunError`` where the run in a folder was begun with other arguments than those of now."""
+    now = json.loads(json.dumps(now))
+    if differing := sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name)):
+        given, expected = (", ".join(f"{name} {of.get(name)}" for name in differing) for of in (now, then))
+        raise RunError(
+            f"{folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, or the "
+            "folder removed to begin anew"
+        )
 
 
 def record(script: str, arguments: Any) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressB
 
 from training.common.curves import Batch, Curves, batch_size
 from training.common.precision import Precision, resolved
-from training.common.records import RunError, record, write_at_once
+from training.common.records import RunError, check_same_run, record, write_at_once
 from training.common.trainer_arguments import TrainerArguments
 
 
@@ -75,9 +75,9 @@ class Run:
     """A training in a folder of its own: ``run.json``, ``metrics.csv`` and ``last.ckpt``, and its trainer.
 
     Begun again with the same arguments, it goes on after its last whole epoch and ends as if it had not been stopped.
-    Several processes hold the same run; only the one that ``is_first`` writes. With ``best``, the name of something
-    that is logged, the weights of the epoch in which that was lowest are kept, not the last ones. ``data`` identifies
-    recordings, which count as arguments, and ``settings`` are those of the world that the training depends on.
+    Several processes hold the same run; only the one that ``is_first`` writes. ``data`` identifies recordings, which
+    count as arguments. They are small: of them the weights of the epoch with the lowest ``best``, a name that is
+    logged, are kept, not the last ones. ``settings`` are those of the world that the training depends on.
 
     Raises:
         ValueError: the folder holds a run that was begun with other arguments or settings.
@@ -89,7 +89,6 @@ class Run:
         script: str,
         arguments: TrainerArguments,
         epochs: int,
-        seed: int,
         datapoints: Callable[[Batch], int] = batch_size,
         best: str | None = None,
         data: str | None = None,
@@ -109,18 +108,9 @@ class Run:
         self._description = {**self.record, "started": _now(), "resumed": [], "state": "running"}
         self._check_arguments()
         self.curves = Curves(folder / "metrics.csv", datapoints)
-        self.best = None if best is None else BestWeights(best)
-        self.trainer = make_trainer(
-            folder,
-            epochs,
-            seed,
-            arguments.precision,
-            [SameStart(folder), self.curves, *([] if self.best is None else [self.best])],
-            accelerator=arguments.accelerator,
-            devices=arguments.devices,
-            num_nodes=arguments.num_nodes,
-            strategy=arguments.strategy,
-        )
+        self.best = None if best is None or data is None else BestWeights(best)
+        callbacks = [SameStart(folder), self.curves, *([] if self.best is None else [self.best])]
+        self.trainer = make_trainer(folder, epochs, arguments, callbacks)
         self.is_first = bool(self.trainer.is_global_zero)
         if why and self.is_first:
             print(f"precision {arguments.precision}: {why} (--precision chooses another)", flush=True)
@@ -138,17 +128,8 @@ class Run:
         if not path.exists() or resume_from(self.folder) is None:
             return
         begun = json.loads(path.read_text())
-        now, then = (
-            {**of["arguments"], **of.get("settings", {})} for of in (json.loads(json.dumps(self.record)), begun)
-        )
-        differing = sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name))
-        if differing:
-            given = ", ".join(f"{name} {now.get(name)}" for name in differing)
-            expected = ", ".join(f"{name} {then.get(name)}" for name in differing)
-            raise RunError(
-                f"{self.folder} holds a run with other arguments: given {given}; expected {expected} to go on with it, "
-                "or the folder removed to begin anew"
-            )
+        now, then = ({**of["arguments"], **of.get("settings", {})} for of in (self.record, begun))
+        check_same_run(self.folder, now, then)
         self._description = {**begun, "state": "running"}
         self._description["resumed"] = [*begun["resumed"], {"time": _now(), "revision": self.record["revision"]}]
 
@@ -172,6 +153,11 @@ class Run:
         self._write()
         return training
 
+    def ended(self, metrics: dict[str, float], begun: Mapping[str, str] | None = None) -> dict[str, Any]:
+        """Complete and print; returns the entries of the JSON beside the weights, with what they ``begun`` from."""
+        print("validation", {name: round(value, 5) for name, value in metrics.items()})
+        return {"training": {**self.finish(metrics), **(begun or {})}, "metrics": {"validation": metrics}}
+
     def _write(self) -> None:
         write_at_once(self.folder / "run.json", json.dumps(self._description, indent=2) + "\n")
 
@@ -194,21 +180,21 @@ def _now() -> str:
 
 
 def make_trainer(
-    folder: Path, epochs: int, seed: int, precision: str, callbacks: Sequence[Callback] = (), **options: Any
+    folder: Path, epochs: int, arguments: TrainerArguments, callbacks: Sequence[Callback]
 ) -> lightning.Trainer:
-    """A trainer that keeps ``metrics.csv`` and ``last.ckpt`` in ``folder`` after each epoch, and shows its progress."""
-    lightning.seed_everything(seed, workers=True)
+    """A trainer that keeps ``last.ckpt`` in ``folder`` after each epoch, and shows its progress; seeds all draws."""
+    lightning.seed_everything(arguments.seed, workers=True)
     torch.set_float32_matmul_precision("high")
     checkpoint = ModelCheckpoint(dirpath=folder, filename="last", save_top_k=1, enable_version_counter=False)
     return lightning.Trainer(
         max_epochs=epochs,
-        precision=precision,  # type: ignore[arg-type]
+        accelerator=arguments.accelerator,
+        devices=arguments.devices,
+        num_nodes=arguments.num_nodes,
+        strategy=arguments.strategy,
+        precision=arguments.precision,  # type: ignore[arg-type]
         gradient_clip_val=1.0,
-        callbacks=[
-            checkpoint,
-            *(callbacks or [Curves(folder / "metrics.csv")]),
-            TQDMProgressBar(refresh_rate=20, leave=True),
-        ],
+        callbacks=[checkpoint, *callbacks, TQDMProgressBar(refresh_rate=20, leave=True)],
         logger=False,
         reload_dataloaders_every_n_epochs=1,
         # The streams deal the training data out themselves; every process measures all of the validation data, so that
@@ -216,7 +202,6 @@ def make_trainer(
         use_distributed_sampler=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
-        **options,
     )
 
 

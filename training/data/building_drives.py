@@ -9,8 +9,9 @@ import numpy as np
 
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan, WheelPose
-from ngo_sim.building2d import Building2d
+from ngo_sim.building2d import Building2d, BuildingDrive
 from ngo_sim.floor_plans import FloorPlanConfig
+from ngo_sim.wheels import WheelsConfig
 from training.data.lidar_drives import LidarDrive, TruePoses, simulated_stamps_ns
 
 BUILDING_TEST_SEEDS = range(20_000, 30_000)
@@ -30,13 +31,53 @@ def building_drive(
 
     With ``slips_per_km`` the wheels slip so often; all else is as drawn.
     """
-    building = Building2d(FloorPlanConfig(aliased=aliased))
+    plan = FloorPlanConfig(aliased=aliased)
+    building = Building2d(plan)
     if slips_per_km is not None:
         building.reset(seed)
-        building = Building2d(
-            FloorPlanConfig(aliased=aliased), wheels=replace(building.wheels, slips_per_km=slips_per_km)
-        )
-    drive = building.record(seed, length_m, most_scans)
+        building = Building2d(plan, wheels=replace(building.wheels, slips_per_km=slips_per_km))
+    return _drive(
+        building.record(seed, length_m, most_scans),
+        f"{'aliased' if aliased else 'building'}_{seed}",
+        f"building seed {seed}, aliased {aliased}, {length_m:g} m, at most {most_scans} scans, slips {slips_per_km}",
+    )
+
+
+def poor_wheels_drive(seed: int, length_m: float, most_scans: int = 100_000) -> LidarDrive:
+    """The same with wheels that drift by as much as the building is large: uneven, slipping, freezing and jumping.
+
+    Scanners that are faster take 10 scans a second.
+    """
+    rng = np.random.default_rng((seed, 3))
+    common, apart = rng.normal(0.0, 0.03), rng.choice((-1.0, 1.0)) * rng.uniform(0.0002, 0.001)
+    wheels = WheelsConfig(
+        left_bias=float(np.clip(common + apart, -0.2, 0.2)),
+        right_bias=float(np.clip(common - apart, -0.2, 0.2)),
+        wheel_noise=0.01,
+        slips_per_km=60.0,
+        freezes_per_hour=40.0,
+        jumps_per_hour=10.0,
+        lag_s=float(rng.uniform(0.0, 0.2)),
+    )
+    building = Building2d(FloorPlanConfig())
+    building.reset(seed)
+    scanner = replace(building.scanner, scan_period_s=max(building.scanner.scan_period_s, 0.1))
+    drive = Building2d(FloorPlanConfig(), scanner, wheels).record(seed, length_m, most_scans)
+    words = f"building seed {seed}, poor wheels, {length_m:g} m, at most {most_scans} scans"
+    return _drive(drive, f"poor_wheels_{seed}", words)
+
+
+def two_buildings(seeds: tuple[int, int], length_m: float, most_scans: int = 100_000) -> tuple[LidarDrive, LidarDrive]:
+    """A drive of ``length_m`` through each of two buildings, by the scanner and the wheels that the first one draws."""
+    first = Building2d(FloorPlanConfig())
+    drives = [first.record(seeds[0], length_m, most_scans)]
+    drives.append(Building2d(FloorPlanConfig(), first.scanner, first.wheels).record(seeds[1], length_m, most_scans))
+    words = f"scanner of {seeds[0]}, {length_m:g} m, at most {most_scans} scans"
+    one, other = (_drive(d, f"building_{s}", f"building seed {s}, {words}") for d, s in zip(drives, seeds, strict=True))
+    return one, other
+
+
+def _drive(drive: BuildingDrive, name: str, identity: str) -> LidarDrive:
     scanner = drive.scanner
     increment = scanner.increment_rad * (1.0 + scanner.increment_error)
     stamps_ns = simulated_stamps_ns(drive.stamps_s)
@@ -55,11 +96,5 @@ def building_drive(
     )
     wheels = tuple(map(WheelPose, simulated_stamps_ns(drive.wheel_stamps_s).tolist(), drive.wheel_poses_xyyaw))
     pose = np.array((scanner.laser_x_m, scanner.laser_y_m, math.radians(scanner.laser_yaw_deg)))
-    return LidarDrive(
-        f"{'aliased' if aliased else 'building'}_{seed}",
-        f"building seed {seed}, aliased {aliased}, {length_m:g} m, at most {most_scans} scans, slips {slips_per_km}",
-        scans,
-        wheels,
-        Mounting(pose, scanner.upside_down),
-        TruePoses(stamps_ns, drive.true_poses_xyyaw),
-    )
+    truth = TruePoses(stamps_ns, drive.true_poses_xyyaw)
+    return LidarDrive(name, identity, scans, wheels, Mounting(pose, scanner.upside_down), truth)

@@ -11,6 +11,9 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from training.data.lidar_drives import LidarDrive, Reference, TruePoses
 
+FAR_AWAY_M = 10_000.0
+"""From one place to the next in the truth of drives that were put together."""
+
 
 @dataclass(frozen=True, eq=False)
 class SensorLog:
@@ -93,6 +96,27 @@ class SensorLog:
     def with_wheel_steps(self, steps: np.ndarray) -> SensorLog:
         """The log whose wheels go other steps ``(poses - 1, 3)`` from their first pose on."""
         return replace(self, wheel_poses=chained(np.concatenate((self.wheel_poses[:1], steps)))[1:])
+
+    def followed_by(self, other: SensorLog, pause_s: float) -> SensorLog:
+        """Both logs as one drive whose wheels go on where they were, as if the robot had been carried.
+
+        In the truth the other place lies ``FAR_AWAY_M`` from the first. Mounting and scanner are those of the first.
+        """
+        later_ns = int(self.stamps_ns[-1] - other.stamps_ns[0] + pause_s * 1e9)
+        truth = None
+        if self.true_poses is not None and other.true_poses is not None:
+            truth = np.concatenate((self.true_poses, other.true_poses + (FAR_AWAY_M, 0.0, 0.0)))
+        both = replace(
+            self,
+            stamps_ns=np.concatenate((self.stamps_ns, other.stamps_ns + later_ns)),
+            taken_ns=np.concatenate((self.taken_ns, other.taken_ns + later_ns)),
+            ranges=np.concatenate((self.ranges, other.ranges)),
+            wheel_stamps_ns=np.concatenate((self.wheel_stamps_ns, other.wheel_stamps_ns + later_ns)),
+            wheel_poses=np.concatenate((self.wheel_poses, other.wheel_poses)),
+            true_poses=truth,
+        )
+        steps = np.concatenate((self.wheel_steps, np.zeros((1, 3)), other.wheel_steps))
+        return both.with_wheel_steps(steps).in_order()
 
     @property
     def returned(self) -> np.ndarray:

@@ -70,28 +70,17 @@ class Table:
 class World(Domain):
     """A simulated world. No driver here drives backwards."""
 
-    driver: str
-    """Name of the driver wherever no other is named; smoother and optimizer learn from its trajectories."""
+    driver: str  # Name of the driver wherever no other is named; smoother and optimizer learn from its trajectories.
     training_drivers: tuple[str, ...] = ()
     """Drivers that take turns in the streams, from which all other networks learn; none: ``driver``."""
     optimizer_driver: str | None = None
     """Driver of one more trajectory for every five of ``driver``, for the optimizer alone; None: nobody."""
-    episode_frames: int
-    """Length of the paper's trajectories."""
-    rows: tuple[int, int]
-    """Range of the rows of training mazes, both ends included."""
-    extra_openings: tuple[int, int]
-    """Range of the extra openings of training mazes, both ends included."""
-    tables: dict[str, Table]
-    """The tables of results."""
-    table_trajectories: int = 64
-    """Trajectories of a table."""
-    prefixes: tuple[int, ...] = (250, 500, 750, 1000)
-    """Numbers of steps after which a table gives errors."""
-    error_windows: tuple[int, ...] = (1,)
-    """Lengths of the windows of steps over which losses sum errors: errors that last make the sum drift."""
-    deviation_steps: int = 1
-    """Number of steps over whose sums the deviations of the local network are fitted."""
+    episode_frames: int  # Length of the paper's trajectories.
+    rows: tuple[int, int]  # Range of the rows of training mazes, both ends included.
+    extra_openings: tuple[int, int]  # Range of the extra openings of training mazes, both ends included.
+    tables: dict[str, Table]  # The tables of results.
+    table_trajectories: int = 64  # Trajectories of a table.
+    prefixes: tuple[int, ...] = (250, 500, 750, 1000)  # Numbers of steps after which a table gives errors.
 
     @property
     def stream_drivers(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from training.common.records import recorded_values
 from training.common.trainer_arguments import TrainerArguments
 from training.data.batches import ACTION_HISTORY, relative_poses
 from training.data.data_source import MIRRORED_ACTIONS, Domain
-from training.data.worlds import WorldName
+from training.data.worlds import WorldName, world_named
 from training.recordings.recording_store import StoredRecording, make_store
 from training.recordings.recording_tracks import PARTS, SHORTEST, Part, Split, Track, period_s, split, tracks_of
 
@@ -39,24 +39,15 @@ _NARROW = math.radians(35.0)
 class RecordedArguments:
     """Recordings in place of a simulated world, and their use."""
 
-    data: tuple[Path, ...] = ()
-    """Recordings with ground truth: .mcap files or rosbag2 folders."""
-    name: str = "my_robot"
-    """Name of the robot: of the folders of its weights and of its run."""
-    holdout: tuple[Path, ...] = ()
-    """Recordings that are kept for the evaluation; none: the last of several, or the end of a single one."""
-    reduction: int | None = None
-    """Factor by which pictures are made smaller; none: the least that leaves at most 96 columns."""
-    place_radius_m: float | None = None
-    """Largest distance between two frames of one place; none: four fast steps, 0.3 to 1 m."""
-    heading_limit_deg: float | None = None
-    """Largest turn between two frames of one place; none: 35, or 180 for scanners that look around."""
-    scan_yaw_deg: float = 0.0
-    """Direction of a scanner's angle 0, counter-clockwise from straight ahead; give the same to the live estimator."""
-    mirror: bool = True
-    """Whether to learn also from mirror images; not for sensors that sit far to one side."""
-    from_weights: Path | None = None
-    """Folder of weights of the same sensor to start from; their sizes and search for loops stay."""
+    data: tuple[Path, ...] = ()  # Recordings with ground truth: .mcap files or rosbag2 folders.
+    name: str = "my_robot"  # Name of the robot: of the folders of its weights and of its run.
+    holdout: tuple[Path, ...] = ()  # Recordings kept for the evaluation; none: the last, or the end of a single one.
+    reduction: int | None = None  # Factor by which pictures are made smaller; none: the least for 96 columns at most.
+    place_radius_m: float | None = None  # Largest distance of two frames of one place; none: 4 fast steps, 0.3 to 1 m.
+    heading_limit_deg: float | None = None  # Largest turn between them; none: 35, or 180 for scanners that look around.
+    scan_yaw_deg: float = 0.0  # Direction of a scanner's angle 0, counter-clockwise from ahead; as when it runs live.
+    mirror: bool = True  # Whether to learn also from mirror images; not for sensors that sit far to one side.
+    from_weights: Path | None = None  # Folder of weights of the same sensor to start from; their sizes stay.
     topics: Annotated[TopicArguments, tyro.conf.arg(name="")] = field(default_factory=TopicArguments)
 
     def __post_init__(self) -> None:
@@ -75,16 +66,24 @@ class RecordedArguments:
 
 
 @dataclass(frozen=True)
-class SourceArguments(TrainerArguments):
-    """Arguments of a training on a simulated world or on recordings."""
+class DataArguments:
+    """Where data come from: a simulated world, or recordings."""
 
-    world: WorldName | None = None
-    """World to train for."""
+    world: WorldName | None = None  # World to train for.
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
-    """Recordings to train on instead."""
 
     def __post_init__(self) -> None:
         check_source(self.world, self.recordings)
+
+    @property
+    def name(self) -> str:
+        """Name of the world or the robot, and of its folders."""
+        return self.world or self.recordings.name
+
+
+@dataclass(frozen=True)
+class SourceArguments(DataArguments, TrainerArguments):
+    """Arguments of a training on a simulated world or on recordings."""
 
 
 def check_source(world: str | None, recordings: RecordedArguments) -> None:
@@ -131,6 +130,24 @@ class RecordedData:
         }
 
 
+@dataclass(frozen=True)
+class Source:
+    """Where the data of a training come from: a simulated world, or recordings."""
+
+    domain: Domain
+    recorded: RecordedData | None
+
+    @property
+    def sha256(self) -> str | None:
+        """What identifies recordings."""
+        return None if self.recorded is None else self.recorded.sha256
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the JSON beside the weights says of recordings."""
+        return {} if self.recorded is None else {"data": self.recorded.about}
+
+
 TrainedLocal = tuple[LocalPoseNetwork, dict[str, Any]]
 """A local network and its description, as ``load_local`` gives them."""
 
@@ -158,6 +175,14 @@ def open_recorded(arguments: RecordedArguments, runs: Path, local: TrainedLocal 
     if local is not None:
         check_same_data(data, local)
     return data
+
+
+def open_source(arguments: SourceArguments, local: TrainedLocal | None = None) -> Source:
+    """The world that the arguments name, or their recordings, opened as by ``open_recorded``."""
+    if arguments.world is not None:
+        return Source(world_named(arguments.world), None)
+    recorded = open_recorded(arguments.recordings, arguments.runs, local)
+    return Source(recorded.domain, recorded)
 
 
 def check_same_arguments(arguments: RecordedArguments, description: dict[str, Any]) -> None:

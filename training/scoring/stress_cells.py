@@ -131,13 +131,15 @@ def _cell(log: SensorLog, runs: DriveRuns, name: str) -> StressCell:
 def cell_numbers(relations: Relations, cell: StressCell, clean: StressCell | None) -> dict[str, float]:
     """Mean errors over the relations by their key; what there is nothing for is left out.
 
-    - ``translation_m``, ``rotation_deg``: over all relations; ``over_30_s_m``: over those that span more than 30 s.
+    - ``translation_m``, ``rotation_deg``: over all relations within the estimate, ``relations`` of them;
+      ``over_30_s_m``: over those that span more than 30 s.
     - ``at_scans_m``, ``at_scans_deg``: over those with a scan at both ends (``AT_SCANS_S``): elsewhere poses are
       interpolated.
     - ``best_possible_m``, ``best_possible_deg``: over all, of the poses without the change, ``clean``, read at the
       scans that were kept alone.
     """
     errors = _errors(relations, cell)
+    within = len(errors.translation_m)
     numbers = {"translation_m": errors.translation_m, "rotation_deg": errors.rotation_deg}
     numbers["over_30_s_m"] = errors.translation_m[errors.far]
     kept_s = cell.kept_ns * 1e-9
@@ -145,11 +147,12 @@ def cell_numbers(relations: Relations, cell: StressCell, clean: StressCell | Non
     if seen.any():
         errors = _errors(Relations(relations.stamps_s[seen], relations.relative_xyyaw[seen]), cell)
         numbers.update(at_scans_m=errors.translation_m, at_scans_deg=errors.rotation_deg)
-    if clean is not None:
+    if clean is not None and not clean.failed:
         poses = interpolated(clean.taken_ns * 1e-9, clean.poses, kept_s)
         errors = _errors(relations, StressCell(cell.kept_ns, poses, cell.kept_ns))
         numbers.update(best_possible_m=errors.translation_m, best_possible_deg=errors.rotation_deg)
     means = {key: float(values.mean()) for key, values in numbers.items() if len(values)}
+    means["relations"] = within
     return means | ({} if np.isnan(cell.scans_per_s) else {"scans_per_s": cell.scans_per_s})
 
 

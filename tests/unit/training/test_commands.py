@@ -9,11 +9,16 @@ from collections.abc import Iterator
 import pytest
 import tyro
 
+from training import train, train_smoother
 from training.common.command_line import quiet_framework, run_command
 from training.common.records import ROOT, RunError
 from training.recordings.recording_source import RecordedArguments
 
-COMMANDS = sorted(path.stem for path in (ROOT / "training").glob("*.py") if "\nif __name__" in path.read_text())
+COMMANDS = sorted(
+    path.stem
+    for path in (ROOT / "training").glob("*.py")
+    if "\nif __name__" in path.read_text() and path.stem != "train"
+)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -25,6 +30,23 @@ def test_help_says_first_what_a_command_makes(name: str, capsys: pytest.CaptureF
     told = " ".join(capsys.readouterr().out.split())
     first = command.__doc__.splitlines()[0]
     assert first.endswith(".") and first[:40] in told
+
+
+def test_every_training_is_a_task_of_the_one_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert {f"train_{task}" for task in train.TASKS} == {name for name in COMMANDS if name.startswith("train_")}
+    for arguments in ([], ["--help"]):
+        train.main(arguments)
+        printed = capsys.readouterr().out
+        assert all(f"\n  {task:15} {what}\n" in printed for task, what in train.TASKS.items())
+    with pytest.raises(SystemExit, match=r"^there is no task 'maps'; expected one of local, place"):
+        train.main(["maps"])
+
+
+def test_a_task_gets_the_flags_behind_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = []
+    monkeypatch.setattr(train_smoother, "main", given.append)
+    train.main(["smoother", "--world", "maze3d", "--memory", "--seed", "7"])
+    assert given == [train_smoother.Arguments(world="maze3d", memory=True, seed=7)]
 
 
 def test_a_run_that_does_not_fit_ends_a_command_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,29 +15,34 @@ from training.common.records import WEIGHTS, RunError
 from training.data.worlds import WORLDS, world_named
 from training.train_optimizer import (
     Arguments,
-    Choices,
     OptimizerTraining,
     begun_optimizer,
-    choices,
     config_of,
     main,
     trajectory_loss,
+    with_choices,
 )
 
 
+def chosen(given: Arguments, world: str) -> tuple[bool | None, int | None, int | None, int | None]:
+    """Smoothing, loops a pose, loops and epochs of a training."""
+    arguments = with_choices(given, world_named(world))
+    return arguments.smoothing, arguments.loops_per_pose, arguments.max_loops, arguments.epochs
+
+
 def test_a_world_says_what_suits_it() -> None:
-    assert choices(Arguments(world="maze3d"), world_named("maze3d")) == Choices(True, 4, 128, 20)
-    assert choices(Arguments(world="maze2d"), world_named("maze2d")) == Choices(False, 4, 512, 6)
+    assert chosen(Arguments(world="maze3d"), "maze3d") == (True, 4, 128, 20)
+    assert chosen(Arguments(world="maze2d"), "maze2d") == (False, 4, 512, 6)
 
 
 def test_what_is_given_counts() -> None:
     given = Arguments(world="maze3d", smoothing=False, loops_per_pose=3, max_loops=7, epochs=1)
-    assert choices(given, world_named("maze3d")) == Choices(False, 3, 7, 1)
+    assert chosen(given, "maze3d") == (False, 3, 7, 1)
 
 
 def test_the_papers_form_does_not_smooth_by_itself() -> None:
     for form, smooths in (("loops", True), ("gauss_newton", True), ("paper", False)):
-        assert choices(Arguments(world="maze3d", form=form), world_named("maze3d")).smoothing == smooths  # type: ignore[arg-type]
+        assert chosen(Arguments(world="maze3d", form=form), "maze3d")[0] == smooths  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -52,7 +57,7 @@ def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None
     # Doom's place codes got their ranges as maze3d's have them, after their training (train_ranges.py).
     ranges = "maze3d" if world == "doom" else world
     assert load_place(WEIGHTS / world, world)[0].config.registration == world_named(ranges).registration
-    assert (shipped.smoother is not None) == choices(arguments, world_named(world)).smoothing
+    assert (shipped.smoother is not None) == chosen(arguments, world)[0]
     if shipped.smoother is not None:
         load_smoother(WEIGHTS / world, world)  # for whoever trains an optimizer anew; of the local network beside it
 

@@ -10,13 +10,14 @@ from torch import Tensor
 from ngo_estimator.geometry import se2
 from ngo_estimator.graph.gauss_newton import (
     Factors,
-    chain_factors,
+    chain_nodes,
     gauss_newton_step,
     node_covariance,
-    pair_factors,
+    pick,
+    relative_factors,
     step_information,
 )
-from ngo_estimator.ngo.loop_residuals import loop_residuals
+from ngo_estimator.loops.loop_closure import Loops
 from tests.unit.ngo_estimator.samples import make_loops, meta_steps, with_origin
 
 DOUBLE = torch.float64
@@ -31,8 +32,21 @@ def random_graph(seed: int = 0) -> tuple[Tensor, list[Factors]]:
     step_std = 0.02 + 0.2 * torch.rand(1, BLOCKS, 3, generator=generator, dtype=DOUBLE)
     deviation = 0.1 * torch.randn(1, BLOCKS, 3, generator=generator, dtype=DOUBLE)
     information = 50.0 * torch.rand(1, 4, 3, generator=generator, dtype=DOUBLE)
-    chain = chain_factors(poses, deviation, step_information(step_std))
-    return poses, [chain, pair_factors(loops.nodes, poses, loop_residuals(loops, poses), information)]
+    return poses, [
+        chain_factors(poses, deviation, step_information(step_std)),
+        loop_factors(loops, poses, information),
+    ]
+
+
+def chain_factors(poses: Tensor, deviation: Tensor, information: Tensor) -> Factors:
+    """Those of relative poses that deviate so much from the measured ones."""
+    return relative_factors(chain_nodes(deviation.shape[1]), poses, -deviation, information)
+
+
+def loop_factors(loops: Loops, poses: Tensor, information: Tensor) -> Factors:
+    start, end = (pick(poses, loops.nodes[..., k]) for k in (0, 1))
+    residuals = se2.wrapped(loops.measured - se2.between(start, end))
+    return relative_factors(loops.nodes, poses, residuals, information)
 
 
 def dense(factors: list[Factors], nodes: int) -> tuple[Tensor, Tensor]:
@@ -51,19 +65,10 @@ def dense(factors: list[Factors], nodes: int) -> tuple[Tensor, Tensor]:
 
 
 def test_jacobians_are_the_derivatives_of_what_is_predicted() -> None:
-    poses, (chain, pairs) = random_graph()
-
-    def relative(values: Tensor) -> Tensor:
-        return se2.between(values[:-1], values[1:])
-
-    def pose_in_map(values: Tensor) -> Tensor:
-        # What is measured is fixed to the start, and moves and turns in the map with it.
-        start, end = values[pairs.nodes[0, :, 0]], values[pairs.nodes[0, :, 1]]
-        fixed = se2.between(poses[0, pairs.nodes[0, :, 0]], poses[0, pairs.nodes[0, :, 1]])
-        return end - se2.compose(start, fixed)
-
-    for factors, predicted in ((chain, relative), (pairs, pose_in_map)):
-        exact = torch.autograd.functional.jacobian(predicted, poses[0])
+    poses, graph = random_graph()
+    for factors in graph:
+        start, end = factors.nodes[0].unbind(-1)
+        exact = torch.autograd.functional.jacobian(lambda p, a=start, b=end: se2.between(p[a], p[b]), poses[0])
         for k in range(exact.shape[0]):
             expected = exact[k][:, factors.nodes[0, k]].flatten(1)
             assert torch.allclose(factors.jacobian[0, k], expected, atol=1e-10)
@@ -99,10 +104,9 @@ def test_a_square_that_does_not_close_is_closed_as_by_hand() -> None:
     loops = make_loops([0], [3])  # the end is the start
     step_std = torch.tensor([0.1, 1e-5, 1e-5], dtype=DOUBLE).expand(1, 4, 3)
     information = torch.tensor([[[1e8, 1e8, 0.0]]], dtype=DOUBLE)
-    residuals = loop_residuals(loops, poses)
     factors = [
         chain_factors(poses, torch.zeros_like(steps), step_information(step_std)),
-        pair_factors(loops.nodes, poses, residuals, information),
+        loop_factors(loops, poses, information),
     ]
     after = poses + gauss_newton_step(factors, 5)
     correction = se2.g2r(after[:, 1:]) - steps
@@ -134,7 +138,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
     def step(poses: Tensor, deviation: Tensor, step_std: Tensor, residual: Tensor, information: Tensor) -> Tensor:
         factors = [
             chain_factors(poses, deviation, step_information(step_std)),
-            pair_factors(loops.nodes, poses, residual, information),
+            relative_factors(loops.nodes, poses, residual, information),
         ]
         return gauss_newton_step(factors, BLOCKS + 1)
 
@@ -152,7 +156,7 @@ def test_long_chains_with_unlike_deviations_are_solved(loop_information: float) 
     information = torch.full((1, count, 3), loop_information, dtype=DOUBLE)
     factors = [
         chain_factors(poses, torch.zeros_like(step_std), step_information(step_std)),
-        pair_factors(loops.nodes, poses, loop_residuals(loops, poses), information),
+        loop_factors(loops, poses, information),
     ]
     step = gauss_newton_step(factors, blocks + 1)
     assert step.isfinite().all()
@@ -223,7 +227,7 @@ def test_a_loop_that_knows_nothing_along_a_corridor_moves_nothing_along_it() -> 
     nodes = torch.tensor([[[0, 1]]])
     factors = [
         chain_factors(poses, torch.zeros_like(poses[:, 1:]), torch.ones(1, 1, 3, dtype=DOUBLE)),
-        pair_factors(nodes, poses, residual, 1e9 * torch.outer(across, across)[None, None]),
+        relative_factors(nodes, poses, residual, 1e9 * torch.outer(across, across)[None, None]),
     ]
     step = gauss_newton_step(factors, 2)[0, 1]
     torch.testing.assert_close(step @ across, residual[0, 0] @ across, rtol=1e-6, atol=1e-6)
@@ -240,7 +244,7 @@ def test_gradients_of_whole_information_are_those_of_finite_differences() -> Non
     def step(poses: Tensor, deviation: Tensor, residual: Tensor, chain_root: Tensor, loop_root: Tensor) -> Tensor:
         parts = [
             chain_factors(poses, deviation, chain_root @ chain_root.mT),
-            pair_factors(loops, poses, residual, loop_root @ loop_root.mT),
+            relative_factors(loops, poses, residual, loop_root @ loop_root.mT),
         ]
         return gauss_newton_step(parts, BLOCKS + 1)
 

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -9,7 +10,8 @@ from torch import Tensor, nn
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig
-from ngo_estimator.ngo.loop_residuals import loop_residuals, odometry_variances, spread_over_span
+from ngo_estimator.ngo.loop_closing import spread_over_span
+from ngo_estimator.ngo.loop_gates import loop_residuals, odometry_variances
 from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from tests.unit.ngo_estimator.samples import make_loops, meta_steps, place_config, with_origin
 
@@ -20,10 +22,11 @@ def test_residual_is_measured_less_current_along_the_map() -> None:
     relative = meta_steps(6)
     poses = with_origin(se2.r2g(relative))
     exact = se2.between(poses[:, 1], poses[:, 5])
-    assert loop_residuals(make_loops([1], [4], exact[:, None]), poses).abs().max() < 1e-12
+    nodes = torch.tensor([[[1, 5]]])
+    assert loop_residuals(nodes, exact[:, None], poses).abs().max() < 1e-12
     # The measurement says: 0.2 m further in the direction in which the start looks, and 0.1 rad more to the left.
     more = exact + torch.tensor([0.2, 0.0, 0.1], dtype=DOUBLE)
-    x, y, yaw = loop_residuals(make_loops([1], [4], more[:, None]), poses)[0, 0]
+    x, y, yaw = loop_residuals(nodes, more[:, None], poses)[0, 0]
     heading = poses[0, 1, 2]
     assert torch.allclose(
         torch.stack((x, y, yaw)), torch.stack((0.2 * heading.cos(), 0.2 * heading.sin(), yaw * 0 + 0.1))
@@ -34,13 +37,15 @@ def test_heading_residual_is_wrapped() -> None:
     poses = torch.zeros(1, 3, 3, dtype=DOUBLE)
     poses[0, 2, 2] = 6.0
     measured = torch.tensor([[[0.0, 0.0, -0.1]]], dtype=DOUBLE)
-    assert loop_residuals(make_loops([0], [1], measured), poses)[0, 0, 2].item() == pytest.approx(2 * torch.pi - 6.1)
+    assert loop_residuals(torch.tensor([[[0, 2]]]), measured, poses)[0, 0, 2].item() == pytest.approx(
+        2 * torch.pi - 6.1
+    )
 
 
 def test_spread_is_the_weighted_mean_over_the_loops_on_each_step() -> None:
     loops = make_loops([0, 2, 3, 7], [5, 4, 9, 7])
     values, weights = torch.randn(1, 4, 3, dtype=DOUBLE), torch.tensor([[0.7, 0.2, 1.0, 0.5]], dtype=DOUBLE)
-    spread, support = spread_over_span(loops, values, weights, 11)
+    spread, support = spread_over_span(loops.nodes, values, weights, 11)
     for step in range(11):
         total, sum_weights = torch.zeros(3, dtype=DOUBLE), 0.0
         for number, (start, end) in enumerate(zip(loops.start[0].tolist(), loops.end[0].tolist(), strict=True)):
@@ -51,9 +56,31 @@ def test_spread_is_the_weighted_mean_over_the_loops_on_each_step() -> None:
         assert support[0, step].item() == pytest.approx(sum_weights, abs=1e-12)
 
 
+def test_arrays_of_one_trajectory_give_what_tensors_of_a_batch_give() -> None:
+    poses, loops = with_origin(se2.r2g(meta_steps(9))), make_loops([0, 2, 1, 4], [8, 6, 8, 4])
+    generator = torch.Generator().manual_seed(1)
+    measured, variance, weights = (
+        torch.rand(1, *shape, generator=generator, dtype=DOUBLE) for shape in ((4, 3), (9, 3), (4,))
+    )
+    arrays = [x[0].numpy() for x in (loops.nodes, measured, poses, variance, weights)]
+    nodes, of_measured, of_poses, of_variance, of_weights = arrays
+    residuals = loop_residuals(loops.nodes, measured, poses)
+    pairs = [
+        (residuals, loop_residuals(nodes, of_measured, of_poses)),
+        (odometry_variances(loops.nodes, poses, variance), odometry_variances(nodes, of_poses, of_variance)),
+        *zip(
+            spread_over_span(loops.nodes, residuals, weights, 9),
+            spread_over_span(nodes, residuals[0].numpy(), of_weights, 9),
+            strict=True,
+        ),
+    ]
+    for tensors, of_one in pairs:
+        np.testing.assert_allclose(of_one, tensors[0].numpy(), rtol=1e-10, atol=1e-12)
+
+
 def test_loops_of_weight_zero_spread_nothing() -> None:
     spread, support = spread_over_span(
-        make_loops([0, 1], [4, 3]), torch.randn(1, 2, 3, dtype=DOUBLE), torch.zeros(1, 2, dtype=DOUBLE), 6
+        make_loops([0, 1], [4, 3]).nodes, torch.randn(1, 2, 3, dtype=DOUBLE), torch.zeros(1, 2, dtype=DOUBLE), 6
     )
     assert not spread.any() and not support.any()
 
@@ -236,7 +263,7 @@ def test_odometry_variances_are_the_diagonal_of_the_propagated_covariance() -> N
     index = torch.arange(9)
     on_loop = (index >= loops.start[0, :, None]) & (index <= loops.end[0, :, None])
     expected = ((jacobian * on_loop[:, None, :, None]).square() * variance[0]).sum((-2, -1))
-    result = odometry_variances(loops.start, loops.end + 1, with_origin(se2.r2g(relative)), variance)[0]
+    result = odometry_variances(loops.nodes, with_origin(se2.r2g(relative)), variance)[0]
     assert torch.allclose(result, expected, atol=1e-12)
 
 

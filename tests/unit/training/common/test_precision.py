@@ -44,7 +44,7 @@ def test_a_run_says_its_precision_once_and_keeps_it(
 ) -> None:
     def begin(wanted: precision.Precision = "auto") -> runs.Run:
         arguments = Arguments("maze2d", accelerator="cpu", precision=wanted)
-        return runs.Run(tmp_path, "train_local", arguments, epochs=2, seed=0)
+        return runs.Run(tmp_path, "train_local", arguments, epochs=2)
 
     monkeypatch.setattr(precision, "cpu_gain", lambda: 0.5)
     run = begin()

@@ -16,19 +16,25 @@ class Arguments(TrainerArguments):
     world: str
     learning_rate: float = 1e-3
     batch_size: int = 8
-    out: Path = Path("/somewhere")
 
 
 def begin(folder: Path, **changes: object) -> runs.Run:
     arguments = Arguments("maze2d", accelerator="cpu", precision="32-true", **changes)  # type: ignore[arg-type]
-    return runs.Run(folder, "train_local", arguments, epochs=2, seed=0)
+    return runs.Run(folder, "train_local", arguments, epochs=2)
 
 
 def test_the_record_holds_a_command_that_makes_the_same_again() -> None:
     record = records.record("train_local", Arguments("maze2d", batch_size=4, out=Path("/elsewhere"), devices="2"))
     assert record["command"] == "python -m training.train_local --devices 2 --world maze2d --batch-size 4"
     expected = {"world": "maze2d", "learning_rate": 1e-3, "batch_size": 4}
-    trainer = {"accelerator": "auto", "devices": "2", "num_nodes": 1, "strategy": "auto", "precision": "auto"}
+    trainer = {
+        "accelerator": "auto",
+        "devices": "2",
+        "num_nodes": 1,
+        "strategy": "auto",
+        "precision": "auto",
+        "seed": 0,
+    }
     assert record["arguments"] == {**trainer, **expected}
     assert record["revision"]
 
@@ -91,7 +97,6 @@ def test_a_run_does_not_go_on_with_other_settings_of_its_world(tmp_path: Path) -
             "train_local",
             Arguments("maze2d", accelerator="cpu", precision="32-true"),
             2,
-            0,
             settings=settings,
         )
 

@@ -6,7 +6,7 @@ import pytest
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from training.data.lidar_drives import LidarDrive, Relations, TruePoses
-from training.data.sensor_log import SensorLog
+from training.data.sensor_log import FAR_AWAY_M, SensorLog
 
 STAMPS = [10, 20, 30, 25, 30, 40]
 POSES = np.stack((np.arange(6.0), np.zeros(6), np.zeros(6)), axis=-1)
@@ -49,3 +49,14 @@ def test_scanners_that_change_and_truth_of_other_stamps_are_refused() -> None:
         SensorLog.of_drive(replace(other, scans=(other.scans[0], replace(other.scans[1], angle_min=1.0))))
     with pytest.raises(ValueError, match="other stamps"):
         SensorLog.of_drive(drive(TruePoses(np.arange(6), POSES)))
+
+
+def test_logs_that_are_put_together_go_on_elsewhere() -> None:
+    log = SensorLog.of_drive(drive(TruePoses(np.array(STAMPS), POSES)))
+    turned = replace(log, wheel_poses=log.wheel_poses + (0.0, 7.0, 0.0))
+    both = log.followed_by(turned, 1e-7)
+    assert both.stamps_ns.tolist() == both.wheel_stamps_ns.tolist() == [10, 20, 30, 40, 140, 150, 160, 170]
+    assert both.wheel_poses[:, 0].tolist() == [0, 1, 2, 5, 5, 6, 7, 10]
+    assert not both.wheel_poses[:, 1:].any()
+    assert both.true_poses is not None
+    assert both.true_poses[4:, 0].tolist() == [FAR_AWAY_M + x for x in (0, 1, 2, 5)]

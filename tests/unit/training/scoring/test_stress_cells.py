@@ -25,7 +25,7 @@ def test_numbers_are_means_over_the_relations_they_name() -> None:
     assert numbers["over_30_s_m"] == pytest.approx(0.0, abs=1e-9)  # the second alone
     assert numbers["at_scans_m"] == pytest.approx(0.99 / 3)  # all but the last, which is between scans
     assert numbers["at_scans_deg"] == pytest.approx(turn_deg / 3)
-    assert numbers["scans_per_s"] == 250.0
+    assert (numbers["relations"], numbers["scans_per_s"]) == (4, 250.0)
     assert "best_possible_m" not in numbers
 
 
@@ -33,6 +33,8 @@ def test_at_scans_counts_scans_that_were_kept() -> None:
     kept = np.isin(TAKEN, S * np.array([1, 2, 3, 60, 100]))
     cell = StressCell(TAKEN[kept], POSES[kept], TAKEN[kept])
     assert cell_numbers(RELATIONS, cell, None)["at_scans_m"] == pytest.approx(0.0, abs=1e-9)
+    failed = StressCell(TAKEN[:0], POSES[:0], TAKEN, failed="no scan fits")
+    assert "best_possible_m" not in cell_numbers(RELATIONS, cell, failed)
     none = StressCell(TAKEN[kept][3:], POSES[kept][3:], TAKEN[kept][3:])
     with pytest.raises(ValueError, match="none of 4 relations"):
         cell_numbers(RELATIONS, none, None)

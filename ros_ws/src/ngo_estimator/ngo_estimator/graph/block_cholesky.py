@@ -86,6 +86,15 @@ class BlockCholesky:
         """Solve in place for right hand sides ``(count, 3, n)`` whose rows are in the order of elimination."""
         solve(self._structure.starts, self._structure.rows, self._diagonal, self._lower, right)
 
+    def selected_inverse(self) -> tuple[Array, Array]:
+        """The inverse matrix at the structure's blocks alone: on the diagonal, and below, in the order of elimination.
+
+        It costs about as much as the factor (Takahashi, Fagan, Chen 1973).
+        """
+        diagonal, lower = np.empty_like(self._diagonal), np.empty_like(self._lower)
+        _selected_inverse(self._structure.starts, self._structure.rows, self._diagonal, self._lower, diagonal, lower)
+        return diagonal, lower
+
 
 @njit(cache=True)
 def _bits(word: Any) -> Any:
@@ -304,3 +313,57 @@ def solve(starts: Array, rows: Array, diagonal: Array, lower: Array, x: Array) -
             c = c / d[2, 2]
             b = (b - d[2, 1] * c) / d[1, 1]
             x[k, 0, s], x[k, 1, s], x[k, 2, s] = (a - d[1, 0] * b - d[2, 0] * c) / d[0, 0], b, c
+
+
+@njit(cache=True, error_model="numpy")
+def _selected_inverse(
+    starts: Array, rows: Array, diagonal: Array, lower: Array, inverse_diagonal: Array, inverse_lower: Array
+) -> None:
+    """Fill the blocks of the inverse from the last column to the first, from a factor with such blocks."""
+    count = len(diagonal)
+    place = np.full(count, -1)
+    for j in range(count - 1, -1, -1):
+        first, last = starts[j], starts[j + 1]
+        d = diagonal[j]
+        inverse = np.zeros((3, 3))
+        inverse[0, 0], inverse[1, 1], inverse[2, 2] = 1.0 / d[0, 0], 1.0 / d[1, 1], 1.0 / d[2, 2]
+        inverse[1, 0] = -d[1, 0] * inverse[0, 0] * inverse[1, 1]
+        inverse[2, 1] = -d[2, 1] * inverse[1, 1] * inverse[2, 2]
+        inverse[2, 0] = -(d[2, 0] * inverse[0, 0] + d[2, 1] * inverse[1, 0]) * inverse[2, 2]
+        sums = np.zeros((last - first, 3, 3))
+        for p in range(first, last):
+            place[rows[p]] = p
+        for p in range(first, last):
+            column = rows[p]
+            for r in range(3):
+                for c in range(3):
+                    for k in range(3):
+                        sums[p - first, r, c] += inverse_diagonal[column, r, k] * lower[p, k, c]
+            for q in range(starts[column], starts[column + 1]):
+                other = place[rows[q]]
+                if other < 0:
+                    continue
+                for r in range(3):
+                    for c in range(3):
+                        for k in range(3):
+                            sums[other - first, r, c] += inverse_lower[q, r, k] * lower[p, k, c]
+                            sums[p - first, r, c] += inverse_lower[q, k, r] * lower[other, k, c]
+        own = inverse.copy().T
+        for p in range(first, last):
+            place[rows[p]] = -1
+            for r in range(3):
+                for c in range(3):
+                    value = 0.0
+                    for k in range(3):
+                        value -= sums[p - first, r, k] * inverse[k, c]
+                    inverse_lower[p, r, c] = value
+            for r in range(3):
+                for c in range(3):
+                    for k in range(3):
+                        own[r, c] -= inverse_lower[p, k, r] * lower[p, k, c]
+        for r in range(3):
+            for c in range(3):
+                value = 0.0
+                for k in range(3):
+                    value += own[r, k] * inverse[k, c]
+                inverse_diagonal[j, r, c] = value

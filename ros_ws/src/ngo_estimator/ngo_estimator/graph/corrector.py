@@ -15,7 +15,10 @@ from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
 from ngo_estimator.graph.relative_poses import RelativePoses
 
 INLIER_PROBABILITY = 0.99
-"""A right edge's squared residual is below its threshold so often."""
+"""A right loop's squared residual is below its threshold so often."""
+
+STEP_LIMIT = 100.0
+"""Squared residual above which a step is an outlier: odometry fails far less often than loops do."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,10 @@ class CorrectedGraph:
     """A solution of a ``GraphProblem``.
 
     ``poses`` ``(nodes, 3)``. ``loop_weights`` ``(loops,)`` and ``step_weights`` ``(nodes - 1,)``, zero to one, say how
-    much each edge is believed. ``cost`` is comparable between solutions of one problem. ``step_scale`` and
-    ``loop_scale`` are how many times as large as stated the variances of steps and loops were found to be.
+    much each edge is believed. ``cost`` is the truncated cost with variances ``scale`` times as large as stated, as
+    they were when it was solved. ``step_scale`` and ``loop_scale`` are how many times as large as stated the variances
+    of steps and loops were found to be afterwards. ``loops_from_nothing`` loops were there when the graph was last
+    solved without a warm start.
     """
 
     problem: GraphProblem
@@ -57,8 +62,10 @@ class CorrectedGraph:
     loop_weights: np.ndarray
     step_weights: np.ndarray
     cost: float
+    scale: float = 1.0
     step_scale: float = 1.0
     loop_scale: float = 1.0
+    loops_from_nothing: int = 0
 
     def information(self, steps: RelativePoses | None = None) -> NormalEquations:
         """The factorised information of all poses, by the edges that are believed and their scales.
@@ -88,10 +95,12 @@ class Corrector(Protocol):
         """
 
 
-def thresholds(edges: RelativePoses) -> np.ndarray:
-    """Squared whitened residual ``(n,)`` above which an edge is an outlier, by its degrees of freedom."""
-    table = np.concatenate(((1.0,), chi2.ppf(INLIER_PROBABILITY, (1, 2, 3))))
-    limits: np.ndarray = table[edges.degrees]
+_THRESHOLDS = np.concatenate(((1.0,), chi2.ppf(INLIER_PROBABILITY, (1, 2, 3))))
+
+
+def thresholds(loops: RelativePoses) -> np.ndarray:
+    """Squared whitened residual ``(n,)`` above which a loop is an outlier, by its degrees of freedom."""
+    limits: np.ndarray = _THRESHOLDS[loops.degrees]
     return limits
 
 
@@ -100,11 +109,9 @@ def truncated_cost(problem: GraphProblem, poses: np.ndarray, step_scale: float =
 
     What a loop costs is multiplied by its trust, and variances by their scales.
     """
-    total = 0.0
-    for edges, scale, trust in ((problem.steps, step_scale, 1.0), (problem.loops, loop_scale, problem.trust)):
-        squared = (edges.residuals(poses) ** 2).sum(1) / scale
-        total += float((trust * np.minimum(squared, thresholds(edges))).sum())
-    return total
+    steps, loops = ((x.residuals(poses) ** 2).sum(1) for x in (problem.steps, problem.loops))
+    refused = np.minimum(loops / loop_scale, thresholds(problem.loops))
+    return float(np.minimum(steps / step_scale, STEP_LIMIT).sum() + (problem.trust * refused).sum())
 
 
 def normal_equations(
@@ -116,5 +123,6 @@ def normal_equations(
     """
     if structure is None:
         structure = GraphStructure(np.concatenate([edges.nodes for edges, _ in parts]), len(poses))
-    hessian, gradient = zip(*(edges.equations(poses, weights) for edges, weights in parts), strict=True)
-    return NormalEquations(np.concatenate(hessian), np.concatenate(gradient), structure)
+    relative = np.concatenate([edges.relative for edges, _ in parts])
+    information = np.concatenate([weights[:, None, None] * edges.information for edges, weights in parts])
+    return NormalEquations(structure, poses, relative, information)

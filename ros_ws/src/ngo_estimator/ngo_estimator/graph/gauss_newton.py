@@ -1,4 +1,4 @@
-"""One Gauss-Newton step of a pose graph: a chain of relative poses, and loops between any two of its poses.
+"""One Gauss-Newton step of a pose graph through which gradients flow; ``normal_equations`` takes it without them.
 
 The unknowns are all poses after the origin, in the map. Each factor compares two poses. The step minimises the sum of
 squared residuals, weighted with their information. It is differentiable with respect to every tensor.
@@ -51,43 +51,29 @@ def step_information(step_std: Tensor) -> Tensor:
     return step_std.square().reciprocal()
 
 
-def chain_factors(poses: Tensor, deviation: Tensor, information: Tensor) -> Factors:
-    """The relative meta-poses of a chain.
-
-    Args:
-        poses: global poses with the origin in front ``(batch, blocks + 1, 3)``.
-        deviation: relative poses of ``poses`` less the measured ones ``(batch, blocks, 3)``.
-        information: ``(batch, blocks, 3)`` or ``(batch, blocks, 3, 3)``, along the axes of the earlier pose.
-    """
-    batch, blocks = deviation.shape[:2]
-    index = torch.arange(blocks, device=poses.device)
-    nodes = torch.stack((index, index + 1), dim=-1).expand(batch, -1, -1)
-    heading = poses[:, :-1, 2]
-    offset = se2.rotate(-heading, poses[:, 1:, :2] - poses[:, :-1, :2])
-    cos, sin, zero, one = torch.cos(heading), torch.sin(heading), torch.zeros_like(heading), torch.ones_like(heading)
-    rows = (
-        torch.stack((-cos, -sin, offset[..., 1], cos, sin, zero), dim=-1),
-        torch.stack((sin, -cos, -offset[..., 0], -sin, cos, zero), dim=-1),
-        torch.stack((zero, zero, -one, zero, zero, one), dim=-1),
-    )
-    return Factors(nodes, torch.stack(rows, dim=-2), -deviation, information)
+def chain_nodes(count: int) -> Tensor:
+    """Nodes ``(1, count, 2)`` of the relative poses of a chain: each leads to the next node."""
+    index = torch.arange(count)
+    return torch.stack((index, index + 1), dim=-1).unsqueeze(0)
 
 
-def pair_factors(nodes: Tensor, poses: Tensor, residual: Tensor, information: Tensor) -> Factors:
-    """Measurements of one pose from another.
+def relative_factors(nodes: Tensor, poses: Tensor, residual: Tensor, information: Tensor) -> Factors:
+    """Measurements of one pose from another, as those of a chain or of loops.
 
     Args:
         nodes: the pose measured from, and the pose measured ``(batch, factors, 2)``.
         poses: global poses of all nodes ``(batch, nodes, 3)``.
-        residual: measured less predicted pose of the second, along the axes of the map ``(batch, factors, 3)``.
-        information: ``(batch, factors, 3)`` or ``(batch, factors, 3, 3)``, along the axes of the map.
+        residual: measured less predicted pose of the second, seen from the first ``(batch, factors, 3)``.
+        information: ``(batch, factors, 3)`` or ``(batch, factors, 3, 3)``, along the axes of the first.
     """
+    nodes = nodes.expand(poses.shape[0], -1, -1)
     start, end = (pick(poses, nodes[..., k]) for k in (0, 1))
-    offset = end[..., :2] - start[..., :2]
-    zero, one = torch.zeros_like(offset[..., 0]), torch.ones_like(offset[..., 0])
+    heading = start[..., 2]
+    offset = se2.rotate(-heading, end[..., :2] - start[..., :2])
+    cos, sin, zero, one = torch.cos(heading), torch.sin(heading), torch.zeros_like(heading), torch.ones_like(heading)
     rows = (
-        torch.stack((-one, zero, offset[..., 1], one, zero, zero), dim=-1),
-        torch.stack((zero, -one, -offset[..., 0], zero, one, zero), dim=-1),
+        torch.stack((-cos, -sin, offset[..., 1], cos, sin, zero), dim=-1),
+        torch.stack((sin, -cos, -offset[..., 0], -sin, cos, zero), dim=-1),
         torch.stack((zero, zero, -one, zero, zero, one), dim=-1),
     )
     return Factors(nodes, torch.stack(rows, dim=-2), residual, information)

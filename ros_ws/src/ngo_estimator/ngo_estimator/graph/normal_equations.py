@@ -1,14 +1,16 @@
-"""Sparse normal equations of one pose graph; the optimizer solves these when nobody needs a gradient.
+"""Sparse normal equations of one pose graph, of images or of scans: the solver where nobody needs a gradient.
 
 The factors of some hundred poses fill a few per cent of the matrix.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 
 from ngo_estimator.data.state_arrays import Arrays, require, taken
+from ngo_estimator.geometry.planar_motion import wrap
 from ngo_estimator.graph.block_cholesky import Array, BlockCholesky, BlockStructure, placed
 from ngo_estimator.graph.rounding import RELATIVE_JITTER
 
@@ -18,12 +20,11 @@ class GraphStructure:
 
     Args:
         nodes: of all factors ``(factors, 2)``, each 0 to ``count - 1``; the pose of node 0 is known.
-        chain: whether factors between neighbours come before these.
     """
 
-    def __init__(self, nodes: Array, count: int, chain: bool = False) -> None:
-        self.count = count
-        rows, pairs = _joined(nodes, count if chain else 1)
+    def __init__(self, nodes: Array, count: int) -> None:
+        self.nodes, self.count = nodes, count
+        rows, pairs = _joined(nodes)
         self.blocks = BlockStructure(pairs, count - 1)
         """Those of the information matrix, whose row ``k`` is node ``k + 1``."""
         self.ranks, self.place = placed(rows, self.blocks.rank, self.blocks.starts, self.blocks.rows)
@@ -73,6 +74,25 @@ class FactorisedInformation:
         covariance: Array = self._factor.solve(right)[rows].reshape(size, size)
         return 0.5 * (covariance + covariance.T)
 
+    def pair_covariances(self, pairs: Array) -> Array:
+        """Joint covariances ``(n, 6, 6)`` of the poses of pairs ``(n, 2)`` of nodes, zero for node 0.
+
+        Raises:
+            ValueError: no factor joins a pair.
+        """
+        diagonal, lower = self._factor.selected_inverse()
+        rows = np.asarray(pairs) - 1
+        joint = np.zeros((len(rows), 2, 3, 2, 3))
+        for side in (0, 1):
+            known = rows[:, side] >= 0
+            joint[known, side, :, side] = diagonal[self._structure.rank[rows[known, side]]]
+        both = (rows >= 0).all(1)
+        place, first_below = self._structure.places(rows[both])
+        block = lower[place]
+        block[~first_below] = block[~first_below].mT
+        joint[both, 0, :, 1], joint[both, 1, :, 0] = block, block.mT
+        return joint.reshape(-1, 6, 6)
+
     def state(self) -> Arrays:
         """The matrix, for ``from_state``."""
         pairs = np.unique(np.sort(self._structure.pairs, axis=1), axis=0)
@@ -90,20 +110,24 @@ class FactorisedInformation:
 
 
 class NormalEquations(FactorisedInformation):
-    """The factorised normal equations of one graph, at the poses where its factors were linearised.
+    """The factorised normal equations of measured relative poses, linearised at the poses of all nodes.
 
     Args:
-        hessian, gradient: the part of each factor in them, a matrix ``(factors, 6, 6)`` and a right hand side
-            ``(factors, 6)`` of its two nodes.
-        structure: of these factors.
+        structure: of the factors.
+        poses: where they are linearised ``(count, 3)``.
+        relative: measured pose of each factor's second node, seen from its first ``(factors, 3)``.
+        information: inverse covariance of these ``(factors, 3, 3)``, along the axes of the first node.
 
     Raises:
         ArithmeticError: a pose has no factor at all.
     """
 
-    def __init__(self, hessian: Array, gradient: Array, structure: GraphStructure) -> None:
+    def __init__(self, structure: GraphStructure, poses: Array, relative: Array, information: Array) -> None:
         diagonal, lower, self._right = structure.empty()
-        _add_all(structure.ranks, structure.place, hessian, gradient, diagonal, lower, self._right)
+        _linearise(
+            poses, structure.nodes, relative, information, structure.ranks, structure.place, diagonal, lower,
+            self._right,
+        )  # fmt: skip
         super().__init__(structure.blocks, diagonal, lower)
 
     def solution(self) -> Array:
@@ -111,18 +135,17 @@ class NormalEquations(FactorisedInformation):
         return self.step(self._right.copy())
 
 
-@njit(cache=True)
-def _joined(nodes: Array, chain: int) -> tuple[Array, Array]:
-    """Rows of the nodes ``(n, 2)`` of all factors, -1 for node 0, and those of two rows.
+def diagonal_information(values: Array) -> Array:
+    """Information matrices ``(n, 3, 3)`` of measurements with independent components of this information ``(n, 3)``."""
+    information = np.zeros((*values.shape, 3))
+    np.einsum("kii->ki", information)[:] = values
+    return information
 
-    Factors between the first ``chain`` nodes, neighbour to neighbour, come before the others.
-    """
-    rows = np.empty((chain - 1 + len(nodes), 2), np.int64)
-    for k in range(chain - 1):
-        rows[k] = k - 1, k
-    for k in range(len(nodes)):
-        rows[chain - 1 + k] = nodes[k, 0] - 1, nodes[k, 1] - 1
-    pairs, count = np.empty_like(rows), 0
+
+@njit(cache=True)
+def _joined(nodes: Array) -> tuple[Array, Array]:
+    """Rows of the nodes ``(n, 2)`` of all factors, -1 for node 0, and those of two rows."""
+    rows, pairs, count = nodes - 1, np.empty_like(nodes), 0
     for k in range(len(rows)):
         if rows[k, 0] >= 0 and rows[k, 1] >= 0:
             pairs[count] = rows[k]
@@ -130,34 +153,59 @@ def _joined(nodes: Array, chain: int) -> tuple[Array, Array]:
     return rows, pairs[:count]
 
 
-@njit(cache=True)
-def _add_factor(
-    hessian: Array, gradient: Array, ranks: Array, place: int, diagonal: Array, lower: Array, right: Array
+@njit(cache=True, error_model="numpy")
+def _linearise(
+    poses: Array,
+    nodes: Array,
+    relative: Array,
+    information: Array,
+    ranks: Array,
+    place: Array,
+    diagonal: Array,
+    lower: Array,
+    right: Array,
 ) -> None:
-    """Add a factor to the blocks of ``GraphStructure.empty``.
+    """Add all factors to the blocks of ``GraphStructure.empty``.
 
-    Args:
-        hessian: ``(6, 6)``; gradient: ``(6,)``.
-        ranks: ``(2,)``, and ``place``: of this factor, as in the structure.
+    Along the axes of the map, with the information W and the residual r, a factor's Jacobian is the identity for its
+    second node and -L for its first one: L is the identity, but for what its heading does with the offset between both.
     """
-    a, b = ranks
-    for which in range(2):
-        at, first = (b, 3) if which else (a, 0)
-        if at >= 0:
-            for r in range(3):
-                right[at, r, 0] += gradient[first + r]
-                for c in range(3):
-                    diagonal[at, r, c] += hessian[first + r, first + c]
-    if place >= 0:
-        row, column = (0, 3) if a > b else (3, 0)
+    weight, lever, pull = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for k in range(len(nodes)):
+        a, b = nodes[k, 0], nodes[k, 1]
+        cos, sin = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+        x, y = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
+        own = (
+            relative[k, 0] - cos * x - sin * y,
+            relative[k, 1] + sin * x - cos * y,
+            wrap(relative[k, 2] - poses[b, 2] + poses[a, 2]),
+        )
         for r in range(3):
+            first, second, third = information[k, r, 0], information[k, r, 1], information[k, r, 2]
+            pull[r] = first * own[0] + second * own[1] + third * own[2]
+            weight[r, 0], weight[r, 1], weight[r, 2] = cos * first - sin * second, sin * first + cos * second, third
+        pull[0], pull[1] = cos * pull[0] - sin * pull[1], sin * pull[0] + cos * pull[1]
+        for c in range(3):
+            first, second = weight[0, c], weight[1, c]
+            weight[0, c], weight[1, c] = cos * first - sin * second, sin * first + cos * second
+        for r in range(3):  # W L
+            lever[r, 0], lever[r, 1] = weight[r, 0], weight[r, 1]
+            lever[r, 2] = weight[r, 2] - y * weight[r, 0] + x * weight[r, 1]
+        at, to, between = ranks[k, 0], ranks[k, 1], place[k]
+        if to >= 0:
+            for r in range(3):
+                right[to, r, 0] += pull[r]
+                for c in range(3):
+                    diagonal[to, r, c] += weight[r, c]
+        if between >= 0:
+            for r in range(3):
+                for c in range(3):
+                    lower[between, r, c] -= lever[c, r] if at > to else lever[r, c]
+        if at >= 0:
             for c in range(3):
-                lower[place, r, c] += hessian[row + r, column + c]
-
-
-@njit(cache=True)
-def _add_all(
-    ranks: Array, place: Array, hessian: Array, gradient: Array, diagonal: Array, lower: Array, right: Array
-) -> None:
-    for k in range(len(ranks)):
-        _add_factor(hessian[k], gradient[k], ranks[k], place[k], diagonal, lower, right)
+                lever[2, c] += x * lever[1, c] - y * lever[0, c]  # now it is L.T W L
+            pull[2] += x * pull[1] - y * pull[0]
+            for r in range(3):
+                right[at, r, 0] -= pull[r]
+                for c in range(3):
+                    diagonal[at, r, c] += lever[r, c]

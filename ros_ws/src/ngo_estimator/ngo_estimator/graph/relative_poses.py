@@ -1,10 +1,11 @@
 """Measured poses of nodes seen from others: the edges of a pose graph, each with a whole information matrix."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_arrays import between, wrap
+from ngo_estimator.geometry.se2 import between, wrap
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,12 @@ class RelativePoses:
         """The same with covariances so many times as large."""
         return RelativePoses(self.nodes, self.relative, self.root / np.sqrt(variance))
 
+    @cached_property
+    def information(self) -> np.ndarray:
+        """Information matrices ``(n, 3, 3)``, along the axes of the first node."""
+        information: np.ndarray = self.root.mT @ self.root
+        return information
+
     @property
     def degrees(self) -> np.ndarray:
         """How many directions each measurement knows ``(n,)``, 0 to 3."""
@@ -64,11 +71,8 @@ class RelativePoses:
         whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
         return whitened
 
-    def equations(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Their part in the normal equations at these poses, as ``NormalEquations`` takes it.
-
-        ``weights`` ``(n,)`` multiply the information.
-        """
+    def whitened_jacobian(self, poses: np.ndarray) -> np.ndarray:
+        """Derivative ``(n, 3, 6)`` of the whitened prediction by the poses of both nodes."""
         start, end = (poses[self.nodes[:, k]] for k in (0, 1))
         cos, sin = np.cos(start[:, 2]), np.sin(start[:, 2])
         x, y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
@@ -77,6 +81,5 @@ class RelativePoses:
         jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = sin, -cos, -cos * x - sin * y
         jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
         jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 1, 3], jacobian[:, 1, 4] = cos, sin, -sin, cos
-        whitened = self.root @ jacobian
-        weighted = (weights[:, None, None] * whitened).mT
-        return weighted @ whitened, (weighted @ self.residuals(poses)[..., None])[..., 0]
+        whitened: np.ndarray = self.root @ jacobian
+        return whitened

@@ -7,6 +7,7 @@ gated since registration can be wrong and sure of it: the graph may break there 
 
 import numpy as np
 
+from ngo_estimator.graph.corrector import normal_equations
 from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
 from ngo_estimator.graph.relative_poses import RelativePoses
 
@@ -63,12 +64,8 @@ class ScanPoseGraph:
 
     def _equations(self, steps: RelativePoses) -> NormalEquations:
         """Those of ``steps`` and of the loops, at the present poses and weights."""
-        parts = (
-            steps.equations(self.poses, self._kernel_weights(self._steps)),
-            self._loops.equations(self.poses, self.weights),
-        )
-        hessian, gradient = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return NormalEquations(hessian, gradient, self._structure)
+        parts = (steps, self._kernel_weights(self._steps)), (self._loops, self.weights)
+        return normal_equations(self.poses, *parts, structure=self._structure)
 
     def _kernel_weights(self, measured: RelativePoses) -> np.ndarray:
         squared = (measured.residuals(self.poses) ** 2).sum(1)

@@ -1,6 +1,6 @@
 """Loop closures: the record of loops, and the search for them in whole trajectories.
 
-Not in the paper, whose attention has to learn all this. A loop says where a meta-pose lies relative to an earlier
+A loop says where a meta-pose lies relative to an earlier
 frame.
 """
 
@@ -122,12 +122,6 @@ class Loops:
 
     def _with(self, per_loop: dict[str, Tensor]) -> Loops:
         return dataclasses.replace(self, **per_loop)  # type: ignore[arg-type]
-
-    @cached_property
-    def description(self) -> Tensor:
-        """What gates see of each loop beside its residual ``(batch, loops, 6)``: the same under all poses."""
-        beliefs = torch.stack((self.similarity, self.logit / 5.0), dim=-1)
-        return torch.cat((beliefs, self.log_scale, self.spread - self.log_scale), dim=-1)
 
     @cached_property
     def log_length(self) -> Tensor:

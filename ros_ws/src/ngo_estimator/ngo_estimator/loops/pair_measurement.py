@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, register
+from ngo_estimator.geometry.se2 import Values, library
 from ngo_estimator.graph.gauss_newton import pick
 from ngo_estimator.networks.place_encoder import PairHead
 
@@ -157,29 +158,24 @@ def fuse_views(measured: Tensor, log_scale: Tensor) -> PairMeasurement:
         measured: ``(views, ..., 3)``; log_scale: logarithm of their scales ``(views, ..., 2)``.
     """
     asked = torch.is_grad_enabled() and (measured.requires_grad or log_scale.requires_grad)
-    if not asked and measured.device.type == "cpu":
-        return _fused(measured, log_scale)
-    precision = torch.exp(-2.0 * log_scale)
+    if asked or measured.device.type != "cpu":
+        return PairMeasurement(*_fused(measured, log_scale))
+    # For some pairs the calls of torch cost more than their arithmetic.
+    fused = _fused(measured.detach().double().numpy(), log_scale.detach().double().numpy())
+    return PairMeasurement(*(torch.from_numpy(values).to(measured.dtype) for values in fused))
+
+
+def _fused(measured: Values, log_scale: Values) -> tuple[Values, Values, Values]:
+    """Pose ``(..., 3)``, logarithm of its scale ``(..., 2)`` and of how far the views disagree ``(..., 2)``."""
+    of = library(measured)
+    precision = of.exp(-2.0 * log_scale)
     error = se2.wrapped(measured - measured[0])
-    weight, mean = precision, torch.zeros_like(measured[0])
+    weight, mean, squares = precision, error[0], precision
     for _ in range(_REWEIGHTINGS + 1):
         by_component = weight[..., [0, 0, 1]]
         mean = (by_component * error).sum(0) / by_component.sum(0)
-        left = (error - mean).square()
-        squares = torch.stack((left[..., 0] + left[..., 1], left[..., 2]), dim=-1)
+        left = (error - mean) ** 2
+        squares = of.stack((left[..., 0] + left[..., 1], left[..., 2]), axis=-1)
         weight = precision / (1.0 + 0.25 * precision * squares)
-    spread = ((weight * squares).sum(0) / weight.sum(0)).sqrt().clamp(min=SMALLEST_SPREAD).log()
-    return PairMeasurement(se2.wrapped(measured[0] + mean), -0.5 * weight.sum(0).log(), spread)
-
-
-def _fused(measured: Tensor, log_scale: Tensor) -> PairMeasurement:
-    """``fuse_views`` compiled: for some pairs its calls of torch cost more than their arithmetic."""
-    # The compiler's library takes 100 MB: only those pay for it that fuse.
-    from ngo_estimator.loops.view_fusion_kernel import fuse
-
-    views, *shape, _ = measured.shape
-    poses, scales = (
-        rows.detach().double().reshape(views, -1, rows.shape[-1]).numpy() for rows in (measured, log_scale)
-    )
-    fused = fuse(poses, scales, _REWEIGHTINGS, SMALLEST_SPREAD)
-    return PairMeasurement(*(torch.from_numpy(rows).to(measured.dtype).reshape(*shape, -1) for rows in fused))
+    spread = of.log(of.sqrt((weight * squares).sum(0) / weight.sum(0)).clip(SMALLEST_SPREAD))
+    return se2.wrapped(measured[0] + mean), -0.5 * of.log(weight.sum(0)), spread

@@ -1,22 +1,32 @@
-"""Loop closing: each iteration judges the loops under the current poses, and closes them by a Gauss-Newton step.
-
-Not in the paper, whose attention has to learn loop closures.
-"""
+"""Loop closing: each iteration judges the loops under the current poses, and closes them by a Gauss-Newton step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.graph.gauss_newton import chain_factors, gauss_newton_step, pair_factors, step_information
+from ngo_estimator.geometry.se2 import Values, library
+from ngo_estimator.graph.gauss_newton import chain_nodes, gauss_newton_step, pick, relative_factors
 from ngo_estimator.loops.loop_closure import Loops
-from ngo_estimator.ngo.loop_gates import RobustLoopGate
-from ngo_estimator.ngo.loop_residuals import loop_residuals, odometry_variances, spread_over_span
-from ngo_estimator.ngo.meta_poses import ClosedLoops, GraphState, MetaSteps
+from ngo_estimator.ngo.loop_gates import (
+    JudgedLoops,
+    RobustLoopGate,
+    chained,
+    is_single,
+    loop_residuals,
+    odometry_variances,
+    unchained,
+)
+from ngo_estimator.ngo.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
+
+if TYPE_CHECKING:
+    from ngo_estimator.graph.normal_equations import FactorisedInformation, GraphStructure
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -24,19 +34,8 @@ OVERLAPS_AFTER = 2
 CHANNELS = 7
 """Channels in which the convolutions see the loops: spread residual, deviation (three each) and support."""
 
-
-@dataclass(frozen=True)
-class _GatedLoops:
-    """The loops under the poses of one iteration ``(batch, poses + 1, 3)``, origin in front.
-
-    ``residuals`` ``(batch, loops, 3)``; ``weights`` ``(batch, loops)``; ``information`` ``(batch, loops, 3)``.
-    """
-
-    poses: Tensor
-    loops: Loops
-    residuals: Tensor
-    weights: Tensor
-    information: Tensor
+_LEAST_WEIGHT = 1e-4
+"""Of a loop that an earlier solution knew: one of less weight has no share in the equations."""
 
 
 class NoLoopClosing:
@@ -57,7 +56,10 @@ class NoLoopClosing:
 
 
 class LoopClosing:
-    """Closes the loops of one optimisation, iteration by iteration, so that gradients can be asked for.
+    """Closes the loops of one optimisation, iteration by iteration.
+
+    For a batch, or where gradients are asked for, it works with tensors and the dense solver, else with arrays of the
+    only trajectory and the sparse one.
 
     Args:
         gate: how much each loop is trusted.
@@ -65,6 +67,7 @@ class LoopClosing:
         find_overlaps: gives further loops under corrected poses ``(batch, poses + 1, 3)``, or None.
         odometry_noise: ``(3,)`` factors between the deviations of ``steps`` and those of the odometry's real errors.
         correction_std: ``(3,)`` unit of residuals and deviations for the convolutions.
+        solution: an earlier one, whose trust in the loops that it knew stays; only new ones are judged.
     """
 
     def __init__(
@@ -75,30 +78,60 @@ class LoopClosing:
         find_overlaps: Callable[[Tensor], Loops | None],
         odometry_noise: Tensor,
         correction_std: Tensor,
+        solution: Solution | None = None,
     ) -> None:
-        self._gate, self._steps, self._loops, self._find_overlaps = gate, steps, loops, find_overlaps
-        self._odometry_noise, self._correction_std = odometry_noise, correction_std
-        self._gated: _GatedLoops
-        self._closed: ClosedLoops | None = None
+        self._keys, self._find_overlaps, self._correction_std = steps.key_frames, find_overlaps, correction_std
+        self._is_single = is_single(steps)
+        self._gate = gate.values(self._is_single)
+        self._std, self._noise = self._given(steps.std), self._given(odometry_noise)
+        self._new: np.ndarray | None = None
+        self._weights: Any
+        self._information: Any
+        if solution is not None:
+            self._new = np.flatnonzero(~solution.known)
+            self._weights, self._information = solution.weights.clip(0.0), solution.information.clip(0.0)
+            self._shared = np.where(solution.known, solution.weights >= _LEAST_WEIGHT, loops.valid[0].numpy())
+        self._take(loops)
+        self._equations: FactorisedInformation | None = None
+        self._begun = False
+
+    def _take(self, loops: Loops) -> None:
+        self._loops = loops
+        self._structure: GraphStructure | None = None
+        self._judged: JudgedLoops[Any]
+        if not self._is_single:
+            self._judged = JudgedLoops.of(loops)
+        elif self._new is None:
+            self._judged = JudgedLoops.of_single(loops)
+            self._shared = self._judged.valid
+        else:
+            self._judged = JudgedLoops.of_single(loops, self._new)
+
+    def _given(self, tensor: Tensor) -> Any:
+        """Values of this batch, or arrays of the only trajectory."""
+        values = tensor.double()
+        if not self._is_single:
+            return values
+        return (values[0] if values.dim() > 1 else values).numpy()
+
+    def _returned(self, values: Any) -> Tensor:
+        """Tensors of what ``_given`` gave."""
+        return torch.from_numpy(values).unsqueeze(0) if self._is_single else values
 
     @property
     def closed(self) -> ClosedLoops:
         """The loops of the last ``close``; raises ``RuntimeError`` before it."""
-        if self._closed is None:
+        if not self._begun:
             raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
-        return self._closed
+        weights, information = self._returned(self._weights), self._returned(self._information)
+        return ClosedLoops(self._loops, weights, information, self._equations)
 
     def look(self, state: GraphState, iteration: int) -> None:
         """Judge the loops under the current poses; the third iteration adds overlaps to them."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
-            self._loops = self._loops.and_also(overlaps)
-        loops, poses = self._loops, state.poses
-        residuals = loop_residuals(loops, poses)
-        expected = odometry_variances(loops.start, loops.end + 1, poses, state.step_std.square()).to(poses.dtype)
-        if loops.most_drift is not None:
-            expected = torch.minimum(expected, loops.most_drift)
-        weights, information = self._gate(loops, residuals, expected, iteration)
-        self._gated = _GatedLoops(poses, loops, residuals, weights, information)
+            self._take(self._loops.and_also(overlaps))
+        adjusted, deviation, step_std = (self._given(x) for x in (state.adjusted, state.deviation, state.step_std))
+        self._look(adjusted, deviation, step_std, iteration)
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """Take a Gauss-Newton step from the poses of the last ``look``, so that the gated loops close.
@@ -107,31 +140,129 @@ class LoopClosing:
             stiffness: ``(batch, blocks, 3)`` or ``(3,)``: logarithm of a factor of the odometry's deviations, which is
                 then limited to -3 to 3.
         """
-        gated, keys, base_std = self._gated, self._steps.key_frames, self._steps.std
-        own = base_std[:, keys:] * torch.exp(3.0 * torch.tanh(stiffness / 3.0)) * self._odometry_noise
-        step_std = torch.cat((base_std[:, :keys], own), dim=1)
-        # Sums over hundreds of poses need more digits than float32 has.
-        poses = gated.poses.double()
-        odometry = step_information(step_std.double())
+        step_std = self._softened(stiffness)
+        deviation = self._close(step_std)
+        return replace(state, deviation=self._returned(deviation), step_std=self._returned(step_std))
+
+    def resume(
+        self, adjusted: Tensor, stiffness: Tensor, relative: Tensor, iterations: Sequence[int]
+    ) -> tuple[Tensor, Tensor]:
+        """Corrected relative poses and deviations of the steps, both ``(1, poses, 3)``, by a warm start.
+
+        Args:
+            adjusted: relative poses ``(1, poses, 3)`` with all adjustments; stiffness: as of ``close``.
+            relative: those of the earlier solution.
+            iterations: as which the loops that it did not know are judged.
+        """
+        own, step_std, softened = self._given(adjusted), self._std, self._softened(stiffness)
+        deviation = se2.wrapped(self._given(relative) - own)
+        for iteration in iterations:
+            self._look(own, deviation, step_std, iteration)
+            deviation, step_std = self._close(softened), softened
+        return self._returned(own + deviation), self._returned(softened)
+
+    def _look(self, adjusted: Any, deviation: Any, step_std: Any, iteration: int) -> None:
+        self._adjusted, self._deviation, self._poses = adjusted, deviation, chained(adjusted + deviation)
+        loops, poses = self._judged, self._poses
+        if self._new is not None and not len(self._new):
+            return
+        expected = odometry_variances(loops.nodes, poses, step_std**2)
+        if loops.most_drift is not None:
+            expected = library(expected).minimum(expected, loops.most_drift)
+        residuals = loop_residuals(loops.nodes, loops.measured, poses)
+        judged = self._gate.judged(loops, residuals, expected, iteration)
+        if self._new is None:
+            self._weights, self._information = judged
+        else:
+            self._weights[self._new], self._information[self._new] = judged
+
+    def _softened(self, stiffness: Tensor) -> Any:
+        """Deviations ``(..., poses, 3)`` with which the odometry is believed."""
+        of = library(self._std)
+        factor = of.exp(3.0 * of.tanh(self._given(stiffness) / 3.0)) * self._noise
+        return of.concatenate((self._std[..., : self._keys, :], self._std[..., self._keys :, :] * factor), axis=-2)
+
+    def _close(self, step_std: Any) -> Any:
+        """What loops change in the relative poses ``(..., poses, 3)`` after a Gauss-Newton step."""
+        self._begun = True
+        # It begins at the poses under which the loops were judged, before the network adjusted the odometry.
+        solve = self._sparse_step if self._is_single else self._dense_step
+        after = self._poses + solve(1.0 / step_std**2)
+        return se2.wrapped(unchained(after) - self._adjusted)
+
+    def _dense_step(self, odometry: Tensor) -> Tensor:
+        """Changes ``(batch, poses + 1, 3)`` of all poses, with gradients; ``odometry`` is the steps' information."""
+        poses, loops = self._poses, self._judged
+        # The information of a loop is the same along x and y, so that its axes may be turned.
+        residuals = loop_residuals(loops.nodes, loops.measured, poses)
+        turned = se2.rotate(-pick(poses, loops.nodes[..., 0])[..., 2], residuals[..., :2])
         factors = [
-            chain_factors(poses, state.deviation.double(), odometry),
-            pair_factors(gated.loops.nodes, poses, gated.residuals.double(), gated.information.double()),
+            relative_factors(chain_nodes(odometry.shape[1]).to(poses.device), poses, -self._deviation, odometry),
+            relative_factors(
+                loops.nodes, poses, torch.cat((turned, residuals[..., 2:]), dim=-1), self._information.double()
+            ),
         ]
-        change = gauss_newton_step(factors, poses.shape[1])
-        after, before = se2.g2r(torch.cat((poses + change, poses))[:, 1:]).chunk(2)
-        deviation = state.deviation + se2.wrapped(after - before).to(state.deviation.dtype)
-        self._closed = ClosedLoops(gated.loops, gated.weights, gated.information, None)
-        return replace(state, deviation=deviation, step_std=step_std)
+        return gauss_newton_step(factors, poses.shape[1])
+
+    def _sparse_step(self, odometry: np.ndarray) -> np.ndarray:
+        """The same changes ``(poses + 1, 3)`` without gradients."""
+        # The compiler's library takes 100 MB: only those pay for it that optimise.
+        from ngo_estimator.graph import normal_equations as sparse
+
+        if self._structure is None:
+            self._used = np.flatnonzero(self._shared)
+            self._measured = self._loops.measured[0].double().numpy()[self._used]
+            chain = np.arange(len(odometry))
+            ends = self._loops.start[0].numpy(), self._loops.end[0].numpy() + 1
+            loops = np.stack(ends, axis=-1)[self._used]
+            nodes = np.concatenate((np.stack((chain, chain + 1), axis=-1), loops))
+            self._structure = sparse.GraphStructure(nodes, len(odometry) + 1)
+        relative = np.concatenate((self._adjusted, self._measured))
+        information = sparse.diagonal_information(np.concatenate((odometry, self._information[self._used])))
+        self._equations = equations = sparse.NormalEquations(self._structure, self._poses, relative, information)
+        return equations.solution()
 
     def channels(self, state: GraphState) -> Tensor:
         """The loops of the last ``look`` for the convolutions ``(batch, blocks, CHANNELS)``.
 
         Their residuals are spread over the loops, in the frame of each pose; the deviation and support there follow.
         """
-        gated, keys, poses = self._gated, self._steps.key_frames, state.poses
-        spread, support = spread_over_span(gated.loops, gated.residuals, gated.weights, state.adjusted.shape[1])
-        spread, support = spread[:, keys:], support[:, keys:]
-        local = torch.cat((se2.rotate(-poses[:, keys:-1, 2], spread[..., :2]), spread[..., 2:]), dim=-1)
-        bent = torch.cat((local, state.deviation[:, keys:]), dim=-1)
+        loops, poses, keys = self._judged, self._poses, self._keys
+        residuals = loop_residuals(loops.nodes, loops.measured, poses)
+        spread, support = spread_over_span(loops.nodes, residuals, self._weights, poses.shape[-2] - 1)
+        spread, support = spread[..., keys:, :], support[..., keys:, :]
+        of, local = library(poses), se2.rotate(-poses[..., keys:-1, 2], spread[..., :2])
+        unit = self._given(self._correction_std)
         # At first, residuals of many standard deviations are usual: the convolutions see their logarithm.
-        return torch.cat((torch.asinh(bent / self._correction_std.repeat(2)), torch.log1p(support)), dim=-1)
+        seen = (
+            of.arcsinh(local / unit[:2]),
+            of.arcsinh(spread[..., 2:] / unit[2:]),
+            of.arcsinh(self._deviation[..., keys:, :] / unit),
+            of.log1p(support),
+        )
+        return self._returned(of.concatenate(seen, axis=-1)).to(state.features)
+
+
+def spread_over_span(nodes: Values, values: Values, weights: Values, steps: int) -> tuple[Values, Values]:
+    """Spread a value of each loop evenly over its meta-steps, and average over the loops.
+
+    Args:
+        nodes: both ends ``(..., loops, 2)``; values: ``(..., loops, channels)``; weights: ``(..., loops)``.
+
+    Returns:
+        Weighted mean of value / length ``(..., steps, channels)`` and sum of weights ``(..., steps, 1)``.
+    """
+    of, start, end = library(values), nodes[..., 0], nodes[..., 1]
+    weights = weights[..., None]
+    payload = of.concatenate((values / (end - start)[..., None] * weights, weights), axis=-1)
+    if isinstance(nodes, np.ndarray):
+        edges = np.zeros((steps + 1, payload.shape[-1]))
+        np.add.at(edges, start, payload)
+        np.subtract.at(edges, end, payload)
+    else:
+        edges = payload.new_zeros(payload.shape[0], steps + 1, payload.shape[2])
+        index = torch.cat((start, end), dim=1).unsqueeze(-1).expand(-1, -1, payload.shape[2])
+        edges = edges.scatter_add(1, index, torch.cat((payload, -payload), dim=1))
+    spread = of.cumsum(edges, axis=-2)[..., :-1, :]
+    total = spread[..., -1:].clip(0.0)
+    return spread[..., :-1] / (total + 1e-3), total

@@ -1,6 +1,6 @@
 """How likely a loop joins one place, and how far it may be off: learned from what is known of it before it is closed.
 
-Not in the paper. In mazes the pair head and the ranges tell places well, on maps that nobody trained on poorly: of the
+In mazes the pair head and the ranges tell places well, on maps that nobody trained on poorly: of the
 loops that the pair head is sure of there, one in twenty joins one place. The odometry between the two poses and other
 loops nearby tell much more, and how much each of them is worth depends on the others
 (docs/explanation/findings.md). The judge is small, and learns from true poses (``training.train_loop_judge``).
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ngo_estimator.geometry import se2
 from ngo_estimator.graph.gauss_newton import pick
 from ngo_estimator.loops.loop_closure import Loops
-from ngo_estimator.ngo.loop_residuals import loop_residuals, odometry_variances
+from ngo_estimator.ngo.loop_gates import loop_residuals, odometry_variances
 from ngo_estimator.ngo.meta_poses import MetaSteps, with_origin
 
 WITHIN = 3.0
@@ -98,9 +98,9 @@ def evidence_of(loops: Loops, steps: MetaSteps) -> tuple[Tensor, Tensor]:
     end, both say the same if they agree.
     """
     poses = with_origin(se2.r2g(steps.relative.double()))
-    variance = odometry_variances(loops.start, loops.end + 1, poses, steps.std.double().square())
+    variance = odometry_variances(loops.nodes, poses, steps.std.double().square())
     noise = variance.new_tensor((_NOISE_M, _NOISE_M, _NOISE_RAD)).square()
-    squared = loop_residuals(loops, poses).square() / (variance + noise)
+    squared = loop_residuals(loops.nodes, loops.measured, poses).square() / (variance + noise)
     allowed = loops.valid & (squared.sum(-1) <= WITHIN**2)
     neighbours = [_neighbours(loops, poses, allowed, batch) for batch in range(len(allowed))]
     agreeing, others = (torch.stack(column) for column in zip(*neighbours, strict=True))

@@ -7,10 +7,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.graph.gauss_newton import chain_factors, node_covariance, pair_factors, step_information
+from ngo_estimator.geometry.se2 import Values, library
+from ngo_estimator.graph.gauss_newton import chain_nodes, node_covariance, relative_factors, step_information
 from ngo_estimator.loops.loop_closure import Loops
 
 if TYPE_CHECKING:
@@ -41,15 +42,23 @@ class MetaSteps:
         """Relative meta-poses in front of the blocks."""
         return self.relative.shape[1] - self.blocks
 
+    def without_fixed(self, before: Tensor, after: Tensor, stiffness: Tensor) -> tuple[Tensor, Tensor]:
+        """Relative poses ``(batch, poses, 3)`` and stiffness after both phases; those of fixed blocks as ``before``."""
+        if self.fixed is None:
+            return after, stiffness
+        which = self.fixed.unsqueeze(-1)
+        whole = nn.functional.pad(which, (0, 0, self.key_frames, 0))
+        return torch.where(whole, before, after), torch.where(which, torch.zeros_like(stiffness), stiffness)
+
 
 @dataclass(frozen=True)
 class GraphState:
     """The meta-poses between two iterations.
 
     ``adjusted`` ``(batch, poses, 3)`` are the relative poses of the odometry with all adjustments so far, the paper's
-    Delta P. ``deviation`` ``(batch, poses, 3)`` is what closing loops has added to them. ``step_std`` ``(batch, poses,
-    3)`` are the deviations with which the odometry is believed, ``features`` ``(batch, blocks, width)`` the paper's F
-    (width 0 without a network).
+    Delta P. ``deviation`` ``(batch, poses, 3)``, float64, is what closing loops has added to them. ``step_std``
+    ``(batch, poses, 3)`` are the deviations with which the odometry is believed, ``features`` ``(batch, blocks,
+    width)`` the paper's F (width 0 without a network).
     """
 
     adjusted: Tensor
@@ -62,7 +71,8 @@ class GraphState:
         """The state before the first iteration."""
         batch, poses, _ = steps.relative.shape
         features = steps.relative.new_zeros(batch, poses, 0) if steps.features is None else steps.features
-        return cls(steps.relative, torch.zeros_like(steps.relative), steps.std, features)
+        # Sums over hundreds of poses need more digits than float32 has.
+        return cls(steps.relative, torch.zeros_like(steps.relative, dtype=torch.float64), steps.std, features)
 
     @property
     def relative(self) -> Tensor:
@@ -80,7 +90,8 @@ class ClosedLoops:
     """The loops of an iteration, and the belief in them.
 
     ``weights`` ``(batch, loops)`` from zero to one, ``information`` ``(batch, loops, 3)`` (1/m^2, 1/m^2, 1/rad^2) along
-    the axes of the map. ``equations`` are those of the Gauss-Newton step; None if a gradient was asked for.
+    the axes of the map, the same along x and y. ``equations`` are those of the Gauss-Newton step; None if a gradient
+    was asked for.
     """
 
     loops: Loops
@@ -156,11 +167,13 @@ class OptimizedMetaPoses:
             # They are linearised before the last step. That step was small, and all else is the same.
             return torch.from_numpy(self.equations.covariance([self.step_std.shape[1]])).unsqueeze(0)
         poses = with_origin(se2.r2g(self.meta_relative[-1].double()))
-        information = step_information(self.step_std.double())
-        factors = [chain_factors(poses, torch.zeros_like(poses[:, 1:]), information)]
+        measured = [(chain_nodes(poses.shape[1] - 1).to(poses.device), step_information(self.step_std.double()))]
         if self.closed is not None:
-            residual = torch.zeros_like(self.closed.information)
-            factors.append(pair_factors(self.closed.loops.nodes, poses, residual, self.closed.information))
+            measured.append((self.closed.loops.nodes, self.closed.information.double()))
+        factors = [
+            relative_factors(nodes, poses, torch.zeros_like(information), information)
+            for nodes, information in measured
+        ]
         return node_covariance(factors, poses.shape[1], poses.shape[1] - 1)
 
 
@@ -171,6 +184,8 @@ class OptimizedTrajectory(OptimizedMetaPoses):
     poses: Tensor = field(kw_only=True)
 
 
-def with_origin(poses: Tensor) -> Tensor:
-    """Global poses ``(batch, poses + 1, 3)`` with the origin in front."""
-    return torch.cat((torch.zeros_like(poses[:, :1]), poses), dim=1)
+def with_origin(poses: Values) -> Values:
+    """Rows ``(..., n + 1, k)``, of which the first is zero: of poses ``(..., n, k)`` those with the origin in front."""
+    of = library(poses)
+    padded: Values = of.concatenate((of.zeros_like(poses[..., :1, :]), poses), axis=-2)
+    return padded

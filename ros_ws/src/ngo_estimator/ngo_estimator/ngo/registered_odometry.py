@@ -1,6 +1,6 @@
 """Odometry measured again: every frame of a block is registered to the frame where the block begins.
 
-Not in the paper, whose meta-poses are as good as the local odometry. Errors of single steps no longer add up within a
+The paper's meta-poses are as good as the local odometry. With this, errors of single steps no longer add up within a
 block, and what is left of them is known.
 """
 

@@ -1,0 +1,69 @@
+"""Graduated non-convexity over truncated least squares, with one Gauss-Newton step a stage (Yang et al. 2020).
+
+The first stage is all but convex, so that wrong loops pull little and the poses may go far; the last one believes a
+loop or does not. How many stages there are follows from the graph's own largest residual.
+"""
+
+import numpy as np
+
+from ngo_estimator.graph.corrector import STEP_LIMIT, GraphProblem, normal_equations, thresholds
+from ngo_estimator.graph.normal_equations import GraphStructure
+
+_GROWTH = 1.4
+"""Of the control from stage to stage."""
+
+_NEAR_GROWTH = 2.0
+"""The same where poses are nearly right."""
+
+_MOST_STAGES = 100
+_LEAST_STEP = 1e-3
+"""Size of a step (m, rad) below which the poses have converged."""
+
+_LEAST_WEIGHT = 1e-6
+"""Of a step that broke: all nodes stay in one piece."""
+
+_SPARSER = 0.7
+"""The structure is worked out anew where so few of its loops still have a weight."""
+
+
+def graduate(
+    problem: GraphProblem, poses: np.ndarray, control: float | None = None, steps_break: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses ``(nodes, 3)``, and weights of loops ``(loops,)`` and of steps ``(nodes - 1,)``, from poses on.
+
+    ``control`` is where to begin: without it so that every residual is on the convex side; 1 and above is close to the
+    truncated cost, as for poses that are nearly right.
+    """
+    poses, limits = poses.copy(), thresholds(problem.loops)
+    squared = (problem.loops.residuals(poses) ** 2).sum(1) / limits
+    growth = _NEAR_GROWTH if control else _GROWTH
+    if control is None:
+        control = 1.0 / max(2.0 * float(squared.max(initial=0.0)) - 1.0, 1e-3)
+    step_weights = np.ones(len(problem.steps))
+    rows, loops, structure = np.zeros(0, np.int64), problem.loops[:0], None
+    for _ in range(_MOST_STAGES):
+        weights = problem.trust * _weights(squared, control)
+        believed = np.flatnonzero(weights > 0.0)
+        if structure is None or len(believed) < _SPARSER * len(rows) or not np.isin(believed, rows).all():
+            rows, loops = believed, problem.loops[believed]
+            structure = GraphStructure(np.concatenate((problem.steps.nodes, loops.nodes)), len(poses))
+        parts = (problem.steps, step_weights), (loops, weights[rows])
+        step = normal_equations(poses, *parts, structure=structure).solution()
+        poses = poses + step
+        squared = (problem.loops.residuals(poses) ** 2).sum(1) / limits
+        if steps_break:
+            off = (problem.steps.residuals(poses) ** 2).sum(1) / STEP_LIMIT
+            step_weights = np.maximum(_weights(off, control), _LEAST_WEIGHT)
+        decided = _weights(squared, control)
+        if np.abs(step).max() < _LEAST_STEP and ((decided < 0.01) | (decided > 0.99)).all():
+            break
+        control *= growth
+    poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
+    return poses, problem.trust * (squared <= 1.0), step_weights
+
+
+def _weights(squared: np.ndarray, control: float) -> np.ndarray:
+    """Weights for residuals ``(n,)``, squared and by their threshold (Yang et al. 2020, eq. 14)."""
+    between = np.sqrt(control * (control + 1.0) / np.maximum(squared, 1e-30)) - control
+    weights: np.ndarray = np.clip(between, 0.0, 1.0)
+    return weights

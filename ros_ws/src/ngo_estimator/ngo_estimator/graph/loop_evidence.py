@@ -1,0 +1,102 @@
+"""What speaks for each loop and against it before a graph is solved, and whether covariances are as stated.
+
+A right loop's residual is Gaussian, with a covariance that the graph gives; a wrong one's is anything on the map.
+"""
+
+import math
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ngo_estimator.graph.corrector import GraphProblem
+from ngo_estimator.graph.cycle_agreement import ChainUncertainty
+from ngo_estimator.graph.normal_equations import NormalEquations
+from ngo_estimator.graph.relative_poses import RelativePoses
+
+_PARTNERS = 16
+"""Loops that each is compared with: those whose ends are nearest to its own, along the chain."""
+
+_MOST_SUPPORT = 7.0
+"""What agreeing partners can say for a loop, log odds: in a group that is wrong together all agree."""
+
+_SCALES = np.exp(np.linspace(math.log(1e-3), math.log(1e3), 61))
+_ROUNDS = 12  # of expectation and maximisation, for the share of right loops
+_FEW = 30  # loops from which on a scale and a share are estimated
+_LARGEST = 50.0  # log odds of one cycle, either way
+
+
+def map_area(poses: np.ndarray) -> float:
+    """Area (m^2) where the end of a wrong loop may lie: the square around all poses."""
+    return float(max(np.ptp(poses[:, :2], axis=0).max(), 1.0) ** 2)
+
+
+def likelihood_ratio(
+    squared: np.ndarray, log_determinant: np.ndarray, degrees: np.ndarray, area: float, scale: float = 1.0
+) -> np.ndarray:
+    """Log of how much likelier residuals ``(n,)`` are for right loops than for wrong ones.
+
+    Args:
+        squared, log_determinant: squared length of the residuals in deviations, and of their covariances.
+        degrees: directions that each knows: x and y, or the yaw, too.
+        area: see ``map_area``; scale: factor of the covariances.
+    """
+    wrong = math.log(area) + np.where(degrees > 2, math.log(2.0 * math.pi), 0.0)
+    ratio: np.ndarray = wrong - 0.5 * (squared / scale + log_determinant + degrees * math.log(2.0 * math.pi * scale))
+    return ratio
+
+
+def scale_and_share(chain: ChainUncertainty, loops: RelativePoses, area: float) -> tuple[float, float]:
+    """How many times as large as stated variances are, and the share of right loops, by cycles with the chain alone.
+
+    The likeliest mixture of right and wrong loops. Both are 1 and a half where there are few loops.
+    """
+    if len(loops) < _FEW:
+        return 1.0, 0.5
+    squared, logs = chain.off_chain(loops)
+    best = (-math.inf, 1.0, 0.5)
+    for scale in _SCALES.tolist():
+        ratio = np.clip(likelihood_ratio(squared, logs, loops.degrees, area, scale), -_LARGEST, _LARGEST)
+        share = 0.5
+        for _ in range(_ROUNDS):
+            share = float(np.clip((1.0 / (1.0 + np.exp(-ratio) * (1.0 - share) / share)).mean(), 0.05, 0.95))
+        best = max(best, (float(np.log(share * np.exp(ratio) + 1.0 - share).sum()), scale, share))
+    return best[1], best[2]
+
+
+def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, share: float) -> np.ndarray:
+    """Log odds ``(n,)`` of loops by their cycles with the chain and with each other; ``share`` of them are right."""
+    odds = likelihood_ratio(*chain.off_chain(loops), loops.degrees, area)
+    odds += math.log(share / (1.0 - share))
+    whole = np.flatnonzero(loops.degrees == 3)
+    if len(whole) > 1:
+        odds[whole] += np.minimum(_support(chain, loops[whole], area, share), _MOST_SUPPORT)
+    return odds
+
+
+def _support(chain: ChainUncertainty, loops: RelativePoses, area: float, share: float) -> np.ndarray:
+    """What their partners say of loops ``(n,)``, log odds: each of these is right as often as ``share`` says."""
+    ends, count = loops.nodes.astype(np.float64), min(_PARTNERS + 1, len(loops))
+    partner = KDTree(ends).query(ends, k=count, p=1)[1]
+    pairs = np.stack((np.repeat(np.arange(len(loops)), count), partner.ravel()), axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    ratio = likelihood_ratio(*chain.off_pairs(loops, pairs), np.full(len(pairs), 3), area)
+    each = np.log(share * np.exp(np.minimum(ratio, _LARGEST)) + 1.0 - share)
+    return np.bincount(pairs[:, 0], each, len(loops))
+
+
+def predicted_odds(
+    problem: GraphProblem, poses: np.ndarray, equations: NormalEquations, area: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log likelihood ratios ``(loops,)`` of loops that a graph does not believe yet, and their squared residuals.
+
+    ``equations`` are the graph's at ``poses``; all loops must be in its structure. The squared residuals ``(loops,)``
+    are whitened by the covariance of the graph and of the loop together.
+    """
+    loops = problem.loops
+    jacobian = loops.whitened_jacobian(poses)
+    total = jacobian @ equations.pair_covariances(loops.nodes) @ jacobian.mT + np.eye(3)
+    residuals = loops.residuals(poses)
+    squared = (residuals * np.linalg.solve(total, residuals[..., None])[..., 0]).sum(1)
+    known = np.einsum("kii->ki", loops.root)
+    logs = np.linalg.slogdet(total)[1] - 2.0 * np.log(np.where(known != 0.0, np.abs(known), 1.0)).sum(1)
+    return likelihood_ratio(squared, logs, loops.degrees, area), squared

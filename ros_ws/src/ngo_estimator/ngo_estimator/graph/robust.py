@@ -1,0 +1,141 @@
+"""The robust corrector: no network, and right with most loops wrong.
+
+Two ways lead to a solution, and one cost judges between them: graduated non-convexity over all loops that the cycles do
+not rule out, and belief in the surest loops first. Covariances that are not as stated are scaled, which the cycles tell
+before anything is solved, and the residuals of what is believed tell afterwards.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, normal_equations, truncated_cost
+from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
+from ngo_estimator.graph.graduated import graduate
+from ngo_estimator.graph.loop_evidence import cycle_odds, map_area, scale_and_share
+from ngo_estimator.graph.normal_equations import GraphStructure
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.surest_first import believe
+
+_MISSTATED = 2.0
+"""Variances that are off by less than this factor, either way, are taken as stated."""
+
+_NEAR = 1.0
+"""Where graduated non-convexity begins at poses that are nearly right."""
+
+_GROWN = 1.25
+"""A solution from nothing is worth its time once there are so many times as many loops as at the last one."""
+
+_MOST_FILLED = 2_000_000
+"""Blocks that one factorisation may multiply: where loops would fill it, the likeliest of them come first."""
+
+_FEWER = 0.7
+"""How many loops are tried where those before are too many."""
+
+_LEAST_REDUNDANCY = 30.0
+"""Degrees of freedom from which on residuals tell a scale."""
+
+
+class Robust:
+    """A ``Corrector`` by graduated non-convexity and by belief in the surest loops first."""
+
+    def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
+        """Solve a problem; see ``Corrector``.
+
+        A warm solution lets new loops in by what the graph predicts of them. Once there are many more loops than at the
+        last solution from nothing, there is one again, and the better one is kept.
+        """
+        loops = len(problem.loops)
+        if loops == 0:
+            return CorrectedGraph(problem, problem.poses, np.zeros(0), np.ones(len(problem.steps)), 0.0)
+        if start is None or len(start.loop_weights) == 0:
+            return _from_nothing(problem)
+        warm = _warm(problem, start)
+        if loops < _GROWN * start.loops_from_nothing:
+            return warm
+        anew = _from_nothing(problem)
+        better = truncated_cost(problem, warm.poses, anew.scale, anew.scale) < anew.cost
+        return replace(warm, loops_from_nothing=loops) if better else anew
+
+
+def _from_nothing(problem: GraphProblem) -> CorrectedGraph:
+    """The better of two solutions that begin at the chain."""
+    area, scale, share = map_area(problem.poses), 1.0, 0.5
+    chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
+    whole = bool((problem.loops.degrees == 3).all())
+    if whole:
+        scale, share = scale_and_share(ChainUncertainty(problem.steps), problem.loops, area)
+        scale = _noticed(scale)
+        scaled = _scaled(problem, scale, scale)
+    odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, share)
+    rows = np.argsort(-odds, kind="stable")
+    if whole:  # places say too little of each other to rule one out
+        rows = rows[: np.count_nonzero(odds > 0.0)]
+    likely = _affordable(replace(scaled, poses=chain), rows)
+    ways = [graduate(likely, chain)[0], believe(likely, chain, np.zeros(len(likely.loops), bool), area, share)[0]]
+    best = min(ways, key=lambda poses: truncated_cost(scaled, poses))
+    solution = _polished(problem, best, scale, len(problem.loops))
+    # Cycles with the chain share its errors, so that they tell a scale roughly; what is left over tells it well.
+    if whole and scale not in (1.0, solution.loop_scale):
+        solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops))
+    return solution
+
+
+def _warm(problem: GraphProblem, start: CorrectedGraph) -> CorrectedGraph:
+    """The solution that the last one leads to."""
+    nodes, old = len(start.poses), len(start.loop_weights)
+    since = chain_poses(problem.steps.relative[nodes - 1 :], start.poses[-1])
+    poses = np.concatenate((start.poses, since[1:]))
+    believed = np.zeros(len(problem.loops), bool)
+    believed[:old] = start.loop_weights > 0.0
+    poses, _ = believe(_scaled(problem, start.scale, start.scale), poses, believed, map_area(poses))
+    return _polished(problem, poses, start.scale, start.loops_from_nothing)
+
+
+def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
+    """The problem with the first of these loops alone, as many as do not fill its factor."""
+    while True:
+        part = replace(problem, loops=problem.loops[rows], trust=problem.trust[rows], similarity=None)
+        structure = GraphStructure(np.concatenate((part.steps.nodes, part.loops.nodes)), len(part.poses))
+        if np.square(np.diff(structure.blocks.starts)).sum() <= _MOST_FILLED:
+            return part
+        rows = rows[: int(_FEWER * len(rows))]
+
+
+def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int) -> CorrectedGraph:
+    """The nearest solution of the truncated cost, with variances so many times as large as stated."""
+    scaled = _scaled(problem, scale, scale)
+    poses, loop_weights, step_weights = graduate(scaled, poses, _NEAR, steps_break=True)
+    cost = truncated_cost(scaled, poses)
+    solution = CorrectedGraph(problem, poses, loop_weights, step_weights, cost, scale, loops_from_nothing=loops)
+    of_steps, of_loops = _found_scales(scaled, solution)
+    return replace(solution, step_scale=_noticed(scale * of_steps), loop_scale=_noticed(scale * of_loops))
+
+
+def _noticed(scale: float) -> float:
+    return 1.0 if 1.0 / _MISSTATED < scale < _MISSTATED else scale
+
+
+def _scaled(problem: GraphProblem, step_scale: float, loop_scale: float) -> GraphProblem:
+    return replace(problem, steps=problem.steps.scaled(step_scale), loops=problem.loops.scaled(loop_scale))
+
+
+def _found_scales(problem: GraphProblem, solution: CorrectedGraph) -> tuple[float, float]:
+    """Chi-square per degree of freedom of the steps, and of the loops that are believed (Helmert's components).
+
+    An edge's degrees of freedom are those that the rest of the graph knows better than the edge.
+    """
+    rows = np.flatnonzero(solution.loop_weights > 0.0)
+    loops = problem.loops[rows]
+    parts = (problem.steps, solution.step_weights), (loops, solution.loop_weights[rows])
+    equations = normal_equations(solution.poses, *parts)
+
+    def found(edges: RelativePoses, weights: np.ndarray) -> float:
+        jacobian = edges.whitened_jacobian(solution.poses)
+        known = np.einsum("kij,kjl,kil->k", jacobian, equations.pair_covariances(edges.nodes), jacobian)
+        redundancy = float((weights * (edges.degrees - weights * known)).sum())
+        if redundancy < _LEAST_REDUNDANCY:
+            return 1.0
+        return float((weights * (edges.residuals(solution.poses) ** 2).sum(1)).sum()) / redundancy
+
+    return found(*parts[0]), found(*parts[1])

@@ -1,0 +1,68 @@
+"""Believes loops one handful after another, the surest first, each judged by what the graph knows by then.
+
+What is predicted well tells a right loop from a wrong one; every loop that is believed makes the rest predicted better.
+Loops that agree with each other and are wrong together have to pass the same test, each time in a better known graph.
+"""
+
+import math
+
+import numpy as np
+
+from ngo_estimator.graph.corrector import GraphProblem, normal_equations, thresholds
+from ngo_estimator.graph.loop_evidence import predicted_odds
+from ngo_estimator.graph.normal_equations import GraphStructure
+
+_MOST_ROUNDS = 40
+_SHARE = 0.25
+"""How many of the loops that may be believed are, in one round."""
+
+_AT_LEAST = 20
+"""The same in loops."""
+
+_LEAST_ODDS = math.log(10.0)
+"""Of a loop that is believed."""
+
+_SURELY_WRONG = 30.0
+"""A loop that is off by so many times its threshold leaves: what is known of it only grows."""
+
+_SPARSER = 0.7
+"""The structure is worked out anew where so few of its loops are left."""
+
+_AT_REST = 1e-2
+"""Size of a step (m, rad) below which no loop's verdict changes any more."""
+
+
+def believe(
+    problem: GraphProblem, poses: np.ndarray, believed: np.ndarray, area: float, share: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses ``(nodes, 3)`` and which loops are believed ``(loops,)``, beginning with those that are.
+
+    Args:
+        area: see ``map_area``.
+        share: of right loops, before anything is known of them.
+    """
+    poses, believed, limits = poses.copy(), believed.copy(), thresholds(problem.loops)
+    prior = math.log(share / (1.0 - share)) + np.log(np.maximum(problem.trust, 1e-9))
+    rows, structure = np.arange(len(problem.loops)), None
+    alive = np.ones(len(rows), bool)
+    for _ in range(_MOST_ROUNDS):
+        if structure is None or alive.sum() < _SPARSER * len(rows):
+            rows = np.flatnonzero(alive)
+            likely = GraphProblem(poses, problem.steps, problem.loops[rows], problem.trust[rows])
+            structure = GraphStructure(np.concatenate((likely.steps.nodes, likely.loops.nodes)), len(poses))
+        parts = (problem.steps, np.ones(len(problem.steps))), (likely.loops, believed[rows].astype(np.float64))
+        equations = normal_equations(poses, *parts, structure=structure)
+        step = equations.solution()
+        poses = poses + step
+        squared = (likely.loops.residuals(poses) ** 2).sum(1)
+        left = believed[rows] & (squared > limits[rows])
+        ratio, off = predicted_odds(likely, poses, equations, area)
+        odds = np.where(~believed[rows] & (off <= limits[rows]), ratio + prior[rows], -np.inf)
+        new = np.flatnonzero(odds > _LEAST_ODDS)
+        if len(new) == 0 and not left.any() and np.abs(step).max() < _AT_REST:
+            break
+        most = max(_AT_LEAST, int(_SHARE * len(new)))
+        believed[rows[left]] = False
+        believed[rows[new[np.argsort(-odds[new], kind="stable")[:most]]]] = True
+        alive[rows] = believed[rows] | (off <= _SURELY_WRONG * limits[rows])
+    return poses, believed

@@ -1,0 +1,167 @@
+"""The robust corrector: right with wrong loops of many kinds, and on clean graphs the least squares solution."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ngo_estimator.geometry.se2 import between
+from ngo_estimator.graph.corrector import GraphProblem, normal_equations
+from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.robust import Robust
+from tests.unit.ngo_estimator.graph.test_corrector import STD, loop, straight
+
+STEP_STD, LOOP_STD = np.array((0.02, 0.02, 0.004)), np.array((0.05, 0.05, 0.02))
+ROUND = 60
+"""Steps of one way around a square."""
+
+
+def square(
+    rounds: int, seed: int, wrong: int = 0, metric: bool = True, group: int = 1
+) -> tuple[GraphProblem, np.ndarray]:
+    """A robot that goes around a square; loops join a round to others, the last ``wrong`` of them wrongly.
+
+    The other value is the true poses. Wrong loops come in groups that agree with each other.
+    """
+    rng = np.random.default_rng(seed)
+    steps = np.tile((1.0, 0.0, 0.0), (rounds * ROUND, 1))
+    steps[:: ROUND // 4, 2] = math.pi / 2.0
+    true = chain_poses(steps)
+    measured = steps + rng.normal(0.0, STEP_STD, steps.shape)
+    nodes = np.stack((np.arange(len(steps)), np.arange(1, len(steps) + 1)), axis=1)
+    first = rng.integers(0, len(true) - ROUND, 2 * ROUND)
+    right = np.stack((first, first + ROUND), axis=1)
+    relative = between(true[right[:, 0]], true[right[:, 1]]) + rng.normal(0.0, LOOP_STD, (len(right), 3))
+    groups = -(-wrong // group)
+    start = rng.integers(0, len(true) - ROUND, groups)
+    shift = rng.integers(10, ROUND - 10, groups)
+    pairs = (np.stack((start, start + shift), axis=1)[:, None] + np.arange(group)[:, None]).reshape(-1, 2)[:wrong]
+    pairs = np.minimum(pairs, len(true) - 1)
+    pairs, relative = np.concatenate((right, pairs)), np.concatenate((relative, np.zeros((wrong, 3))))
+    deviations = np.tile(LOOP_STD if metric else (0.3, 0.3, math.inf), (len(pairs), 1))
+    loops = RelativePoses.of_deviations(pairs, relative, deviations)
+    chain = RelativePoses.of_deviations(nodes, measured, np.tile(STEP_STD, (len(steps), 1)))
+    return GraphProblem(chain_poses(measured), chain, loops, np.ones(len(loops))), true
+
+
+def worst(poses: np.ndarray, others: np.ndarray) -> float:
+    return float(np.hypot(*(poses - others)[:, :2].T).max())
+
+
+def least_squares(problem: GraphProblem) -> np.ndarray:
+    poses = problem.poses
+    for _ in range(10):
+        parts = [(edges, np.ones(len(edges))) for edges in (problem.steps, problem.loops)]
+        poses = poses + normal_equations(poses, *parts).solution()
+    return poses
+
+
+def test_a_loop_shares_its_error_by_the_variances() -> None:
+    """Three steps of 1 m and a loop of 2.8 m, all of one variance: each gives way by a quarter of 0.2 m."""
+    solution = Robust().correct(straight(3, loop(2.8, (STD, STD, STD))))
+    np.testing.assert_allclose(solution.poses[:, 0], [0.0, 0.95, 1.9, 2.85], atol=1e-6)
+    assert solution.loop_weights.tolist() == [1.0]
+    assert solution.cost == pytest.approx(4 * (0.05 / STD) ** 2)
+
+
+def test_without_loops_nothing_moves() -> None:
+    problem = straight(3, loop(3.0, (STD, STD, STD))[:0])
+    solution = Robust().correct(problem)
+    assert np.array_equal(solution.poses, problem.poses) and solution.cost == 0.0
+
+
+def test_a_clean_graph_has_its_least_squares_solution() -> None:
+    problem, _ = square(3, 1)
+    solution = Robust().correct(problem)
+    believed = solution.loop_weights > 0.0
+    assert believed.mean() > 0.95  # a hundredth is beyond its threshold by chance
+    kept = replace(problem, loops=problem.loops[believed], trust=problem.trust[believed])
+    np.testing.assert_allclose(between(solution.poses, least_squares(kept)), 0.0, atol=1e-4)
+    assert (solution.scale, solution.step_scale, solution.loop_scale) == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+@pytest.mark.parametrize("group", [1, 12])
+def test_wrong_loops_are_recognised(group: int, metric: bool) -> None:
+    """Two thirds of the loops are wrong, alone or in groups that agree, with a whole pose or only as a place."""
+    problem, true = square(4, 2, 4 * ROUND, metric, group)
+    solution = Robust().correct(problem)
+    believed, right = solution.loop_weights > 0.0, np.arange(len(problem.loops)) < 2 * ROUND
+    assert believed[right].mean() > 0.9 and believed[~right].mean() < 0.05
+    assert worst(solution.poses, true) < 0.5 * worst(problem.poses, true)
+
+
+def test_loops_without_trust_change_nothing() -> None:
+    problem, _ = square(2, 3)
+    solution = Robust().correct(replace(problem, trust=np.zeros(len(problem.loops))))
+    np.testing.assert_allclose(between(solution.poses, problem.poses), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [50.0, 0.02])
+def test_misstated_covariances_are_noticed(factor: float) -> None:
+    problem, _ = square(4, 4, ROUND)
+    stated = replace(problem, steps=problem.steps.scaled(factor), loops=problem.loops.scaled(factor))
+    solution, honest = Robust().correct(stated), Robust().correct(problem)
+    np.testing.assert_allclose([solution.step_scale * factor, solution.loop_scale * factor], 1.0, rtol=0.5)
+    assert worst(solution.poses, honest.poses) < 0.1
+    ratio = solution.covariance([100]) / honest.covariance([100])
+    assert 0.5 < ratio[0, 0] < 2.0
+
+
+def test_it_is_deterministic() -> None:
+    problem, _ = square(3, 5, ROUND)
+    one, other = Robust().correct(problem), Robust().correct(problem)
+    assert np.array_equal(one.poses, other.poses) and one.cost == other.cost
+
+
+def test_a_warm_start_ends_where_a_start_from_nothing_does() -> None:
+    """The graph grows, and its loops come in blocks; no verdict of the end differs."""
+    problem, _ = square(4, 6, ROUND)
+    order = np.argsort(problem.loops.nodes.max(1), kind="stable")
+    problem = replace(problem, loops=problem.loops[order])
+    solution = None
+    for nodes in (100, 150, 200, len(problem.poses)):
+        here = problem.loops.nodes.max(1) < nodes
+        part = GraphProblem(problem.poses[:nodes], problem.steps[: nodes - 1], problem.loops[here], problem.trust[here])
+        solution = Robust().correct(part, solution)
+    assert solution is not None
+    anew = Robust().correct(problem)
+    assert np.array_equal(solution.loop_weights, anew.loop_weights)
+    assert worst(solution.poses, anew.poses) < 1e-3
+
+
+def test_a_wrong_first_verdict_does_not_last() -> None:
+    """A warm start from a solution that believed the wrong loops alone finds the right ones."""
+    problem, _ = square(4, 7, ROUND)
+    first = Robust().correct(problem)
+    upside_down = replace(first, poses=problem.poses, loop_weights=1.0 - first.loop_weights, loops_from_nothing=1)
+    assert worst(Robust().correct(problem, upside_down).poses, first.poses) < 1e-2
+
+
+def test_cycles_have_the_covariance_of_what_is_in_them() -> None:
+    """Squared residuals of right cycles are chi-square with three degrees of freedom: 3 on average, variance 6."""
+    problem, true = square(3, 8)
+    pair, rng, found = np.array(((5, 66), (12, 70))), np.random.default_rng(0), []
+    for _ in range(400):
+        steps = replace(problem.steps, relative=between(true[:-1], true[1:]) + rng.normal(0.0, STEP_STD, (180, 3)))
+        relative = between(true[pair[:, 0]], true[pair[:, 1]]) + rng.normal(0.0, LOOP_STD, (2, 3))
+        loops = RelativePoses.of_deviations(pair, relative, np.tile(LOOP_STD, (2, 1)))
+        chain = ChainUncertainty(steps)
+        found.append((*chain.off_chain(loops)[0], chain.off_pairs(loops, np.array([[0, 1]]))[0][0]))
+    np.testing.assert_allclose(np.mean(found, axis=0), 3.0, atol=0.4)
+    np.testing.assert_allclose(np.var(found, axis=0), 6.0, atol=2.0)
+
+
+def test_covariances_of_pairs_are_those_of_a_dense_inverse() -> None:
+    problem, _ = square(2, 9)
+    parts = [(edges, np.ones(len(edges))) for edges in (problem.steps, problem.loops)]
+    equations = normal_equations(problem.poses, *parts)
+    pairs = problem.loops.nodes[:10]
+    for pair, joint in zip(pairs, equations.pair_covariances(pairs), strict=True):
+        if pair.min() > 0:
+            np.testing.assert_allclose(joint, equations.covariance(pair), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        equations.pair_covariances(np.array([[0, 1]]))[0, 3:, 3:], equations.covariance([1]), rtol=1e-6, atol=1e-12
+    )

@@ -1,0 +1,105 @@
+"""Graphs with wrong loops, the peers that solve them, and the table's numbers."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ngo_estimator.geometry.se2 import between, compose
+from ngo_estimator.graph.corrector import GraphProblem
+from ngo_estimator.graph.robust import Robust
+from training import results_graphs
+from training.baselines import graph_peers
+from training.baselines.lidar_peers import solve_with
+from training.scoring.graph_problems import KINDS, JudgedProblem, read_g2o, synthetic
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_graph_has_the_share_of_wrong_loops_that_was_asked_for(kind: str) -> None:
+    judged = synthetic(kind, 50.0, 400, True, 0)
+    loops = judged.problem.loops
+    assert (~judged.right).mean() == pytest.approx(0.5, abs=0.02)
+    # The chain's drift is far less than 2 m in so short a graph: it tells the right loops from the wrong ones.
+    poses = judged.problem.poses
+    off = np.hypot(*(loops.relative - between(poses[loops.nodes[:, 0]], poses[loops.nodes[:, 1]]))[:, :2].T)
+    assert np.median(off[judged.right]) < 1.0 and np.median(off[~judged.right]) > 2.0
+
+
+def test_a_place_alone_knows_no_heading() -> None:
+    judged = synthetic("random", 30.0, 400, False, 0)
+    assert (judged.problem.loops.degrees == 2).all()
+
+
+def test_the_error_is_that_after_the_best_alignment() -> None:
+    judged = synthetic("random", 30.0, 200, True, 1)
+    true = np.column_stack((judged.truth, np.zeros(200)))
+    assert judged.ate_m(compose(np.array((3.0, -2.0, 1.0)), true)) < 1e-9
+    assert judged.ate_m(true * (-1.0, 1.0, 1.0)) > 1.0  # a mirror is no motion
+
+
+@pytest.fixture(scope="module")
+def easy() -> JudgedProblem:
+    return synthetic("random", 30.0, 300, True, 2)
+
+
+@pytest.mark.parametrize("peer", results_graphs.PEERS)
+def test_peers_solve_an_easy_graph(easy: JudgedProblem, peer: str) -> None:
+    answer = graph_peers.within(results_graphs.PEERS[peer], easy.problem, 60)
+    assert answer is not None and easy.ate_m(answer[0]) < 0.5 and answer[1] > 0.0
+
+
+def test_our_corrector_finds_what_gtsam_finds_in_a_clean_graph(easy: JudgedProblem) -> None:
+    ours = Robust().correct(easy.problem)
+    kept = easy.problem.loops[ours.loop_weights > 0.0]
+    theirs = solve_with(None, easy.problem.steps, kept, easy.problem.poses)
+    np.testing.assert_allclose(between(ours.poses, theirs), 0.0, atol=1e-3)
+
+
+def test_a_peer_that_takes_too_long_or_fails_has_no_answer(easy: JudgedProblem) -> None:
+    def never_ends(problem: GraphProblem) -> np.ndarray:
+        while True:
+            problem.poses.sum()
+
+    def fails(problem: GraphProblem) -> np.ndarray:
+        return np.full((1, 3), math.nan)
+
+    assert graph_peers.within(never_ends, easy.problem, 1) is None
+    assert graph_peers.within(fails, easy.problem, 60) is None
+
+
+def test_a_g2o_file_gives_steps_and_loops(tmp_path: Path) -> None:
+    path = tmp_path / "square.g2o"
+    path.write_text(
+        "VERTEX_SE2 0 0 0 0\n"
+        "EDGE_SE2 1 2 1 0 0.5 4 0 0 4 0 16\n"
+        "EDGE_SE2 0 1 1 0 0 4 0 0 4 0 16\n"
+        "EDGE_SE2 0 2 2 0 0.5 1 0 0 1 0 1\n"
+    )
+    steps, loops = read_g2o(path)
+    assert steps.nodes.tolist() == [[0, 1], [1, 2]] and steps.relative[1].tolist() == [1.0, 0.0, 0.5]
+    np.testing.assert_allclose(steps.root[0].T @ steps.root[0], np.diag((4.0, 4.0, 16.0)))
+    assert loops.nodes.tolist() == [[0, 2]]
+
+
+def test_the_table_has_every_row_and_keeps_other_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        results_graphs, "synthetic", lambda kind, percent, _, *rest: synthetic(kind, percent, 200, *rest)
+    )
+    for kind in ("random", "local"):
+        arguments = results_graphs.Arguments(
+            graphs=("synthetic_1000",), kinds=(kind,), percents=(30,), seeds=(0, 1), rows=("robust", "gtsam_lm_cauchy"),
+            out=tmp_path, docs=tmp_path,
+        )  # fmt: skip
+        cells = results_graphs.main(arguments)["tables"]["synthetic_1000"]
+    assert list(cells) == ["random_30", "local_30"]
+    assert set(cells["local_30"]) == {"odometry", "right_loops", "robust", "gtsam_lm_cauchy"}
+    robust = cells["random_30"]["robust"]
+    assert set(robust) == {"ate_m", "solved", "precision", "recall", "seconds"}
+    assert robust["solved"]["mean"] == 1.0 and robust["precision"]["mean"] > 0.9
+    assert "| random_30 |" in (tmp_path / "results_graphs.md").read_text()
+
+
+def test_an_unknown_row_is_refused() -> None:
+    with pytest.raises(ValueError, match="rows has robusted"):
+        results_graphs.Arguments(rows=("robusted",))

@@ -1,0 +1,119 @@
+"""Other ways to solve a pose graph with wrong loops: GTSAM's kernels and graduated non-convexity, and PCM.
+
+All get the measurements and the covariances that our corrector gets. Each runs in a process of its own, which is
+stopped where it computes for too long: that does not depend on how busy the machine is.
+"""
+
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+
+import gtsam
+import numpy as np
+
+from ngo_estimator.graph.corrector import GraphProblem, thresholds
+from ngo_estimator.graph.cycle_agreement import ChainUncertainty
+from ngo_estimator.graph.relative_poses import RelativePoses
+from training.baselines.lidar_peers import GraphPeerConfig, solve_gnc, solve_with
+
+_UNKNOWN_STD = 1e3
+"""Deviation (rad) that GTSAM gets for a heading of which nothing is known."""
+
+_CAUCHY, _DCS, _GEMAN_MCCLURE = 3.0, 1.0, 3.0
+_SEEDS = 20  # nodes where a search for a clique begins
+
+Peer = Callable[[GraphProblem], np.ndarray]
+"""Poses ``(nodes, 3)`` of a problem."""
+
+
+def cauchy(problem: GraphProblem) -> np.ndarray:
+    """Levenberg-Marquardt with a Cauchy kernel of three deviations on loops."""
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY)
+    return solve_with(kernel, problem.steps, _stated(problem.loops), problem.poses)
+
+
+def dcs(problem: GraphProblem) -> np.ndarray:
+    """The same with dynamic covariance scaling (Agarwal et al. 2013)."""
+    return solve_with(
+        gtsam.noiseModel.mEstimator.DCS.Create(_DCS), problem.steps, _stated(problem.loops), problem.poses
+    )
+
+
+def geman_mcclure(problem: GraphProblem) -> np.ndarray:
+    """The same with a Geman-McClure kernel."""
+    kernel = gtsam.noiseModel.mEstimator.GemanMcClure.Create(_GEMAN_MCCLURE)
+    return solve_with(kernel, problem.steps, _stated(problem.loops), problem.poses)
+
+
+def gnc(problem: GraphProblem) -> np.ndarray:
+    """Graduated non-convexity over truncated least squares (Yang et al. 2020), with every step for an inlier."""
+    return solve_gnc(problem.steps, _stated(problem.loops), problem.poses, GraphPeerConfig())
+
+
+def least_squares(problem: GraphProblem) -> np.ndarray:
+    """Every loop is believed: for graphs whose loops are right."""
+    return solve_with(None, problem.steps, _stated(problem.loops), problem.poses)
+
+
+def pcm(problem: GraphProblem) -> np.ndarray:
+    """Least squares with the largest set of loops that agree pair by pair (Mangelson et al. 2018), found greedily.
+
+    Raises:
+        ValueError: a loop has no whole relative pose.
+    """
+    loops = problem.loops
+    first, second = np.triu_indices(len(loops), 1)
+    off, _ = ChainUncertainty(problem.steps).off_pairs(loops, np.stack((first, second), axis=1))
+    agree = np.zeros((len(loops), len(loops)), bool)
+    agree[first, second] = off <= thresholds(loops)[0]
+    agree |= agree.T
+    kept = _clique(agree)
+    return solve_with(None, problem.steps, loops[kept], problem.poses)
+
+
+def _clique(agree: np.ndarray) -> np.ndarray:
+    """Members ``(n,)`` of a large clique: from each of the best connected, always the best connected that is left."""
+    degree, best = agree.sum(1), np.zeros(0, np.int64)
+    for seed in np.argsort(-degree, kind="stable")[:_SEEDS]:
+        members, left = [seed], agree[seed].copy()
+        while left.any():
+            following = int(np.argmax(np.where(left, degree, -1)))
+            members.append(following)
+            left &= agree[following]
+        if len(members) > len(best):
+            best = np.sort(np.array(members))
+    return best
+
+
+def _stated(loops: RelativePoses) -> RelativePoses:
+    """The same with a little information about every direction, as GTSAM needs it."""
+    root = loops.root.copy()
+    unknown = ~(root != 0.0).any(2)
+    np.einsum("kii->ki", root)[unknown] = 1.0 / _UNKNOWN_STD
+    return replace(loops, root=root)
+
+
+def within(solve: Peer, problem: GraphProblem, limit_s: int) -> tuple[np.ndarray, float] | None:
+    """What a peer finds, and its computing time (s); None where it fails or computes for longer than ``limit_s``."""
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=_answer, args=(theirs, solve, problem, limit_s))
+    process.start()
+    theirs.close()
+    try:
+        poses, seconds = ours.recv()
+    except EOFError:  # it was stopped, or it died of an error
+        return None
+    finally:
+        process.join()
+    return poses, seconds
+
+
+def _answer(pipe: Connection, solve: Peer, problem: GraphProblem, limit_s: int) -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s))
+    began = time.process_time()
+    poses = solve(problem)
+    if np.isfinite(poses).all():
+        pipe.send((poses, time.process_time() - began))

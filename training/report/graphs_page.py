@@ -1,0 +1,58 @@
+"""The page of pose graphs with wrong loops, from the table's JSON."""
+
+from typing import Any
+
+import numpy as np
+
+from training.report.page import interval, markdown
+
+_HEAD = """# Pose graphs with wrong loops
+
+Made by `{command}` at revision {revision}. A graph counts as solved where its error (ATE after the best alignment) is
+below 1.5 times that of its right loops alone. Manhattan's truth is itself a solution, with its own loops: there an
+error below 0.5 m counts as solved. Means are over graphs, with intervals of 95 %. Times are computing
+times, so that a busy machine does not change them. A peer that computes for longer than its limit answers with the
+odometry. A cell's name is the kind of its wrong loops and their percentage. `_place`: loops know
+no relative pose, only "the same place". All peers get the stated covariances; those of Manhattan are far too large.
+A loop counts as believed where the poses fit it within its stated threshold.
+
+| kind | wrong loops |
+|---|---|
+| random | between any two nodes |
+| local | between nodes near each other along the chain |
+| grouped | in groups of ten that agree with each other |
+| lookalike | between stretches of fifty nodes that look alike |
+| offset | right ones, shifted by 3 m, all in the same way |
+"""
+
+
+def page(result: dict[str, Any]) -> str:
+    """The page in Markdown."""
+    parts = [_HEAD.format(**result)]
+    for graph, cells in result["tables"].items():
+        rows = list(dict.fromkeys(row for cell in cells.values() for row in cell))
+        parts.append(f"## {graph}\n\nShare solved, and in brackets the mean error in metres:\n")
+        parts.append(
+            markdown(
+                ("cell", *rows), [(name, *(_short(cell.get(row)) for row in rows)) for name, cell in cells.items()]
+            )
+        )
+        if len(cells) > 1:
+            parts.append(f"\n{_over_cells(cells, rows)}\n")
+        parts.append("Time in seconds, precision and recall of the loops that are believed:\n")
+        keys = ("seconds", "precision", "recall")
+        lines = [
+            (name, row, *(interval(cell[row][key]) for key in keys)) for name, cell in cells.items() for row in cell
+        ]
+        parts.append(markdown(("cell", "row", *keys), lines))
+    return "\n".join(parts) + "\n"
+
+
+def _short(row: dict[str, Any] | None) -> str:
+    return "" if row is None else f"{row['solved']['mean']:.2f} ({row['ate_m']['mean']:.2f})"
+
+
+def _over_cells(cells: dict[str, Any], rows: list[str]) -> str:
+    """Mean share solved of each row over the cells where it was measured."""
+    means = {row: [cell[row]["solved"]["mean"] for cell in cells.values() if row in cell] for row in rows}
+    return "Mean over cells: " + ", ".join(f"{row} {np.mean(values):.2f}" for row, values in means.items()) + "."

@@ -1,0 +1,165 @@
+"""The table of pose graphs with wrong loops: who still finds the trajectory, and how long it takes.
+
+    python -m training.results --world graphs
+    python -m training.results --world graphs --folder FOLDER --percents 10 30 --rows robust gtsam_gnc
+
+Synthetic graphs have wrong loops of five kinds, with a whole relative pose (KIND) or only "the same place"
+(KIND_place). With ``--folder`` Lecture Hall and Manhattan3500 are measured, too. The command writes
+``training/results/graphs.json`` and ``docs/results_graphs.md``; a run that is restricted adds its cells to them.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ngo_estimator.graph.corrector import GraphProblem, thresholds
+from ngo_estimator.graph.robust import Robust
+from training.baselines import graph_peers
+from training.common import records
+from training.common.command_line import run_command
+from training.common.records import write_at_once
+from training.report import graphs_page
+from training.scoring.graph_problems import KINDS, JudgedProblem, lecture_hall, manhattan, synthetic
+from training.scoring.statistics import Interval, mean_interval
+
+GRAPHS = ("synthetic_1000", "synthetic_3000", "lecture_hall", "manhattan")
+PEERS: dict[str, graph_peers.Peer] = {
+    "gtsam_gnc": graph_peers.gnc,
+    "gtsam_lm_cauchy": graph_peers.cauchy,
+    "gtsam_lm_dcs": graph_peers.dcs,
+    "gtsam_lm_geman_mcclure": graph_peers.geman_mcclure,
+    "pcm": graph_peers.pcm,
+}
+ROWS = ("odometry", *PEERS, "robust", "right_loops")
+_SOLVED = 1.5
+"""A graph is solved where its error is below so many times that of the right loops."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Settings of the table."""
+
+    world: Literal["graphs"] = "graphs"
+    """World to measure in."""
+    graphs: tuple[str, ...] = GRAPHS
+    """Graphs to measure."""
+    folder: Path | None = None
+    """Folder with Lecture Hall and Manhattan3500; without it they are skipped."""
+    kinds: tuple[str, ...] = (*KINDS, *(f"{kind}_place" for kind in KINDS))
+    """Kinds of wrong loops; KIND_place has loops without a relative pose, on synthetic graphs alone."""
+    percents: tuple[int, ...] = (10, 30, 50, 70)
+    """Wrong loops in percent of all."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of a cell's graphs."""
+    rows: tuple[str, ...] = ROWS
+    """Rows to measure; odometry and right_loops are always measured."""
+    limit_s: int = 300
+    """Computing time after which a peer is stopped; its answer is the odometry then."""
+    out: Path = records.ROOT / "training" / "results"
+    """Folder that gets graphs.json."""
+    docs: Path = records.ROOT / "docs"
+    """Folder that gets results_graphs.md."""
+
+    def __post_init__(self) -> None:
+        known = {"graphs": GRAPHS, "kinds": (*KINDS, *(f"{kind}_place" for kind in KINDS)), "rows": ROWS}
+        for name, names in known.items():
+            if unknown := [one for one in getattr(self, name) if one not in names]:
+                raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(names)}")
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Measure, print each cell, write everything after each, and return the JSON's content."""
+    path = arguments.out / "graphs.json"
+    result: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {"tables": {}}
+    result["command"] = 'make results WORLD=graphs ARGS="--folder FOLDER"'
+    result["revision"] = records.record("results", arguments)["revision"]
+    if arguments.folder is None:
+        print("lecture_hall and manhattan are skipped: --folder gives none")
+    _measure(synthetic("random", 30, 200, True, 0), ROWS, arguments.limit_s)  # compiles everything
+    for graph, cell, draw in _cells(arguments):
+        measured = [_measure(draw(seed), arguments.rows, arguments.limit_s) for seed in arguments.seeds]
+        rows = result["tables"].setdefault(graph, {}).setdefault(cell, {})
+        rows.update({row: _intervals([each[row] for each in measured if row in each]) for row in measured[0]})
+        print(f"{graph} {cell}: {json.dumps({row: _means(rows[row]) for row in measured[0]})}", flush=True)
+        write_at_once(path, json.dumps(result, indent=2) + "\n")
+        write_at_once(arguments.docs / "results_graphs.md", graphs_page.page(result))
+    return result
+
+
+def _cells(arguments: Arguments) -> Iterator[tuple[str, str, Callable[[int], JudgedProblem]]]:
+    """Graph, KIND_PERCENT, and what draws the problem of a seed."""
+    folder = arguments.folder
+    if folder is not None and "lecture_hall" in arguments.graphs:
+        hall = lecture_hall(folder)
+        yield "lecture_hall", f"own_{100.0 * (~hall.right).mean():.0f}", lambda _: hall
+    for graph in arguments.graphs:
+        for kind in arguments.kinds:
+            for percent in arguments.percents:
+                name, place = kind.removesuffix("_place"), kind.endswith("_place")
+                if graph.startswith("synthetic"):
+                    nodes = int(graph.removeprefix("synthetic_"))
+                    yield graph, f"{kind}_{percent}", _synthetic(name, percent, nodes, not place)
+                elif graph == "manhattan" and folder is not None and not place:
+                    yield graph, f"{kind}_{percent}", _manhattan(folder, name, percent)
+
+
+def _synthetic(kind: str, percent: int, nodes: int, metric: bool) -> Callable[[int], JudgedProblem]:
+    return lambda seed: synthetic(kind, percent, nodes, metric, seed)
+
+
+def _manhattan(folder: Path, kind: str, percent: int) -> Callable[[int], JudgedProblem]:
+    return lambda seed: manhattan(folder, kind, percent, seed)
+
+
+def _measure(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) -> dict[str, dict[str, float]]:
+    """The numbers of each row on one graph."""
+    problem, kept = judged.problem, judged.problem.loops[judged.right]
+    right = GraphProblem(problem.poses, problem.steps, kept, np.ones(len(kept)))
+    found = {"odometry": (problem.poses, 0.0), "right_loops": _timed(graph_peers.least_squares, right, limit_s)}
+    for row in rows:
+        if row == "robust":
+            began = time.process_time()
+            found[row] = (Robust().correct(problem).poses, time.process_time() - began)
+        elif row in PEERS and not (row == "pcm" and problem.loops.degrees.min(initial=3) < 3):
+            found[row] = _timed(PEERS[row], problem, limit_s)
+    bar = max(_SOLVED * judged.ate_m(found["right_loops"][0]), judged.least_ate_m)
+    return {row: _numbers(judged, poses, seconds, bar) for row, (poses, seconds) in found.items()}
+
+
+def _timed(solve: graph_peers.Peer, problem: GraphProblem, limit_s: int) -> tuple[np.ndarray, float]:
+    answer = graph_peers.within(solve, problem, limit_s)
+    return (problem.poses, float(limit_s)) if answer is None else answer
+
+
+def _numbers(judged: JudgedProblem, poses: np.ndarray, seconds: float, bar: float) -> dict[str, float]:
+    """A loop counts as believed where the poses fit it within its threshold."""
+    loops = judged.problem.loops
+    believed = (loops.residuals(poses) ** 2).sum(1) <= thresholds(loops)
+    ate = judged.ate_m(poses)
+    return {
+        "ate_m": ate,
+        "solved": float(ate <= bar),
+        "precision": float(judged.right[believed].mean()) if believed.any() else 1.0,
+        "recall": float(believed[judged.right].mean()),
+        "seconds": seconds,
+    }
+
+
+def _intervals(numbers: list[dict[str, float]]) -> dict[str, Any]:
+    def interval(values: np.ndarray) -> Interval:
+        return mean_interval(values) if len(values) > 1 else Interval(*(3 * (float(values[0]),)))
+
+    return {key: interval(np.array([each[key] for each in numbers])).as_json() for key in numbers[0]}
+
+
+def _means(row: dict[str, Any]) -> dict[str, float]:
+    return {key: round(row[key]["mean"], 3) for key in ("ate_m", "solved", "seconds")}
+
+
+if __name__ == "__main__":
+    run_command(main, Arguments, __doc__)
