@@ -62,29 +62,16 @@ class Watched:
         self.block = self.core.block
         self.optimisations = Times()
         self._given: tuple[MetaSteps, Loops] | None = None
-        self._spent, self._searched = Times(), Times()
         iterate, graph = optimizer.iterate, self.core._graph
-        advance, do = graph.advance, graph._do
+        optimise = graph._optimise
 
         def remembered(steps: MetaSteps, loops: Loops | None = None, *others: Any) -> Any:
             assert loops is not None, "expected an optimizer with loops"
             self._given = (steps, loops)
             return iterate(steps, loops, *others)
 
-        def searching() -> None:
-            self._searched.take(do)
-
-        def advancing(iterations: int) -> bool:
-            done = self._spent.take(advance, iterations)
-            if done:
-                for kind in ("wall_ms", "cpu_ms"):
-                    all_of_it, search = (sum(getattr(times, kind)) for times in (self._spent, self._searched))
-                    getattr(self.optimisations, kind).append(all_of_it - search)
-                self._spent, self._searched = Times(), Times()
-            return done
-
         vars(optimizer)["iterate"] = remembered
-        vars(graph).update(advance=advancing, _do=searching)
+        vars(graph)["_optimise"] = lambda: self.optimisations.take(optimise)
 
     def problem(self) -> Problem:
         """What the optimizer was given last."""
@@ -95,14 +82,15 @@ class Watched:
 def core_speed(world_name: str, seed: int, window: int, live: int, repeats: int, cache: Path = CACHE) -> dict[str, Any]:
     """Drive ``window + live`` steps; compare with the peers at the last ``repeats`` meta-poses of the full window.
 
-    ``core_ms`` lists, for each of the ``live`` steps, what the core and the path take in this process.
+    ``core_ms`` lists, for each of the ``live`` steps, what the answer of the core and the path take in this process,
+    ``correction_ms`` what the core does after it.
     """
     torch.set_num_threads(1)
     watched = Watched(world_name, window)
     block, core = watched.block, watched.core
-    # The last meta-pose of the window is optimised while the next one comes.
+    # The last meta-pose of the window is optimised before the next frame.
     drive = drive_of(world_name, seed, window + live + block, cache)
-    lm, believed, steps, paths = Times(), Times(), Times(), Times()
+    lm, believed, steps, paths, corrections = Times(), Times(), Times(), Times(), Times()
     incremental = {name: Incremental(skip) for name, skip in INCREMENTAL.items()}
     isam = {name: Times() for name in INCREMENTAL}
     writer = PathWriter("map")
@@ -120,8 +108,11 @@ def core_speed(world_name: str, seed: int, window: int, live: int, repeats: int,
         if number > window + block:
             steps.take(core.update, step)
             paths.take(path)
+            corrections.take(core.correct)
             continue
         optimized = updates.take(core.update, step).optimized
+        if number == window + block:
+            core.correct()  # as the node does from here on
         if not optimized or number > window + block - 1:
             continue
         problem = watched.problem()
@@ -152,6 +143,7 @@ def core_speed(world_name: str, seed: int, window: int, live: int, repeats: int,
     result |= {"gtsam_lm": lm.mean(repeats), "gtsam_lm_believed": believed.mean(repeats)}
     result["core_ms"] = (np.array(steps.wall_ms) + np.array(paths.wall_ms)).tolist()
     result["core_cpu_ms"] = (np.array(steps.cpu_ms) + np.array(paths.cpu_ms)).tolist()
+    result |= {"correction_ms": corrections.wall_ms, "correction_cpu_ms": corrections.cpu_ms}
     result["path_ms"] = float(np.median(paths.wall_ms)) if live else 0.0
     return result
 

@@ -5,9 +5,9 @@
 
 What is measured runs on one core with one thread: the nodes as real processes that are fed over DDS from another core,
 the core and its peers in a process of their own. The last line is one JSON object, whose ms are by the clock; exit code
-1 where a bar is missed. "cpu" is processor time, which other processes disturb less. The longest of hundreds of frames
-is judged by it: by the clock, that is the frame in which the system did something else. So is an optimisation, beside
-the faster setting of iSAM2.
+1 where a bar is missed. "cpu" is processor time, which other processes disturb less. The longest of hundreds of
+corrections is judged by it: by the clock, that is the one in which the system did something else. It has to end before
+the next frame comes. An optimisation beside the faster setting of iSAM2 is judged by processor time, too.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ BARS = {
     "ratio_to_gtsam_lm": 1.0,
     "cpu_ratio_to_isam2_best": 2.0,
     "everything_to_gtsam_lm": 0.35,
-    "cpu_longest_to_median": 3.0,
+    "cpu_longest_correction_ms": 1000.0 / RATE_HZ,
     "ngo_node_resident_mb": 350.0,
     "local_node_resident_mb": 350.0,
     "first_path_s": 4.0,
@@ -96,6 +96,7 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         cores[0], core_speed, world, arguments.seed, arguments.window, arguments.live, arguments.repeats, arguments.out
     )
     core_ms, core_cpu_ms = core.pop("core_ms"), core.pop("core_cpu_ms")
+    correction_ms, correction_cpu_ms = core.pop("correction_ms"), core.pop("correction_cpu_ms")
     best = min((core[name] for name in INCREMENTAL), key=lambda times: float(times["cpu_ms"]))
     say.print(f"{world}: local_node")
     local_ms = in_process(cores[0], local_core_ms, world, arguments.seed, _LOCAL_BEFORE + arguments.live)
@@ -116,9 +117,10 @@ def measure(world: str, arguments: Arguments, say: Console) -> dict[str, Any]:
         "cpu_ratio_to_isam2_best": core["optimize"]["cpu_ms"] / best["cpu_ms"],
         "everything_to_gtsam_lm": core["update"]["ms"] / core["gtsam_lm"]["ms"],
         "cpu_everything_to_gtsam_lm": core["update"]["cpu_ms"] / core["gtsam_lm"]["cpu_ms"],
-        "longest_to_median": float(np.max(core_ms) / np.median(core_ms)),
-        "cpu_longest_to_median": float(np.max(core_cpu_ms) / np.median(core_cpu_ms)),
-        "cpu_s_a_minute_at_10_hz": 0.6 * float(np.mean(core_cpu_ms)),
+        "longest_answer_ms": float(np.max(core_ms)),
+        "longest_correction_ms": float(np.max(correction_ms)),
+        "cpu_longest_correction_ms": float(np.max(correction_cpu_ms)),
+        "cpu_s_a_minute_at_10_hz": 0.6 * float(np.mean(core_cpu_ms) + np.mean(correction_cpu_ms)),
         "first_path_s": first_path_s(world, arguments.seed, cores, logs),
         "end_to_end_frames_per_s": end_to_end(world, arguments),
         **image_to_path(world, arguments),
@@ -196,7 +198,7 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
         ("ratio_to_isam2_default", "the same, relinearised at each tenth"),
         ("ratio_to_isam2_best", "the same, the faster of both"),
         ("everything_to_gtsam_lm", "everything / LM"),
-        ("longest_to_median", "the core's longest frame / its median"),
+        ("longest_correction_ms", "the longest correction behind an answer (ms)"),
     ):
         bar = f"{BARS[key]:g}" if key in BARS else f"cpu {BARS[of_cpu]:g}" if (of_cpu := f"cpu_{key}") in BARS else ""
         row(f"{name} (by the clock, by cpu)", lambda r, k=key: f"{r[k]:.2f}, {r[f'cpu_{k}']:.2f}", bar)

@@ -44,39 +44,26 @@ _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 class Arguments:
     """Settings of an evaluation, of a world, of recordings or of files."""
 
-    world: WorldName | None = None
-    """World to measure in."""
+    world: WorldName | None = None  # World to measure in.
     recordings: tyro.conf.OmitArgPrefixes[RecordedArguments] = field(default_factory=RecordedArguments)
     """Recordings of the training, with the same arguments."""
-    split: Literal["validation", "test"] = "validation"
-    """Mazes to measure on."""
-    trajectories: int = 20
-    """Trajectories, each in a maze of its own."""
-    frames: int = 0
-    """Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000)."""
-    weights: Path = records.WEIGHTS
-    """Folder with NAME/*.safetensors."""
-    online: bool = True
-    """Whether to measure the online estimate also; it runs the optimizer at every eighth frame."""
+    split: Literal["validation", "test"] = "validation"  # Mazes to measure on.
+    trajectories: int = 20  # Trajectories, each in a maze of its own.
+    frames: int = 0  # Frames of a trajectory; 0 for the world's own (2D 2000, 3D 1000).
+    weights: Path = records.WEIGHTS  # Folder with NAME/*.safetensors.
+    online: bool = True  # Whether to measure the online estimate also; it runs the optimizer at every eighth frame.
     window_frames: int = 0
     """Frames of the online estimate's window; 0 for all. With a window there is one more row: `bounded`, the path at
     the end, with key frames before the window."""
-    key_frames: int = 128
-    """Key frames before that window."""
-    estimate: tuple[Path, ...] = ()
-    """Estimated trajectories in the TUM format, to compare with `--truth`."""
-    truth: Path | None = None
-    """True trajectory in the TUM format."""
+    key_frames: int = 128  # Key frames before that window.
+    estimate: tuple[Path, ...] = ()  # Estimated trajectories in the TUM format, to compare with `--truth`.
+    truth: Path | None = None  # True trajectory in the TUM format.
     files_tolerance_s: float = 0.01
     """Files: largest time between an estimated pose and the true pose that it is compared with."""
-    delta: float = 1.0
-    """Files: distance between the two poses of the RPE."""
-    delta_unit: Literal["frames", "metres"] = "frames"
-    """Files: unit of delta."""
-    all_pairs: bool = False
-    """Files: whether pairs of the RPE start at every pose, or at the end of the pair before."""
-    segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
-    """Files: lengths of KITTI's segments."""
+    delta: float = 1.0  # Files: distance between the two poses of the RPE.
+    delta_unit: Literal["frames", "metres"] = "frames"  # Files: unit of delta.
+    all_pairs: bool = False  # Files: whether pairs of the RPE start at every pose, or at the end of the pair before.
+    segment_lengths_m: tuple[float, ...] = KITTI_LENGTHS_M  # Files: lengths of KITTI's segments.
     runs: Path = records.ROOT / "runs"
     """Recordings: folder with NAME/data, which was read from them; gets NAME/results/."""
 

@@ -19,7 +19,7 @@ import tyro
 from ngo_estimator.checkpoint import load_local
 from training.common import records
 from training.data.worlds import world_named
-from training.report.results_page import interval, markdown
+from training.report.page import interval, markdown
 from training.scoring.validation_steps import odometry_errors
 from training.train_local import RPE_STEPS
 
@@ -28,16 +28,11 @@ from training.train_local import RPE_STEPS
 class Arguments:
     """Settings of the measurement."""
 
-    world: Literal["maze2d", "maze3d"]
-    """World to drive in."""
-    weights: tuple[Path, ...] = (records.WEIGHTS,)
-    """Folders with WORLD/local_pose_network.safetensors."""
-    driver: str | None = None
-    """Driver; none: the world's."""
-    mazes: int = 24
-    """Validation mazes."""
-    frames: int = 1000
-    """Frames in each."""
+    world: Literal["maze2d", "maze3d"]  # World to drive in.
+    weights: tuple[Path, ...] = (records.WEIGHTS,)  # Folders with WORLD/local_pose_network.safetensors.
+    driver: str | None = None  # Driver; none: the world's.
+    mazes: int = 24  # Validation mazes.
+    frames: int = 1000  # Frames in each.
 
     def __post_init__(self) -> None:
         if self.frames <= RPE_STEPS:

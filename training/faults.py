@@ -9,28 +9,29 @@ command writes ``training/results/faults.json`` and ``docs/results_faults.md``. 
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
-from ngo_estimator.checkpoint import FAMILIARITY, load_local, load_place
-from ngo_estimator.data.weights_file import load_description
+from ngo_estimator.checkpoint import load_local, load_place
+from ngo_estimator.frontend.camera import local_odometry
 from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.episodes import simulate
 from training.data.faults import SensedDrive, faulted
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
 from training.report import faults_page
+from training.report.folders import Folders
+from training.scoring import honesty
 from training.scoring.honesty import HonestRun, honest_run
-from training.scoring.statistics import mean_interval
+from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, means_over_samples, measure
 
 CLEAN = "clean"
 FAULTS_OF = {
@@ -43,30 +44,20 @@ SCENARIOS = {
 }
 """Maps that ViZDoom ships, each the first of a WAD of its name. Everything was chosen on those of validation."""
 
+_CODE = (honesty, local_odometry, online_trajectory)
 _DOOM_SEEDS = {"test": 20_000, "validation": 11_000}
 _SEEDS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS}
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the measurement."""
 
     split: Literal["validation", "test"] = "test"
     """Mazes and scenarios to measure in. Everything is chosen on validation; test is for the final table alone."""
-    mazes: int = 6
-    """Drives of each row, each in a maze of its own."""
-    frames: int = 600
-    """Frames of a drive."""
-    worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")
-    """Worlds to measure."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets faults.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_faults.md."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what was measured."""
+    mazes: int = 6  # Drives of each row, each in a maze of its own.
+    frames: int = 600  # Frames of a drive.
+    worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")  # Worlds to measure.
 
     def __post_init__(self) -> None:
         if self.mazes < 2 or self.frames < 100:
@@ -80,58 +71,55 @@ class _Cores:
     local: LocalOdometry
     plain: LocalOdometry
     online: OnlineTrajectory
-    sha256: str
 
     @classmethod
     def load(cls, folder: Path, world: str) -> _Cores:
         plain = LocalOdometry(load_local(folder, world)[0], load_place(folder, world)[0], world)
-        sha256 = load_description(folder / f"{FAMILIARITY}.safetensors", FAMILIARITY)["sha256"]
-        return cls(LocalOdometry.load(folder, world), plain, OnlineTrajectory.load(folder, world=world), sha256)
+        return cls(LocalOdometry.load(folder, world), plain, OnlineTrajectory.load(folder, world=world))
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     torch.set_num_threads(1)
-    tables: dict[str, dict[str, Any]] = {}
-    for world in arguments.worlds:
-        networks = "maze3d" if world == "doom" else world
-        cores = _Cores.load(arguments.weights / networks, networks)
-        tables[world] = {
-            name: _summary(
-                [
-                    _measured(arguments, cores, world, name, number)
-                    for number in tqdm(range(arguments.mazes), desc=f"{world} {name}")
-                ]
-            )
-            for name in (SCENARIOS[arguments.split] if world == "doom" else (CLEAN, *FAULTS_OF[world]))
-        }
     result = {
         **records.record("faults", arguments),
         "split": arguments.split,
         "drives": arguments.mazes,
         "frames": arguments.frames,
-        "tables": tables,
+        "tables": {world: _table(arguments, world) for world in arguments.worlds},
     }
     result.pop("arguments")
-    write_at_once(arguments.out / "faults.json", json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_faults.md", faults_page.page(result))
-    return result
+    return arguments.publish("faults", result, faults_page.page(result))
 
 
-def _measured(arguments: Arguments, cores: _Cores, world: str, name: str, number: int) -> dict[str, float]:
-    """What one drive gives, or gave last time."""
-    path = arguments.runs / "faults" / arguments.split / f"{world}_{name}_{number}_{arguments.frames}.json"
-    if path.exists() and (stored := json.loads(path.read_text())).pop("familiarity") == cores.sha256:
-        return dict(stored)
-    drive = _doom_drive(arguments, name, number) if world == "doom" else _maze_drive(arguments, world, name, number)
+def _table(arguments: Arguments, world: str) -> dict[str, Any]:
+    """Of a world by the fault: means over drives."""
+    networks = "maze3d" if world == "doom" else world
+    weights = arguments.weights / networks
+    cores, identity = _Cores.load(weights, networks), folder_digest(weights)
+    folder = arguments.runs / "faults" / arguments.split
+    table: dict[str, Any] = {}
+    for name in SCENARIOS[arguments.split] if world == "doom" else (CLEAN, *FAULTS_OF[world]):
+        row = Row(partial(_measured, cores=cores, clean=name == CLEAN), identity, _CODE)
+        plan = [(_drive(arguments, world, name, number), {"ours": row}) for number in range(arguments.mazes)]
+        table[name] = _summary(column(measure(plan, folder, f"{world} {name}"), "ours"))
+    return table
+
+
+def _measured(drive: SensedDrive, cores: _Cores, clean: bool) -> Measured:
     values = dataclasses.asdict(honest_run(cores.local, cores.online, drive))
-    if name == CLEAN:
+    if clean:
         plain: HonestRun = honest_run(cores.plain, cores.online, drive)
         values["deviation_growth"] = values["deviation_m"] / plain.deviation_m
         values["odometry_deviation_growth"] = values["odometry_deviation_m"] / plain.odometry_deviation_m
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_at_once(path, json.dumps({**values, "familiarity": cores.sha256}))
-    return values
+    return Measured.of(values)
+
+
+def _drive(arguments: Arguments, world: str, name: str, number: int) -> Drive:
+    named = f"{world}_{name}_{number}_{arguments.frames}"
+    if world == "doom":
+        return Drive(named, f"{arguments.split} {named}", partial(_doom_drive, arguments, name, number))
+    return Drive(named, f"{arguments.split} {named}", partial(_maze_drive, arguments, world, name, number))
 
 
 def _maze_drive(arguments: Arguments, name_of_world: str, fault: str, number: int) -> SensedDrive:
@@ -153,12 +141,12 @@ def _doom_drive(arguments: Arguments, scenario: str, number: int) -> SensedDrive
     return SensedDrive.of_episode(world_named("maze3d"), episode)
 
 
-def _summary(found: list[dict[str, float]]) -> dict[str, Any]:
+def _summary(found: list[Measured]) -> dict[str, Any]:
     """Means with intervals, and the largest ratio of corrected to odometry."""
-    columns = {key: np.array([one[key] for one in found]) for key in found[0]}
-    ratio = columns["corrected_m"] / np.maximum(columns["odometry_m"], 1e-9)
+    means = means_over_samples(found)
+    ratio = means["corrected_m"] / np.maximum(means["odometry_m"], 1e-9)
     return {
-        **{key: mean_interval(values).as_json() for key, values in columns.items()},
+        **intervals(means),
         "corrected_to_odometry": {"mean": float(ratio.mean()), "largest": float(ratio.max())},
     }
 

@@ -13,23 +13,23 @@ import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
 
-from ngo_estimator.checkpoint import load_local, load_place
+from ngo_estimator.checkpoint import PlaceNetworks, load_local, load_place
 from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.common import records
 from training.common.command_line import run_command
 from training.data.data_source import MIRRORED_STORE, OTHER_TRAIN_STORE, TRAIN_STORE
 from training.data.drive_plan import Drives, drives_of_table
 from training.data.episodes import mirrored_episode
-from training.data.feature_store import NETWORKS_FILE, check_count, check_networks, fill, groups_of, write_row
+from training.data.feature_store import begin_store, check_count, fill, groups_of, write_row
 from training.data.features import Networks, features_of
 from training.data.worlds import DRAWN, OPTIMIZER_TRAIN_SEEDS, World, world_named
 from training.recordings.recording_features import features_of_track
-from training.recordings.recording_source import DataArguments, open_recorded
+from training.recordings.recording_source import DataArguments, TrainedLocal, open_recorded
 from training.recordings.recording_streams import windows
 from training.recordings.recording_tracks import Part
 
@@ -81,42 +81,34 @@ def main(arguments: Arguments) -> None:
     each table of results ``validation_TABLE`` and ``test_TABLE``; of recordings ``train`` and ``validation``, stretches
     that overlap, and their mirror images.
     """
+    folder, name = arguments.weights / arguments.name, arguments.name
+    local, place = load_local(folder, name), load_place(folder, name)
     if arguments.world is None:
-        _main_recorded(arguments)
+        _of_recordings(arguments, local, place)
         return
-    world = world_named(arguments.world)
-    folder = arguments.weights / world.name
-    local, local_description = load_local(folder, world.name)
-    place, place_description = load_place(folder, world.name)
-    features, chosen = arguments.out / world.name / "features", planned_drives(arguments, world)
+    world, networks = world_named(arguments.world), (local[0], place[0])
+    features, chosen = arguments.out / name / "features", planned_drives(arguments, world)
     for split, drives in chosen.items():
         check_count(features / split, len(drives.seeds))
     for split, drives in chosen.items():
         if not drives.seeds:
             continue
-        store = features / split
-        store.mkdir(parents=True, exist_ok=True)
-        check_networks(store, local_description, place_description)
-        (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
-        part = (arguments.part, arguments.parts)
-        in_mirror = split == MIRRORED_STORE
+        begin_store(features / split, local[1], place[1])
 
-        def arrays_of(episode: Episode, in_mirror: bool = in_mirror) -> dict[str, np.ndarray]:
+        def arrays_of(episode: Episode, in_mirror: bool = split == MIRRORED_STORE) -> dict[str, np.ndarray]:
             seen = mirrored_episode(world, episode) if in_mirror else episode
-            return features_of(world, seen, folder, (local, place))
+            return features_of(world, seen, folder, networks)
 
-        fill(store, world, drives, part, arrays_of)
+        fill(features / split, world, drives, (arguments.part, arguments.parts), arrays_of)
 
 
-def _main_recorded(arguments: Arguments) -> None:
-    name = arguments.recordings.name
-    local, local_description = load_local(arguments.weights / name, name)
-    place, place_description = load_place(arguments.weights / name, name)
-    data = open_recorded(arguments.recordings, arguments.out, (local, local_description))
-    if place.config.image != local.config.image:
+def _of_recordings(arguments: Arguments, local: TrainedLocal, place: tuple[PlaceNetworks, dict[str, Any]]) -> None:
+    data = open_recorded(arguments.recordings, arguments.out, local)
+    name, networks = arguments.name, Networks(local[0], place[0])
+    if networks.place.config.image != networks.local.config.image:
         raise records.RunError(
-            f"the place encoder of {name} takes {place.config.image}, its local network {local.config.image}; expected "
-            "one sensor: train the place encoder anew"
+            f"the place encoder of {name} takes {networks.place.config.image}, its local network "
+            f"{networks.local.config.image}; expected one sensor: train the place encoder anew"
         )
     stores: tuple[tuple[str, Part, int], ...] = (
         (TRAIN_STORE, "optimizer", 8 * _BLOCK),
@@ -124,14 +116,12 @@ def _main_recorded(arguments: Arguments) -> None:
     )
     for split, part, fewest in stores:
         found = windows(data.domain, data.tracks(part), _MOST_STEPS, fewest, _BLOCK)
-        store = arguments.out / data.domain.name / "features" / split
+        store = arguments.out / name / "features" / split
         # Made in minutes: rather anew than from several versions of networks or recordings.
         shutil.rmtree(store, ignore_errors=True)
-        store.mkdir(parents=True)
-        (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
+        begin_store(store, local[1], place[1])
         for row, (track, mirror) in enumerate(tqdm(found.cuts, desc=f"{name} {split}")):
-            features = features_of_track(data.domain, track, Networks(local, place), mirror)
-            write_row(store, row, len(found.cuts), features)
+            write_row(store, row, len(found.cuts), features_of_track(data.domain, track, networks, mirror))
         (store / "done.0of1.json").write_text(json.dumps(groups_of(len(found.cuts), 0, 1)))
 
 

@@ -13,43 +13,50 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
-import ngo_estimator
-import training
-from ngo_common.files import written_whole
-from ngo_estimator.geometry import se2
+from ngo_estimator.frontend.lidar import lidar_odometry
+from ngo_estimator.loops import pair_measurement
+from ngo_estimator.slam import localisation, online_trajectory, place_matcher, scan_matcher, scan_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
+from training.data.batches import seen_from_first
 from training.data.kidnapped_drives import Features, kidnapped_drives
+from training.data.lidar_drives import LidarDrive
 from training.data.worlds import WORLDS, World
+from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_identity, logs_below, read_drive
 from training.report import relocalisation_page
-from training.scoring import kidnapped_logs
-from training.scoring.kidnapped import KnownMap, MapErrors, scored, starts
-from training.scoring.kidnapped_logs import log_starts, summary_of
+from training.report.folders import Folders
+from training.scoring import kidnapped, kidnapped_logs, online_estimate, relocalisation_rows
+from training.scoring.kidnapped import NUMBERS, KnownMap, MapErrors, scored, starts
+from training.scoring.kidnapped_logs import as_arrays, log_starts, starts_of, summary_of
+from training.scoring.metrics import off_by, rms
 from training.scoring.online_estimate import run_online
 from training.scoring.relocalisation_rows import ROWS, Networks, RowName, row_of
-from training.scoring.statistics import mean_interval
-
-Numbers = dict[str, dict[str, Any]]
-"""``{mean, ci95}`` by the name of a number."""
-
-_OURS = ("slam/localisation.py", "slam/evidence.py", "slam/place_matcher.py")
-_BASELINES = ("scoring/relocalisation_rows.py",)
+from training.scoring.table import (
+    Drive,
+    Measured,
+    Numbers,
+    Row,
+    column,
+    folder_digest,
+    interval_of,
+    intervals,
+    means_over_samples,
+    measure,
+)
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the table."""
 
     tables: tuple[Literal["maze2d", "maze3d", "maze2d_aliased", "maze3d_aliased"], ...] = (
@@ -61,26 +68,14 @@ class Arguments:
     """Tables to measure; none: those in the JSON stay as they are, for the logs alone."""
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Thresholds are chosen on validation; the test split is for the final table alone."""
-    mazes: int = 10
-    """Mazes of each table."""
+    mazes: int = 10  # Mazes of each table.
     starts: int = 50
     """Starts in mapped parts of each maze; up to a fifth as many more are taken in parts without a map."""
-    aliased_starts: int = 20
-    """The same in each aliased maze."""
-    rows: tuple[RowName, ...] = ROWS
-    """Rows to measure."""
+    aliased_starts: int = 20  # The same in each aliased maze.
+    rows: tuple[RowName, ...] = ROWS  # Rows to measure.
     logs: Path | None = None
     """Folder of real logs of a lidar (.bag, .log, .clf, gzipped or not); none: they stay as the JSON has them."""
-    log_starts: int = 20
-    """Starts in each log."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets relocalisation.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_relocalisation.md."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of drives, maps and what was measured."""
+    log_starts: int = 20  # Starts in each log.
 
     def __post_init__(self) -> None:
         if min(self.mazes, self.starts, self.aliased_starts) < 2:
@@ -107,148 +102,116 @@ def main(arguments: Arguments) -> dict[str, Any]:
     if arguments.logs is not None:
         of_logs = {**made, "command": f"{made['command']} --logs FOLDER"}
         result["logs"] = {**of_logs, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
-    write_at_once(path, json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_relocalisation.md", relocalisation_page.page(result))
     for table, rows in result["tables"].items():
         for row, numbers in rows.items():
             line = ", ".join(f"{name} {number['mean']:.4g}" for name, number in numbers.items())
             print(f"{table:15} {row:16} {line}")
-    return result
+    return arguments.publish("relocalisation", result, relocalisation_page.page(result))
 
 
-def measured(arguments: Arguments, table: str) -> dict[str, Any]:
+def measured(arguments: Arguments, name: str) -> dict[str, Any]:
     """All rows of a table: of starts in mapped parts, of other starts, and the errors of the maps themselves."""
-    world, aliased = WORLDS[table.removesuffix("_aliased")], table.endswith("_aliased")
-    drives = kidnapped_drives(world, arguments.split, aliased, arguments.mazes, arguments.weights, arguments.runs)
-    networks = Networks.load(world, arguments.weights)
+    world, aliased = WORLDS[name.removesuffix("_aliased")], name.endswith("_aliased")
+    stores = kidnapped_drives(world, arguments.split, aliased, arguments.mazes, arguments.weights, arguments.runs)
+    networks, weights = Networks.load(world, arguments.weights), folder_digest(arguments.weights / world.name)
     folder = arguments.runs / world.name / "relocalisation" / f"{arguments.split}_{'aliased_' * aliased}results"
-    folder.mkdir(parents=True, exist_ok=True)
-    mazes: list[dict[str, Any]] = []
-    for maze in tqdm(range(arguments.mazes), desc=table, unit="maze"):
-        mapped, second = ({name: np.array(x[maze]) for name, x in drives[key].items()} for key in ("map", "second"))
-        made = _map(world, arguments.weights, mapped, folder / f"map_{maze}.npz", networks.identity)
-        count = arguments.aliased_starts if aliased else arguments.starts
-        drive = _Maze(networks, made, mapped, second)
-        mazes.append({"map": made.numbers, **_rows(arguments.rows, drive, count, folder, maze)})
+    count = arguments.aliased_starts if aliased else arguments.starts
+    drives = [
+        Drive(f"maze_{number}", f"{name} {arguments.split} {number}", partial(_Maze, stores, number))
+        for number in range(arguments.mazes)
+    ]
+    map_row = Row(partial(_map, world=world, weights=arguments.weights), weights, _MAP_CODE)
+    maps = measure([(drive, {_MAP: map_row}) for drive in drives], folder, f"{name} maps")
+
+    def with_map(drive: Drive) -> dict[str, Row]:
+        poses = maps[drive.name][_MAP].drawn["poses"]
+        identity = f"{weights} {count} {hashlib.sha256(poses.tobytes()).hexdigest()}"
+        return {
+            row: Row(partial(_starts, row=row, networks=networks, poses=poses, count=count), identity, _ROW_CODE)
+            for row in arguments.rows
+        }
+
+    found = measure([(drive, with_map(drive)) for drive in drives], folder, name)
     return {
-        **{kind: {row: _summary([m[row][kind] for m in mazes]) for row in arguments.rows} for kind in _KINDS},
-        "maps": _summary([[maze["map"]] for maze in mazes]),
+        **{kind: {row: _summary(column(found, row), kind) for row in arguments.rows} for kind in _KINDS},
+        "maps": {**intervals(means_over_samples(column(maps, _MAP))), "starts": _count(len(maps))},
     }
 
 
 _KINDS = ("mapped", "unmapped")
-
-
-@dataclass(frozen=True)
-class _Map:
-    poses: np.ndarray
-    numbers: dict[str, float]
-
-
-def _map(world: World, weights: Path, drive: Features, cache: Path, identity: str) -> _Map:
-    """The corrected poses ``(frames, 3)`` of a drive, and their errors, as the online system leaves them."""
-    if cache.exists():
-        with np.load(cache) as file:
-            if str(file["identity"]) == identity:
-                return _Map(file["poses"], json.loads(str(file["numbers"])))
-    trajectory = run_online(OnlineTrajectory.load(weights / world.name, world=world.name), drive)
-    in_maze = torch.from_numpy(drive["poses"])
-    truth = se2.between(in_maze[:1], in_maze).numpy()
-    numbers = {
-        "position_rmse_m": _rms(np.linalg.norm((trajectory.poses_xyyaw - truth)[:, :2], axis=1)),
-        "heading_rmse_deg": _heading_rmse(trajectory.poses_xyyaw, truth),
-        "online_heading_rmse_deg": _heading_rmse(trajectory.online_xyyaw, truth),
-    }
-    poses = trajectory.poses_xyyaw.copy()
-    with written_whole(cache) as file:
-        np.savez(file, identity=np.array(identity), poses=poses, numbers=np.array(json.dumps(numbers)))
-    return _Map(poses, numbers)
+_MAP = "map"
+_MAP_CODE = (online_trajectory, online_estimate)
+_ROW_CODE = (relocalisation_rows, kidnapped, localisation, place_matcher, pair_measurement)
 
 
 @dataclass(frozen=True)
 class _Maze:
-    networks: Networks
-    made: _Map
-    mapped: Features
-    second: Features
+    stores: dict[str, Features]
+    number: int
+
+    def drive(self, name: str) -> Features:
+        return {key: np.array(array[self.number]) for key, array in self.stores[name].items()}
 
 
-def _rows(
-    rows: Sequence[str], maze: _Maze, count: int, folder: Path, number: int
-) -> dict[str, dict[str, list[dict[str, float]]]]:
-    """Numbers of every start of a maze, by row and kind; what was measured before is read."""
-    networks, second = maze.networks, maze.second
-    codes = np.concatenate((maze.mapped["origin_code"], maze.mapped["codes"])).astype(np.float32)
-    known = KnownMap(maze.made.poses, maze.mapped["poses"], codes, networks.pair_head.config.offset_scale_m)
-    result: dict[str, dict[str, list[dict[str, float]]]] = {}
-    errors: MapErrors | None = None
-    for row in rows:
-        cache, identity = folder / f"{row}_{number}.json", f"{_code(row)} {networks.identity} {count}"
-        stored = json.loads(cache.read_text()) if cache.exists() else {}
-        if stored.get("identity") != identity:
-            errors = errors or MapErrors(known, second["poses"])
-            claims = row_of(row, networks, known, second)
-            kinds = zip(_KINDS, starts(errors, len(second["poses"]), count), strict=True)
-            described = f"{row}, maze {number}"
-            numbers = {
-                kind: [scored(errors, start, claims(start)) for start in tqdm(some, desc=described, unit="start")]
-                for kind, some in kinds
-            }
-            stored = {"identity": identity, "numbers": numbers}
-            write_at_once(cache, json.dumps(stored))
-        result[row] = stored["numbers"]
-    return result
+def _map(maze: _Maze, world: World, weights: Path) -> Measured:
+    """The errors of the map as the online system leaves it; drawn are its corrected poses ``(frames, 3)``."""
+    drive = maze.drive("map")
+    trajectory = run_online(OnlineTrajectory.load(weights / world.name, world=world.name), drive)
+    truth = seen_from_first(drive["poses"])
+    off = {"": off_by(trajectory.poses_xyyaw, truth), "online_": off_by(trajectory.online_xyyaw, truth)}
+    numbers = {
+        "position_rmse_m": rms(np.linalg.norm(off[""][:, :2], axis=1)),
+        **{f"{name}heading_rmse_deg": float(np.degrees(rms(found[:, 2]))) for name, found in off.items()},
+    }
+    return Measured.of(numbers, poses=trajectory.poses_xyyaw)
 
 
-def _code(row: str) -> str:
-    """A hash of the modules that a row's numbers come from."""
-    ours, common = Path(ngo_estimator.__path__[0]), Path(training.__path__[0])
-    files = [ours / path for path in _OURS] if row == "ours" else [common / path for path in _BASELINES]
-    content = b"".join(path.read_bytes() for path in (*files, common / "scoring" / "kidnapped.py"))
-    return hashlib.sha256(content).hexdigest()
+def _starts(maze: _Maze, row: RowName, networks: Networks, poses: np.ndarray, count: int) -> Measured:
+    """Numbers of every start of a maze, ``KIND:NUMBER`` ``(starts,)``."""
+    mapped, second = maze.drive("map"), maze.drive("second")
+    codes = np.concatenate((mapped["origin_code"], mapped["codes"])).astype(np.float32)
+    known = KnownMap(poses, mapped["poses"], codes, networks.pair_head.config.offset_scale_m)
+    errors, claims = MapErrors(known, second["poses"]), row_of(row, networks, known, second)
+    result: dict[str, np.ndarray] = {}
+    for kind, some in zip(_KINDS, starts(errors, len(second["poses"]), count), strict=True):
+        described = f"{row}, maze {maze.number}"
+        found = [scored(errors, start, claims(start)) for start in tqdm(some, desc=described, unit="start")]
+        result |= {f"{kind}:{name}": np.array([one[name] for one in found]) for name in NUMBERS}
+    return Measured(result)
 
 
 def _logs(arguments: Arguments, folder: Path) -> dict[str, Any]:
     """Numbers of each log in the folder."""
-    result: dict[str, Any] = {}
-    for name, path in tqdm(logs_below(folder).items(), desc="logs", unit="log"):
-        cache = arguments.runs / "scan" / "relocalisation" / f"{name}.json"
-        identity = f"{log_identity(path)} {_log_code()} {arguments.log_starts}"
-        stored = json.loads(cache.read_text()) if cache.exists() else {}
-        if stored.get("identity") != identity:
-            drive = read_drive(path)
-            starts_of_log = log_starts(drive, arguments.weights / "scan", arguments.log_starts)
-            found = list(tqdm(starts_of_log, desc=name, total=arguments.log_starts, unit="start"))
-            stored = {"identity": identity, "numbers": summary_of(found)}
-            cache.parent.mkdir(parents=True, exist_ok=True)
-            write_at_once(cache, json.dumps(stored))
-        result[name] = stored["numbers"]
-    return result
+    weights, count = arguments.weights / "scan", arguments.log_starts
+    row = Row(partial(_log, weights=weights, count=count), f"{count} {folder_digest(weights)}", _LOG_CODE)
+    plan = [
+        (Drive(name, log_identity(path), partial(read_drive, path), (lidar_logs,)), {"ours": row})
+        for name, path in logs_below(folder).items()
+    ]
+    found = measure(plan, arguments.runs / "scan" / "relocalisation", "logs")
+    return {name: summary_of(starts_of(rows["ours"].drawn)) for name, rows in found.items()}
 
 
-def _log_code() -> str:
-    """A hash of the package that numbers of logs come from."""
-    files = [*sorted(Path(ngo_estimator.__path__[0]).rglob("*.py")), Path(kidnapped_logs.__file__)]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+_LOG_CODE = (kidnapped_logs, scan_trajectory, lidar_odometry, localisation, scan_matcher)
 
 
-def _summary(mazes: list[list[dict[str, float]]]) -> Numbers:
+def _log(drive: LidarDrive, weights: Path, count: int) -> Measured:
+    return Measured(drawn=as_arrays(list(tqdm(log_starts(drive, weights, count), drive.name, count, unit="start"))))
+
+
+def _summary(mazes: list[Measured], kind: str) -> Numbers:
     """Means over the mazes' means, with intervals by resampling mazes; a number that no two mazes have is left out."""
     result: Numbers = {}
-    for name in dict.fromkeys(name for maze in mazes for start in maze for name in start):
-        columns = [np.array([start[name] for start in maze]) for maze in mazes if maze]
-        means = np.array([np.nanmean(column) for column in columns if np.isfinite(column).any()])
+    for name in NUMBERS:
+        columns = [maze.errors[f"{kind}:{name}"] for maze in mazes]
+        means = np.array([np.nanmean(values) for values in columns if np.isfinite(values).any()])
         if len(means) >= 2:
-            result[{"frames": "frames_to_success"}.get(name, name)] = mean_interval(means).as_json()
-    return result | {"starts": {"mean": float(sum(map(len, mazes))), "ci95": [float(sum(map(len, mazes)))] * 2}}
+            result[{"frames": "frames_to_success"}.get(name, name)] = interval_of(means)
+    return result | {"starts": _count(sum(len(maze.errors[f"{kind}:{NUMBERS[0]}"]) for maze in mazes))}
 
 
-def _heading_rmse(poses: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.degrees(_rms((poses[:, 2] - truth[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)))
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.square(values).mean()))
+def _count(starts: int) -> dict[str, Any]:
+    return {"mean": float(starts), "ci95": [float(starts)] * 2}
 
 
 if __name__ == "__main__":

@@ -15,50 +15,43 @@ measured in mazes that nothing was trained or chosen on. The command writes ``tr
 import json
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from tqdm import tqdm
 
+from ngo_estimator.loops import overlaps, pair_measurement
+from ngo_estimator.ngo import neural_graph_optimizer
+from ngo_estimator.trajectory import errors
 from training import results_doom, results_graphs, results_scan, results_stress
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.prerequisites import Scripts, Wanted, prepare
 from training.report import attention, figures, results_page, tables
+from training.report.folders import Folders
 from training.report.training_records import trainings_json
-from training.scoring.error_cache import Evaluation, evaluate_row
+from training.scoring import oracle_rows
+from training.scoring import prefix_errors as prefix_errors_module
 from training.scoring.network_odometry import open_odometry
 from training.scoring.oracle_rows import LIMITED_WORLDS, LIMITS, limit_estimator
-from training.scoring.row_estimators import Arrays, Prepared, estimators
+from training.scoring.prefix_errors import prefix_errors
+from training.scoring.row_estimators import Arrays, Estimator, Prepared, estimators
+from training.scoring.table import Drive, Measured, Row, measure
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the results."""
 
-    world: Literal["maze2d", "maze3d"]
-    """World to measure in."""
+    world: Literal["maze2d", "maze3d"]  # World to measure in.
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Designs are chosen on validation; the test split is for the final tables alone."""
-    trajectories: int = 0
-    """Trajectories of each table, each in a maze of its own; 0 for the world's number."""
-    seeds: int = 3
-    """Trainings of each optimizer, with the seeds 0, 1, ..."""
+    trajectories: int = 0  # Trajectories of each table, each in a maze of its own; 0 for the world's number.
+    seeds: int = 3  # Trainings of each optimizer, with the seeds 0, 1, ...
     prefixes: tuple[int, ...] = ()
     """Numbers of steps after which errors are given, as if the robot had stopped there; none: the world's."""
-    weights: Path = records.WEIGHTS
-    """Folder with WORLD/*.safetensors of the local network and the place encoder."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets WORLD.json, and holds WORLD.gtsam.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_WORLD.md and images/."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of feature stores, rows' weights, logs and estimates."""
 
     def __post_init__(self) -> None:
         if (self.trajectories < 2 and self.trajectories != 0) or self.seeds < 1:
@@ -70,6 +63,7 @@ class Arguments:
 
 
 _ATTENTION_TRAJECTORIES = 24
+_CODE = (oracle_rows, prefix_errors_module, neural_graph_optimizer, overlaps, pair_measurement, errors)
 
 
 def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]:
@@ -88,11 +82,9 @@ def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]
             table: tables.rows_json(limiting_rows(arguments, sources, table, found), result["steps"], world)
             for table, found in evaluations.items()
         }
-    write_at_once(arguments.out / f"{world.name}.json", json.dumps(result, indent=2) + "\n")
-    images = figures.draw_all(arguments.docs / "images", sources, arguments.split, stores, evaluations, result)
-    write_at_once(arguments.docs / f"results_{world.name}.md", results_page.page(result, images, world))
+    images = figures.draw_all(arguments.images, sources, arguments.split, stores, evaluations, result)
     print(f"{world.name}: {arguments.out / f'{world.name}.json'}, {arguments.docs / f'results_{world.name}.md'}")
-    return result
+    return arguments.publish(world.name, result, results_page.page(result, images, world))
 
 
 @dataclass(frozen=True)
@@ -121,55 +113,50 @@ def table_data(arguments: Arguments, sources: Sources, table: str, row: str = "l
     return TableData({name: array[: arguments.trajectories] for name, array in arrays.items()}, identity)
 
 
-def evaluate_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Evaluation]]:
-    """The evaluations of every row on a table's trajectories, one for each training seed."""
-    shared = table_data(arguments, sources, table)
-    cache = cache_folder(arguments, table)
-    result: dict[str, list[Evaluation]] = {}
-    prepared: Prepared = {}
-    with tqdm(rows_of(sources.world), desc=f"{sources.world.name} {table}", unit="row") as bar:
-        for row in bar:
-            bar.set_postfix_str(row)
-            data = table_data(arguments, sources, table, row)
-            if not np.array_equal(data.arrays["truth"], shared.arrays["truth"]):
-                raise ValueError(f"the features of {row} are of other trajectories than those of the table {table}")
-            result[row] = [
-                evaluate_row(
-                    estimator,
-                    data.arrays,
-                    data.identity,
-                    arguments.prefixes,
-                    sources.world,
-                    cache / f"{row}-seed{seed}.npz",
-                )
-                for seed, estimator in enumerate(estimators(row, arguments.seeds, sources, prepared))
-            ]
-    return result
-
-
-def cache_folder(arguments: Arguments, table: str) -> Path:
-    """Folder of the evaluations of a table."""
-    return arguments.runs / arguments.world / "results" / f"{arguments.split}_{table}"
+def evaluate_rows(arguments: Arguments, sources: Sources, table: str) -> dict[str, list[Measured]]:
+    """What every row gives on a table's trajectories, one measurement for each training seed."""
+    shared, prepared = table_data(arguments, sources, table), Prepared()
+    rows: dict[str, Row] = {}
+    for row in rows_of(sources.world):
+        data = table_data(arguments, sources, table, row)
+        if not np.array_equal(data.arrays["truth"], shared.arrays["truth"]):
+            raise ValueError(f"the features of {row} are of other trajectories than those of the table {table}")
+        for seed, estimator in enumerate(estimators(row, arguments.seeds, sources, prepared)):
+            rows[f"{row}-seed{seed}"] = _row(sources, estimator, data, arguments.prefixes)
+    found = _measured(arguments, sources, table, rows)
+    return {
+        row: [measured for name, measured in found.items() if name.rpartition("-seed")[0] == row]
+        for row in rows_of(sources.world)
+    }
 
 
 def limiting_rows(
-    arguments: Arguments, sources: Sources, table: str, evaluations: dict[str, list[Evaluation]]
-) -> dict[str, list[Evaluation]]:
-    """The evaluations of the rows that show the limits of a table; of optimizers those of the first training seed."""
-    data, cache = table_data(arguments, sources, table), cache_folder(arguments, table)
-    result = {row: evaluations[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
-    for name in tqdm(LIMITS, desc=f"{sources.world.name} {table} limits", unit="row"):
-        estimator = limit_estimator(name, sources)
-        found = evaluate_row(estimator, data.arrays, data.identity, (), sources.world, cache / f"{name}.npz")
-        result[name] = [found]
-    return result
+    arguments: Arguments, sources: Sources, table: str, evaluations: dict[str, list[Measured]]
+) -> dict[str, list[Measured]]:
+    """The rows that show the limits of a table; of optimizers those of the first training seed."""
+    data = table_data(arguments, sources, table)
+    rows = {name: _row(sources, limit_estimator(name, sources), data, ()) for name in LIMITS}
+    known = {row: evaluations[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
+    return known | {name: [found] for name, found in _measured(arguments, sources, table, rows).items()}
+
+
+def _row(sources: Sources, estimator: Estimator, data: TableData, prefixes: tuple[int, ...]) -> Row:
+    identity = json.dumps([estimator.identity, data.identity, sorted(prefixes)])
+    return Row(lambda _: prefix_errors(estimator, data.arrays, prefixes, sources.world), identity, _CODE)
+
+
+def _measured(arguments: Arguments, sources: Sources, table: str, rows: dict[str, Row]) -> dict[str, Measured]:
+    """The rows on all trajectories of a table, which are optimised together and are one drive."""
+    drive = Drive(table, f"{arguments.split} {table} {arguments.trajectories}", lambda: None)
+    folder = arguments.runs / arguments.world / "results" / arguments.split
+    return measure([(drive, rows)], folder, f"{sources.world.name} {table}")[table]
 
 
 def summary(
     arguments: Arguments,
     sources: Sources,
     stores: dict[str, Arrays],
-    evaluations: dict[str, dict[str, list[Evaluation]]],
+    evaluations: dict[str, dict[str, list[Measured]]],
 ) -> dict[str, Any]:
     """The content of the JSON."""
     world, prefixes = sources.world, sorted(arguments.prefixes)

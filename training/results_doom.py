@@ -8,34 +8,33 @@ where ``training/results/doom.gtsam.json`` is missing. Run it again to continue 
 """
 
 import dataclasses
-import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ngo_estimator.checkpoint import FAMILIARITY, load_familiarity, load_local, load_place
 from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.frontend.camera.familiarity_watch import FamiliarityWatch
+from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
 from training.data.episodes import images_of
 from training.data.features import features_of
-from training.data.worlds import world_named
+from training.data.worlds import World, world_named
 from training.report.doom_levels import draw_levels
 from training.report.doom_page import draw, page
+from training.report.folders import Folders
+from training.scoring import doom_rows
 from training.scoring.doom_rows import (
-    METRICS,
     ROWS,
     ActionsFit,
     Estimate,
@@ -46,35 +45,32 @@ from training.scoring.doom_rows import (
     ours,
     returning,
 )
-from training.scoring.statistics import mean_interval
+from training.scoring.metrics import path_length_m
+from training.scoring.online_estimate import with_origin
+from training.scoring.table import Drive, Measured, Row, column, intervals, kept, means_over_samples, measure
 
 _FIRST_SEED = {"validation": 10_000, "test": 20_000}
 _MAPS = {"validation": VALIDATION_MAPS, "test": TEST_MAPS}
 _FIT_SEED, _FIT_MAPS = 5_000, 12
+_TRUTH = "truth"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the measurement."""
 
-    world: Literal["doom"] = "doom"
-    """World to measure in."""
+    world: Literal["doom"] = "doom"  # World to measure in.
     split: Literal["validation", "test"] = "test"
     """Maps to measure on. Settings are chosen on validation; the test maps are for the final table alone."""
-    seeds: int = 3
-    """Drives of each map."""
-    frames: int = 1000
-    """Frames of a drive."""
-    maps: int = 0
-    """Number of maps; 0: all."""
-    weights: Path = records.WEIGHTS
-    """Folder with doom/*.safetensors."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets doom.json, and holds doom.gtsam.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_doom.md and images/."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what is kept of each drive."""
+    seeds: int = 3  # Drives of each map.
+    frames: int = 1000  # Frames of a drive.
+    maps: int = 0  # Number of maps; 0: all.
+
+    def __post_init__(self) -> None:
+        if self.seeds < 2 or self.frames < 2 or self.maps < 0:
+            raise ValueError(
+                f"seeds, frames, maps are {self.seeds}, {self.frames}, {self.maps}; expected at least 2, 2 and 0"
+            )
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -82,30 +78,23 @@ def main(arguments: Arguments) -> dict[str, Any]:
     torch.set_num_threads(1)
     folder = arguments.weights / arguments.world
     drives = Drives(folder, arguments)
-    rows = row_estimators(arguments, drives)
+    rows = table_rows(arguments, drives)
     seeds = range(_FIRST_SEED[arguments.split], _FIRST_SEED[arguments.split] + arguments.seeds)
-    maps = _MAPS[arguments.split][: arguments.maps or None]
     result: dict[str, Any] = {**records.record("results_doom", arguments), "path_m": {}, "returns": {}, "maps": {}}
     result.pop("arguments")
     tracks: dict[str, dict[str, np.ndarray]] = {}
-    for of in tqdm(maps, desc=f"{arguments.world} {arguments.split}", unit="map"):
-        found = [drives.scored(of, seed, rows) for seed in seeds]
-        entry: dict[str, Any] = {
-            row: {metric: mean_interval(np.array([one.errors[row][metric] for one in found])).as_json()
-                  for metric in METRICS}
-            for row in ROWS
-        }  # fmt: skip
-        result["path_m"][map_name(of)] = mean_interval(
-            np.array([one.errors["local"]["path_m"] for one in found])
-        ).as_json()
-        result["returns"][map_name(of)] = float(np.mean([one.errors["local"]["returns"] for one in found]))
-        result["maps"][map_name(of)] = entry
-        tracks[map_name(of)] = found[0].tracks
-    write_at_once(arguments.out / f"{arguments.world}.json", json.dumps(result, indent=2) + "\n")
-    draw_levels(arguments.docs / "images" / "doom_levels.png")
-    draw(arguments.docs / "images" / "results_doom_maps.png", tracks)
-    write_at_once(arguments.docs / "results_doom.md", page(result, folder))
-    return result
+    for of in _MAPS[arguments.split][: arguments.maps or None]:
+        name = map_name(of)
+        table = measure([(drives.of_table(of, seed), rows) for seed in seeds], drives.folder / "scored", name)
+        means = {row: means_over_samples(column(table, row)) for row in rows}
+        result["path_m"][name] = intervals(means[_TRUTH])["path_m"]
+        result["returns"][name] = float(means[_TRUTH]["returns"].mean())
+        result["maps"][name] = {row: intervals(means[row]) for row in ROWS}
+        first = next(iter(table.values()))
+        tracks[name] = {row: measured.drawn["track"] for row, measured in first.items()}
+    draw_levels(arguments.images / "doom_levels.png")
+    draw(arguments.images / "results_doom_maps.png", tracks)
+    return arguments.publish(arguments.world, result, page(result, folder))
 
 
 def map_name(of: Map) -> str:
@@ -114,47 +103,46 @@ def map_name(of: Map) -> str:
     return f"freedoom2_{name}" if wad == "freedoom2.wad" else wad.removesuffix(".wad")
 
 
-@dataclass(frozen=True)
-class Scored:
-    """The errors of each row on a drive, and their paths ``(steps, 2)`` with the true one, ``truth``."""
-
-    errors: dict[str, dict[str, float]]
-    tracks: dict[str, np.ndarray]
-
-
 class Drives:
-    """Drives and what was measured on them, kept in files."""
+    """Drives and what the networks make of them, kept in files below ``folder``."""
 
     def __init__(self, weights: Path, arguments: Arguments) -> None:
-        self._folder = arguments.runs / arguments.world / "results"
+        self.folder = arguments.runs / arguments.world / "results"
         self._frames, self._weights = arguments.frames, weights
         self.local, described = load_local(weights, arguments.world)
         self.place, described_place = load_place(weights, arguments.world)
         familiarity = load_familiarity(weights, arguments.world)
         self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self.place.encoder)
-        self._networks = (described["sha256"], described_place["sha256"])
-        self._world = world_named(arguments.world)
+        known = weights / f"{FAMILIARITY}.safetensors"
+        watch = load_description(known, FAMILIARITY)["sha256"] if known.exists() else None
+        self._networks = json.dumps([described["sha256"], described_place["sha256"]])
+        self._identity = f"{self._networks} {watch}"
+        self._world: World = world_named(arguments.world)
 
     def drive(self, of: Map, seed: int, drawn_start: bool = False) -> Episode:
         """A drive, which is simulated once."""
-        start = "-drawn" if drawn_start else ""
-        path = self._folder / "drives" / f"{map_name(of)}-{seed}-{self._frames}{start}.npz"
-        if not path.exists():
+
+        def made() -> dict[str, np.ndarray]:
             drive = map_drive(of, seed, self._frames, drawn_start=drawn_start)
-            _save(path, observations=drive.observations, actions=drive.actions, poses=drive.poses_xyyaw)
-        with np.load(path) as stored:
-            return Episode(stored["observations"], stored["actions"], stored["poses"], self._world.period_s, None)
+            return {"observations": drive.observations, "actions": drive.actions, "poses": drive.poses_xyyaw}
+
+        name = self._name(of, seed, drawn_start)
+        found = kept(self.folder / "drives" / f"{name}.npz", name, made)
+        return Episode(found["observations"], found["actions"], found["poses"], self._world.period_s, None)
 
     def features(self, of: Map, seed: int, drawn_start: bool = False) -> Features:
         """What the networks make of a drive."""
-        key = hashlib.sha256(json.dumps([self._networks, of, seed, self._frames, drawn_start]).encode()).hexdigest()
-        path = self._folder / f"{map_name(of)}-{seed}-{key[:12]}.npz"
-        if not path.exists():
+
+        def made() -> Features:
             drive = self.drive(of, seed, drawn_start)
             features = features_of(self._world, drive, self._weights, (self.local, self.place))
-            _save(path, actions=drive.actions, poses=drive.poses_xyyaw, **features)
-        with np.load(path) as stored:
-            return dict(stored)
+            return {"actions": drive.actions, "poses": drive.poses_xyyaw, **features}
+
+        name = self._name(of, seed, drawn_start)
+        return kept(self.folder / f"{name}.npz", f"{name} {self._networks}", made)
+
+    def _name(self, of: Map, seed: int, drawn_start: bool) -> str:
+        return f"{map_name(of)}-{seed}-{self._frames}{'-drawn' * drawn_start}"
 
     def judged(self, of: Map, seed: int, features: Features) -> Features:
         """The features with steps and deviations as ``local_node`` publishes them, and ``unlikeness`` ``(steps,)``."""
@@ -171,55 +159,39 @@ class Drives:
             "unlikeness": np.array([one.unlikeness for one in found]),
         }
 
-    def scored(self, of: Map, seed: int, rows: "Rows") -> Scored:
-        """The errors of the rows on a drive."""
-        key = hashlib.sha256(json.dumps([self._networks, rows.identity, self._frames]).encode()).hexdigest()
-        path = self._folder / "scored" / f"{map_name(of)}-{seed}-{key[:12]}.json"
-        if not path.exists():
-            features = self.judged(of, seed, self.features(of, seed))
-            estimates = {row: estimator(features) for row, estimator in rows.estimators.items()}
-            errors = {row: errors_of(estimate, features["truth"]) for row, estimate in estimates.items()}
-            radius_m, angle_rad = self._world.place_radius_m, self._world.heading_limit_rad
-            errors["local"]["returns"] = returning(features["truth"], radius_m, angle_rad)
-            tracks = {row: estimate.poses[:, :2].tolist() for row, estimate in estimates.items()}
-            tracks["truth"] = features["truth"][:, :2].tolist()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_at_once(path, json.dumps({"errors": errors, "tracks": tracks}))
-        stored = json.loads(path.read_text())
-        return Scored(stored["errors"], {row: np.array(track) for row, track in stored["tracks"].items()})
+    def of_table(self, of: Map, seed: int) -> Drive:
+        """A drive of the table, which makes the features as they are judged."""
+        name = self._name(of, seed, drawn_start=False)
+        return Drive(name, f"{name} {self._identity}", lambda: self.judged(of, seed, self.features(of, seed)))
 
 
-@dataclass(frozen=True)
-class Rows:
-    """The estimators of all rows, and what identifies them beside the networks of the odometry and of places."""
-
-    estimators: dict[str, Callable[[Features], Estimate]]
-    identity: str
-
-
-def _save(path: Path, **arrays: np.ndarray) -> None:
-    """Write arrays as a file that is there as a whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".part.npz")
-    np.savez(partial, **arrays)  # type: ignore[arg-type]
-    partial.rename(path)
-
-
-def row_estimators(arguments: Arguments, drives: Drives) -> Rows:
-    """The estimators of all rows."""
+def table_rows(arguments: Arguments, drives: Drives) -> dict[str, Row]:
+    """The rows of the table, and one of the drives themselves."""
     fitted = [drives.features(of, _FIT_SEED, drawn_start=True) for of in TRAIN_MAPS[:_FIT_MAPS]]
     actions = ActionsFit.of([(one["actions"], one["poses"]) for one in fitted])
     settings = load_settings(arguments.out / f"{arguments.world}.gtsam.json")
     core = OnlineTrajectory.load(arguments.weights / arguments.world, world=arguments.world)
-    known = arguments.weights / arguments.world / f"{FAMILIARITY}.safetensors"
-    familiarity = load_description(known, FAMILIARITY)["sha256"] if known.exists() else None
     estimators = {
-        "actions_only": actions.estimate,
-        "local": local,
-        "gtsam": gtsam_graph(settings, drives.place.pair_head),
-        "ours": ours(core),
+        "actions_only": (actions.estimate, str(actions.weights.tolist())),
+        "local": (local, ""),
+        "gtsam": (gtsam_graph(settings, drives.place.pair_head), json.dumps(dataclasses.asdict(settings))),
+        "ours": (ours(core), str(core.identity)),
     }
-    return Rows(estimators, json.dumps([core.identity, dataclasses.asdict(settings), familiarity]))
+
+    def scored(features: Features, row: str) -> Measured:
+        estimate: Estimate = estimators[row][0](features)
+        return Measured.of(errors_of(estimate, features["truth"]), track=estimate.poses[:, :2])
+
+    world, code = world_named(arguments.world), (doom_rows, online_trajectory)
+    rows = {row: Row(partial(scored, row=row), identity, code) for row, (_, identity) in estimators.items()}
+    return {**rows, _TRUTH: Row(partial(_truth, world=world), "", (doom_rows,))}
+
+
+def _truth(features: Features, world: World) -> Measured:
+    """Length of the path, and the share of it that returns."""
+    truth = features["truth"]
+    returns = returning(truth, world.place_radius_m, world.heading_limit_rad)
+    return Measured.of({"path_m": path_length_m(with_origin(truth)), "returns": returns}, track=truth[:, :2])
 
 
 if __name__ == "__main__":

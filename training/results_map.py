@@ -11,66 +11,65 @@ The command writes ``training/results/map.json`` and ``docs/results_map.md``.
 import json
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
+from ngo_estimator.frontend.lidar import lidar_odometry
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
 from ngo_estimator.geometry import se2
+from ngo_estimator.mapping import scan_map
+from ngo_estimator.mapping import scan_source as scan_sources
 from ngo_estimator.mapping.occupancy_grid import OccupancyConfig, OccupancyMap
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
 from ngo_estimator.mapping.scan_source import KeyScans, ScanSource, scan_source
+from ngo_estimator.ngo import whole_trajectory
+from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.whole_trajectory import optimize_offline
+from ngo_estimator.slam import scan_trajectory
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
+from training.data.batches import seen_from_first
 from training.data.episodes import GROUP, simulate
-from training.data.features import OPTIMIZER_INPUTS, features_of
+from training.data.features import OPTIMIZER_INPUTS, Networks, features_of
 from training.data.lidar_drives import ReferencePoses
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.recordings.lidar_logs import logs_below, read_drive
-from training.report.results_page import interval, markdown
+from training.recordings import lidar_logs
+from training.recordings.lidar_logs import log_identity, logs_below, read_drive
+from training.report import map_page
+from training.report.folders import Folders
+from training.scoring import map_errors
 from training.scoring.lidar_rows import DriveRuns, Pipeline
-from training.scoring.map_errors import intersections, mean_entropy_bits, seen_from, true_map
+from training.scoring.lidar_scores import with_runs
+from training.scoring.map_errors import intersections, mean_entropy_bits, true_map
 from training.scoring.metrics import path_length_m
 from training.scoring.online_estimate import steps_of, with_origin
-from training.scoring.statistics import mean_interval
+from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, measure, samples
 
+_CODE = (map_errors, whole_trajectory, scan_map, scan_sources)
+_LOG_CODE = (map_errors, scan_map, scan_sources, lidar_odometry, scan_trajectory)
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 _ROWS = ("odometry", "corrected", "true")
 _DEFAULT = OccupancyConfig()
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the measurement."""
 
-    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")
-    """Worlds whose mazes are drawn."""
+    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")  # Worlds whose mazes are drawn.
     split: Literal["validation", "test"] = "test"
     """Mazes to measure in. Settings are chosen on validation; the test split is for the final table alone."""
-    mazes: int = 20
-    """Mazes of each world, each with a trajectory of its own."""
-    frames: int = 500
-    """Frames of a trajectory."""
-    logs: Path | None = None
-    """Folder of real logs (.bag, .log, .clf, gzipped or not); none: left out."""
-    hit: float = _DEFAULT.hit
-    """Log odds that a scan adds to a cell in which it ends."""
-    passed: float = _DEFAULT.passed
-    """Log odds that a scan takes from a cell which it looks through."""
-    max_range_m: float = 0.0
-    """Longest range that enters a map; 0: that of ngo_map."""
-    weights: Path = records.WEIGHTS
-    """Folder with the weights of each world."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets map.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_map.md."""
+    mazes: int = 20  # Mazes of each world, each with a trajectory of its own.
+    frames: int = 500  # Frames of a trajectory.
+    logs: Path | None = None  # Folder of real logs (.bag, .log, .clf, gzipped or not); none: left out.
+    hit: float = _DEFAULT.hit  # Log odds that a scan adds to a cell in which it ends.
+    passed: float = _DEFAULT.passed  # Log odds that a scan takes from a cell which it looks through.
+    max_range_m: float = 0.0  # Longest range that enters a map; 0: that of ngo_map.
 
     def __post_init__(self) -> None:
         if self.mazes < 2 or self.frames < 2:
@@ -96,61 +95,105 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "logs": log_table(arguments, skipped),
         "skipped": skipped,
     }
-    write_at_once(arguments.out / "map.json", json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_map.md", page(result))
     print(json.dumps({"tables": result["tables"], "skipped": skipped}))
-    return result
+    return arguments.publish("map", result, map_page.page(result))
 
 
 def drawn(
     config: ScanMapConfig, source: ScanSource, steps: list[Any], stamps_ns: np.ndarray, poses: np.ndarray
 ) -> OccupancyMap:
     """The probabilities of the map of all steps at poses ``(frames, 3)``."""
-    scan_map = ScanMap(config)
+    drawing = ScanMap(config)
     for step in steps:
-        scan_map.take(step, source.scans(step))
-    scan_map.update(stamps_ns, poses)
-    return scan_map.cells()
+        drawing.take(step, source.scans(step))
+    drawing.update(stamps_ns, poses)
+    return drawing.cells()
 
 
 def maze_table(arguments: Arguments, world: World) -> dict[str, Any]:
     """By row: IoU of free and of occupied cells in the mazes of a world, ``{mean, ci95}``."""
-    folder = arguments.weights / world.name
-    networks = load_local(folder, world.name)[0], load_place(folder, world.name)[0]
-    optimizer = load_optimizer(folder, world.name)[0]
-    source = scan_source(folder, world.name, arguments.max_range_m)
-    if source is None or world.registration is None:
-        raise ValueError(f"the weights of {world.name} see no ranges; expected ranges behind their place codes")
-    half_rad = math.radians(world.registration.field_of_view_deg) / 2.0
-    angles = np.linspace(half_rad, -half_rad, 8 * world.registration.rays)
-    found: dict[str, list[tuple[float, float]]] = {row: [] for row in _ROWS}
-    config, occupancy = arguments.map_config, arguments.map_config.occupancy
     seeds = list(_SPLITS[arguments.split][: arguments.mazes])
-    with tqdm(total=len(seeds), desc=world.name, unit="maze") as bar:
-        for group in (seeds[i : i + GROUP] for i in range(0, len(seeds), GROUP)):
-            for episode in simulate(world, group, arguments.frames):
-                features = features_of(world, episode, folder, networks)
-                arrays = [torch.from_numpy(features[name]) for name in OPTIMIZER_INPUTS]
-                poses = {
-                    "odometry": with_origin(se2.r2g(arrays[0].double()).numpy()),
-                    "corrected": with_origin(
-                        optimize_offline(optimizer, networks[1].pair_head, *arrays).poses[0].numpy()
-                    ),
-                    "true": seen_from(episode.poses_xyyaw[0], episode.poses_xyyaw),
-                }
-                assert episode.maze is not None
-                true = true_map(episode.maze, episode.poses_xyyaw, angles, config.resolution_m)
-                steps, stamps = list(steps_of(features)), np.arange(arguments.frames)
-                for row, estimate in poses.items():
-                    cells = drawn(config, source, steps, stamps, estimate.astype(np.float64))
-                    found[row].append(intersections(cells.trinary(occupancy.free, occupancy.occupied), true))
-                bar.update()
-    return {
-        row: {
-            key: mean_interval(np.array(values)[:, k]).as_json() for k, key in enumerate(("free_iou", "occupied_iou"))
-        }
-        for row, values in found.items()
-    }
+    made = Mazes.load(arguments, world)
+    # Mazes of a group are simulated together: all are of the size that is drawn for the first.
+    groups = [tuple(seeds[first : first + GROUP]) for first in range(0, len(seeds), GROUP)]
+    identity = _identity(arguments, made.folder)
+    rows = {row: Row(partial(maze_errors, row=row, mazes=made), identity, _CODE) for row in _ROWS}
+    drives = [
+        Drive(f"mazes_{group[0]}_{len(group)}", f"{group}, {arguments.frames} frames", partial(made.drives, group))
+        for group in groups
+    ]
+    found = measure([(drive, rows) for drive in drives], arguments.runs / world.name / "map", world.name)
+    return {row: intervals(samples(column(found, row))) for row in _ROWS}
+
+
+@dataclass(frozen=True)
+class Mazes:
+    """What drives through mazes of a world, and the networks and settings that draw their maps."""
+
+    world: World
+    folder: Path
+    networks: Networks
+    optimizer: NeuralGraphOptimizer
+    source: ScanSource
+    config: ScanMapConfig
+    frames: int
+
+    @classmethod
+    def load(cls, arguments: Arguments, world: World) -> "Mazes":
+        """From the folder of all weights; raises ``ValueError`` where these see no ranges."""
+        folder, name = arguments.weights / world.name, world.name
+        source = scan_source(folder, name, arguments.max_range_m)
+        if source is None or world.registration is None:
+            raise ValueError(f"the weights of {name} see no ranges; expected ranges behind their place codes")
+        networks = Networks(load_local(folder, name)[0], load_place(folder, name)[0])
+        optimizer = load_optimizer(folder, name)[0]
+        return cls(world, folder, networks, optimizer, source, arguments.map_config, arguments.frames)
+
+    def drives(self, seeds: tuple[int, ...]) -> list["MazeDrive"]:
+        """A drive through each maze of a group."""
+        assert self.world.registration is not None
+        half_rad = math.radians(self.world.registration.field_of_view_deg) / 2.0
+        angles = np.linspace(half_rad, -half_rad, 8 * self.world.registration.rays)
+        found = []
+        for one in simulate(self.world, list(seeds), self.frames):
+            assert one.maze is not None
+            true = true_map(one.maze, one.poses_xyyaw, angles, self.config.resolution_m)
+            features = features_of(self.world, one, self.folder, self.networks)
+            found.append(MazeDrive(one.poses_xyyaw, features, true))
+        return found
+
+    def poses(self, drive: "MazeDrive", row: str) -> np.ndarray:
+        """The poses ``(frames, 3)`` of a row, seen from the first frame."""
+        if row == "true":
+            return seen_from_first(drive.poses_xyyaw)
+        arrays = [torch.from_numpy(drive.features[name]) for name in OPTIMIZER_INPUTS]
+        if row == "odometry":
+            return with_origin(se2.r2g(arrays[0].double()).numpy())
+        return with_origin(optimize_offline(self.optimizer, self.networks.place.pair_head, *arrays).poses[0].numpy())
+
+
+@dataclass(frozen=True)
+class MazeDrive:
+    """True poses in the maze ``(frames, 3)``, what the networks make of the drive, and the true map."""
+
+    poses_xyyaw: np.ndarray
+    features: dict[str, np.ndarray]
+    true: OccupancyMap
+
+
+def maze_errors(drives: list[MazeDrive], row: str, mazes: Mazes) -> Measured:
+    """IoU of the maps at the poses of a row, one sample a maze."""
+    occupancy, found = mazes.config.occupancy, []
+    for one in drives:
+        poses = mazes.poses(one, row).astype(np.float64)
+        cells = drawn(mazes.config, mazes.source, list(steps_of(one.features)), np.arange(mazes.frames), poses)
+        found.append(intersections(cells.trinary(occupancy.free, occupancy.occupied), one.true))
+    free, occupied = np.array(found).T
+    return Measured({"free_iou": free, "occupied_iou": occupied})
+
+
+def _identity(arguments: Arguments, weights: Path) -> str:
+    return json.dumps([folder_digest(weights), repr(arguments.map_config), arguments.max_range_m])
 
 
 def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
@@ -158,64 +201,46 @@ def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
     logs = {} if arguments.logs is None else logs_below(arguments.logs)
     if not logs:
         skipped.append("logs: no folder is given (--logs), or it has none")
-    table: dict[str, Any] = {}
-    for name, path in tqdm(logs.items(), desc="logs", unit="log"):
-        drive = read_drive(path)
-        try:
-            run = DriveRuns(drive, arguments.weights / "scan").run(Pipeline())
-        except ValueError as error:
-            skipped.append(f"{name}: {error}")
-            continue
-        trajectory = run.trajectory
-        poses = {"odometry": trajectory.odometry_xyyaw, "corrected": trajectory.poses_xyyaw}
-        steps: list[LidarStep] = list(run.front.steps)
-        if isinstance(drive.reference, ReferencePoses):
-            known = dict(zip(drive.reference.stamps_ns.tolist(), drive.reference.poses_xyyaw, strict=True))
-            if all(stamp in known for stamp in trajectory.stamps_ns.tolist()):
-                poses["reference"] = np.array([known[stamp] for stamp in trajectory.stamps_ns.tolist()])
-        way_m = path_length_m(trajectory.poses_xyyaw)
-        table[name] = {}
-        for row, estimate in poses.items():
-            cells = drawn(arguments.map_config, KeyScans(arguments.max_range_m), steps, trajectory.stamps_ns, estimate)
-            occupied = int((cells.trinary(_DEFAULT.free, _DEFAULT.occupied).values == 100).sum())
-            table[name][row] = {"entropy_bits": mean_entropy_bits(cells), "occupied_cells_a_metre": occupied / way_m}
-    return table
+    weights = arguments.weights / "scan"
+    identity = _identity(arguments, weights)
+    rows = {
+        row: Row(partial(log_errors, row=row, arguments=arguments), identity, _LOG_CODE)
+        for row in ("odometry", "corrected", "reference")
+    }
+    drives = [Drive(name, log_identity(path), partial(read_drive, path), (lidar_logs,)) for name, path in logs.items()]
+    plan = [(with_runs(drive, weights), rows) for drive in drives]
+    found = measure(plan, arguments.runs / "scan" / "map", "logs")
+    skipped += [f"{name}: {log['corrected'].failed}" for name, log in found.items() if log["corrected"].failed]
+    return {
+        name: {
+            row: {key: float(value[0]) for key, value in one.errors.items()} for row, one in log.items() if one.errors
+        }
+        for name, log in found.items()
+        if not log["corrected"].failed
+    }
 
 
-def page(result: dict[str, Any]) -> str:
-    """The page of the results."""
-    lines = [
-        "# Maps",
-        "",
-        f"Made by `{result['command']}`. Intervals are of 95 %, by resampling mazes.",
-        "",
-        "Intersection over union of the map's cells with all cells that exact rays from the true poses see: free",
-        f"cells, and cells that a wall's surface crosses. {result['mazes']} mazes a world, of the {result['split']}",
-        f"split, {result['frames']} frames each, cells of 0.05 m, all poses seen from the first one.",
-        "",
-    ]
-    header = ["World", "Poses", "Free cells, IoU", "Occupied cells, IoU"]
-    rows = [
-        [f"`{world}`", row, interval(entry["free_iou"]), interval(entry["occupied_iou"])]
-        for world, table in result["tables"].items()
-        for row, entry in table.items()
-    ]
-    lines += [markdown(header, rows), ""]
-    if result["logs"]:
-        header = ["Log", "Poses", "Mean entropy of known cells, bit", "Occupied cells a metre of the way"]
-        rows = [
-            [f"`{log}`", row, f"{entry['entropy_bits']:.4f}", f"{entry['occupied_cells_a_metre']:.1f}"]
-            for log, table in result["logs"].items()
-            for row, entry in table.items()
-        ]
-        lines += [
-            "Real logs of a lidar. Scans that contradict each other raise the entropy, and blur walls into more cells.",
-            "`reference`: the poses of the mapper that wrote the log.",
-            "",
-            markdown(header, rows),
-            "",
-        ]
-    return "\n".join(lines)
+def log_errors(runs: DriveRuns, row: str, arguments: Arguments) -> Measured:
+    """How crisp the map of a log is at the poses of a row; nothing for a reference that does not know each pose."""
+    try:
+        run = runs.run(Pipeline())
+    except ValueError as error:
+        return Measured(failed=str(error))
+    trajectory = run.trajectory
+    poses = trajectory.odometry_xyyaw if row == "odometry" else trajectory.poses_xyyaw
+    if row == "reference":
+        reference, stamps = runs.drive.reference, trajectory.stamps_ns.tolist()
+        if not isinstance(reference, ReferencePoses):
+            return Measured()
+        known = dict(zip(reference.stamps_ns.tolist(), reference.poses_xyyaw, strict=True))
+        if not all(stamp in known for stamp in stamps):
+            return Measured()
+        poses = np.array([known[stamp] for stamp in stamps])
+    steps: list[LidarStep] = list(run.front.steps)
+    cells = drawn(arguments.map_config, KeyScans(arguments.max_range_m), steps, trajectory.stamps_ns, poses)
+    occupied = int((cells.trinary(_DEFAULT.free, _DEFAULT.occupied).values == 100).sum())
+    way_m = path_length_m(trajectory.poses_xyyaw)
+    return Measured.of({"entropy_bits": mean_entropy_bits(cells), "occupied_cells_a_metre": occupied / way_m})
 
 
 if __name__ == "__main__":

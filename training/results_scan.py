@@ -16,13 +16,11 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from tqdm import tqdm
 
 from ngo_recordings import mounting, recording, scan_stream, topics
 from ngo_sim import building2d, episodes, maze2d
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data import building_drives, scans, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
 from training.data.scans import CONDITIONS
@@ -31,13 +29,23 @@ from training.data.worlds import WORLDS
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, logs_below
 from training.report import lidar_figures, lidar_page
-from training.scoring.lidar_bars import PUBLISHED, Bar, Table, bars
+from training.report.folders import Folders
+from training.scoring.lidar_bars import PUBLISHED, Bar, bars
 from training.scoring.lidar_rows import ROWS, Row
-from training.scoring.lidar_scores import DriveSource, Scored, score_drive
+from training.scoring.lidar_scores import scored_rows, with_runs
 from training.scoring.statistics import compare, mean_interval
-
-Numbers = dict[str, dict[str, Any]]
-"""``{mean, ci95}`` by the metric's key."""
+from training.scoring.table import (
+    Drive,
+    Measured,
+    Numbers,
+    Table,
+    column,
+    interval_of,
+    intervals,
+    means_over_samples,
+    measure,
+    pairs,
+)
 
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
 _BUILDINGS = (building2d, building_drives)
@@ -47,43 +55,30 @@ _MOST_SCANS = 20_000  # of a building: some robots stand for hours
 _PAIRED = ("ate_m", "within_three_deviations", "negative_log_likelihood")
 _SLIPS_PER_KM = 300.0  # of the table of slip; the buildings have up to 60
 _ABLATED = ("buildings", "aliased")
+_WITH_WHEELS = ("logs", "buildings", "aliased", "slip")
 _SLIP_ROWS = ("wheels", "ours")
 _SETTINGS = ("buildings", "first_building", "ablation", "length_m", "mazes", "frames")
 _SCANNER_ROWS = ("ours_without_wheels",)
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the lidar's results."""
 
-    world: Literal["scan"] = "scan"
-    """World to measure in."""
+    world: Literal["scan"] = "scan"  # World to measure in.
     logs: Path | None = None
     """Folder of real logs (.bag, .log, .clf, gzipped or not), with relations as NAME.relations; none: left out."""
-    buildings: int = 20
-    """Simulated buildings of each of the two tables."""
+    buildings: int = 20  # Simulated buildings of each of the two tables.
     first_building: int = 0
     """Number of the first one among the test seeds: others than those of the tables that are published."""
-    length_m: float = 500.0
-    """Way that the robot drives in a building."""
-    ablation: int = 5
-    """How many of these get the rows of the ablation; and how many buildings have slipping wheels."""
-    mazes: int = 8
-    """Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0."""
-    frames: int = 2000
-    """Scans in a maze."""
-    rows: tuple[str, ...] = ()
-    """Rows to measure, by name; none: all."""
+    length_m: float = 500.0  # Way that the robot drives in a building.
+    ablation: int = 5  # How many of these get the rows of the ablation; and how many buildings have slipping wheels.
+    mazes: int = 8  # Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0.
+    frames: int = 2000  # Scans in a maze.
+    rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all.
     known: bool = False
     """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
-    weights: Path = records.WEIGHTS / "scan"
-    """Folder with lidar.json, the settings of our estimators."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets scan.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_scan.md and images/."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what was measured."""
+    weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
 
     def __post_init__(self) -> None:
         if unknown := [row for row in self.rows if row not in ROWS]:
@@ -108,12 +103,12 @@ def main(arguments: Arguments) -> dict[str, Any]:
     rows, skipped = _rows(arguments.rows)
     slip_rows = {name: row for name, row in rows.items() if name in _SLIP_ROWS}
     tables = {
-        name: _measured(arguments, name, sources, slip_rows if name == "slip" else rows)
-        for name, sources in _sources(arguments, skipped).items()
+        name: _measured(arguments, name, drives, slip_rows if name == "slip" else rows)
+        for name, drives in _plans(arguments, skipped).items()
     }
     scanner_rows = {name: row for name, row in rows.items() if name in _SCANNER_ROWS}
     scanners = {
-        condition: _measured(arguments, condition, _scanner_sources(arguments, condition), scanner_rows)
+        condition: _measured(arguments, condition, _scanner_plan(arguments, condition), scanner_rows)
         for condition in CONDITIONS
     }
     found = bars(tables, scanners)
@@ -130,11 +125,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "skipped": skipped,
         "failed": _failures({"logs": logs, **tables, **scanners}),
     }
-    write_at_once(arguments.out / "scan.json", json.dumps(result, indent=2) + "\n")
-    images = lidar_figures.draw(arguments.docs / "images", logs, tables)
-    write_at_once(arguments.docs / "results_scan.md", lidar_page.page(result, images))
+    images = lidar_figures.draw(arguments.images, logs, tables)
     _print(found, skipped)
-    return result
+    return arguments.publish("scan", result, lidar_page.page(result, images))
 
 
 def _command(recorded: str, with_logs: bool) -> str:
@@ -152,93 +145,75 @@ def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
     )
 
 
-def _sources(arguments: Arguments, skipped: list[str]) -> dict[str, list[DriveSource]]:
+def _plans(arguments: Arguments, skipped: list[str]) -> dict[str, Sequence[Drive]]:
     """The drives of each table; what is not there is added to what is skipped."""
     seeds = BUILDING_TEST_SEEDS[arguments.first_building :]
     aliased = seeds[_ALIASED_FIRST:]
-    sources = {
+    mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
+    plans: dict[str, Sequence[Drive]] = {
         "buildings": [_building(arguments, "buildings", seed) for seed in seeds[: arguments.buildings]],
         "aliased": [_building(arguments, "aliased", seed) for seed in aliased[: arguments.buildings]],
         "slip": [_building(arguments, "slip", seed) for seed in seeds[: arguments.ablation]],
+        "maze2d": [
+            Drive(
+                f"maze2d_{seed}",
+                f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
+                partial(maze_drive, seed, arguments.frames, mazes[0]),
+                _MAZES,
+            )
+            for seed in mazes
+        ],
     }
-    mazes = list(WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes])
-    sources["maze2d"] = [
-        DriveSource(
-            f"maze2d_{seed}",
-            f"maze2d {seed}, size by {mazes[0]}, {arguments.frames} frames",
-            partial(maze_drive, seed, arguments.frames, mazes[0]),
-            _MAZES,
-            has_wheels=False,
-        )
-        for seed in mazes
-    ]
-    if arguments.logs is None:
-        skipped.append("logs: no folder is given (--logs)")
-        return sources
-    logs = logs_below(arguments.logs)
+    logs = {} if arguments.logs is None else logs_below(arguments.logs)
     if not logs:
-        skipped.append("logs: the folder has none")
-        return sources
-    of_logs = [DriveSource(name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()]
-    return {"logs": of_logs, **sources}
+        skipped.append("logs: no folder is given (--logs)" if arguments.logs is None else "logs: the folder has none")
+        return plans
+    of_logs = [Drive(name, log_identity(path), partial(log_drive, path), _READ) for name, path in logs.items()]
+    return {"logs": of_logs, **plans}
 
 
-def _building(arguments: Arguments, table: str, seed: int) -> DriveSource:
-    slips = _SLIPS_PER_KM if table == "slip" else None
-    named = "" if slips is None else f", {slips:g} slips a km"
-    return DriveSource(
-        f"{table}_{seed}",
-        f"building {seed} {table} {arguments.length_m:g} m, {_MOST_SCANS} scans{named}",
-        partial(building_drive, seed, arguments.length_m, table == "aliased", _MOST_SCANS, slips),
-        _BUILDINGS,
-    )
-
-
-def _scanner_sources(arguments: Arguments, condition: str) -> list[DriveSource]:
+def _scanner_plan(arguments: Arguments, condition: str) -> Sequence[Drive]:
     changes = CONDITIONS[condition]
     return [
-        DriveSource(
+        Drive(
             f"maze_{seed}",
             f"scanned maze {seed}, {condition}, {json.dumps(changes)}, {arguments.frames} frames",
             partial(scanned_maze_drive, seed, arguments.frames, changes),
             _MAZES,
-            has_wheels=False,
         )
         for seed in WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes]
     ]
 
 
-def _measured(arguments: Arguments, table: str, sources: Sequence[DriveSource], rows: Mapping[str, Row]) -> Table:
-    cache = arguments.runs / "scan" / "results" / table.replace(" ", "_").replace("%", "percent").replace(",", "")
-    measured: dict[str, dict[str, Scored]] = {}
-    ablation = len(sources) if table == "logs" else arguments.ablation if table in _ABLATED else 0
-    with tqdm(sources, desc=table, unit="drive") as bar:
-        for index, source in enumerate(bar):
-            bar.set_postfix_str(source.name)
-            asked = {
-                name: row
-                for name, row in rows.items()
-                if (index < ablation or not row.ablation) and not (table == "logs" and row.needs_truth)
-            }
-            measured[source.name] = dict(
-                score_drive(source, asked, arguments.weights, cache, known_only=arguments.known)
-            )
-    return measured
+def _building(arguments: Arguments, name: str, seed: int) -> Drive:
+    slips = _SLIPS_PER_KM if name == "slip" else None
+    named = "" if slips is None else f", {slips:g} slips a km"
+    identity = f"building {seed} {name} {arguments.length_m:g} m, {_MOST_SCANS} scans{named}"
+    make = partial(building_drive, seed, arguments.length_m, name == "aliased", _MOST_SCANS, slips)
+    return Drive(f"{name}_{seed}", identity, make, _BUILDINGS)
 
 
-def _log_numbers(scored: Mapping[str, Scored]) -> dict[str, Numbers]:
+def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Mapping[str, Row]) -> Table:
+    """A table; rows of the ablation have its first drives alone, those that need wheels no mazes."""
+    folder = arguments.runs / "scan" / "results" / name.replace(" ", "_").replace("%", "percent").replace(",", "")
+    ablation = len(drives) if name == "logs" else arguments.ablation if name in _ABLATED else 0
+    scored = scored_rows(rows, arguments.weights)
+
+    def is_asked(index: int, row: Row) -> bool:
+        without_truth, without_wheels = name == "logs", name not in _WITH_WHEELS
+        left_out = (row.needs_truth and without_truth) or (row.needs_wheels and without_wheels)
+        return (index < ablation or not row.ablation) and not left_out
+
+    plan = [
+        (with_runs(drive, arguments.weights), {key: scored[key] for key, row in rows.items() if is_asked(index, row)})
+        for index, drive in enumerate(drives)
+    ]
+    return measure(plan, folder, name, known_only=arguments.known)
+
+
+def _log_numbers(scored: Mapping[str, Measured]) -> dict[str, Numbers]:
     """Of one log: means over its relations, the interval by resampling them; one number of a whole log has none."""
-    return {
-        row: {key: _interval(values) for key, values in one.errors.items()}
-        for row, one in scored.items()
-        if not one.failed
-    }
-
-
-def _interval(values: np.ndarray) -> dict[str, Any]:
-    if len(values) == 0:
-        return {"mean": None, "ci95": None}
-    return mean_interval(values).as_json() if len(values) > 1 else {"mean": float(values[0]), "ci95": None}
+    return {row: intervals(one.errors) for row, one in scored.items() if not one.failed}
 
 
 def _published(log: str) -> dict[str, Numbers]:
@@ -248,42 +223,32 @@ def _published(log: str) -> dict[str, Numbers]:
     }
 
 
-def _table_numbers(table: Table) -> dict[str, Numbers]:
+def _table_numbers(found: Table) -> dict[str, Numbers]:
     """Of several drives: means over them, the interval by resampling them, and how many these are."""
-    by_row: dict[str, dict[str, list[float]]] = {}
-    for rows in table.values():
-        for row, scored in rows.items():
-            for key, values in scored.errors.items():
-                by_row.setdefault(row, {}).setdefault(key, []).append(float(values.mean()))
-    return {
-        row: {key: {**_interval(np.array(values)), "drives": len(values)} for key, values in errors.items()}
-        for row, errors in by_row.items()
-    }
-
-
-def _paired(table: Table) -> dict[str, Any]:
-    """By row: how much larger its numbers are than those of our row on the same drives, in a table of two or more."""
-    pairs: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for rows in table.values():
-        for row, scored in rows.items():
-            other = _paired_with(row)
-            known = rows[other].errors if other in rows and other != row else {}
-            for key in _PAIRED:
-                if key in known and key in scored.errors:
-                    pair = float(scored.errors[key][0]), float(known[key][0])
-                    pairs.setdefault(row, {}).setdefault(key, []).append(pair)
+    rows = dict.fromkeys(row for measured in found.values() for row, one in measured.items() if one.errors)
     return {
         row: {
-            "with": _paired_with(row),
-            **{key: _compared(key, np.array(found)) for key, found in keys.items() if len(found) > 1},
+            key: {**interval_of(values), "drives": len(values)}
+            for key, values in means_over_samples(column(found, row)).items()
         }
-        for row, keys in pairs.items()
+        for row in rows
     }
 
 
-def _compared(key: str, pairs: np.ndarray) -> dict[str, Any]:
-    """A row's numbers against another's, pairs ``(drives, 2)``; likelihoods, which may be negative, have no ratio."""
-    values, others = pairs.T
+def _paired(found: Table) -> dict[str, Any]:
+    """By row: how much larger its numbers are than those of our row on the same drives, in a table of two or more."""
+    result: dict[str, Any] = {}
+    for row in dict.fromkeys(row for rows in found.values() for row in rows if row != _paired_with(row)):
+        both = {key: pairs(found, row, _paired_with(row), key) for key in _PAIRED}
+        if any(map(len, both.values())):
+            compared = {key: _compared(key, numbers) for key, numbers in both.items() if len(numbers) > 1}
+            result[row] = {"with": _paired_with(row), **compared}
+    return result
+
+
+def _compared(key: str, both: np.ndarray) -> dict[str, Any]:
+    """A row's numbers against another's ``(drives, 2)``; likelihoods, which may be negative, have no ratio."""
+    values, others = both.T
     if key == "negative_log_likelihood":
         return {"difference": mean_interval(values - others).as_json()}
     return compare(values, others).as_json()

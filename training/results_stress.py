@@ -25,9 +25,11 @@ from training.recordings.lidar_logs import logs_below, relations_of
 from training.report import stress_page
 from training.scoring import stress_tables
 from training.scoring.lidar_rows import ROWS
-from training.scoring.lidar_scores import Scored, score_drive
+from training.scoring.lidar_scores import scored_rows, with_runs
+from training.scoring.stress_bars import stress_bars
 from training.scoring.stress_cells import CLEAN, StressCell, StressLog, cell_numbers
 from training.scoring.stress_tables import StressTable
+from training.scoring.table import Measured, measure
 
 _FIRST_BUILDINGS = {"validation": 12_000, "test": 22_000}
 STRESS_ROWS = ("wheels", "ours", "ours_without_wheels", "kiss_icp")
@@ -86,12 +88,14 @@ def main(arguments: Arguments) -> dict[str, Any]:
     record = records.record("results", arguments)
     rows = [name for name in STRESS_ROWS if not ROWS[name].missing()]
     asked = [name for name in rows if name in (arguments.rows or rows)]
+    logs = {} if arguments.logs is None else _logs(arguments, rows, asked)
     result = {
         "command": 'make results WORLD=stress ARGS="--logs FOLDER"',
         "revision": record["revision"],
         "settings": {name: getattr(arguments, name) for name in ("drives", "length", "split")},
-        "logs": {} if arguments.logs is None else _logs(arguments, rows, asked),
+        "logs": logs,
         "tables": {name: _simulated(arguments, name, table, asked) for name, table in _tables(arguments).items()},
+        "bars": [bar.as_json() for bar in stress_bars(logs)],
         "skipped": [f"{name}: {ROWS[name].missing()}" for name in STRESS_ROWS if name not in rows],
     }
     write_at_once(arguments.out / "stress.json", json.dumps(result, indent=2) + "\n")
@@ -121,11 +125,12 @@ def _simulated(arguments: Arguments, name: str, table: StressTable, asked: Seque
     result: dict[str, Any] = {}
     for group, sources in table.groups.items():
         measures = name in arguments.tables and (name != "buildings" or group in (arguments.changes or CHANGES))
-        scored: dict[str, list[Scored]] = {}
+        scored: dict[str, list[Measured]] = {}
         for source in sources:
             rows = {row: kind for row, kind in table.rows.items() if row in asked or not measures}
-            folder = arguments.runs / "stress" / name
-            for row, one in score_drive(source, rows, arguments.weights, folder, known_only=not measures):
+            plan = [(with_runs(source, arguments.weights), scored_rows(rows, arguments.weights))]
+            found = measure(plan, arguments.runs / "stress" / name, known_only=not measures)[source.name]
+            for row, one in found.items():
                 scored.setdefault(row, []).append(one)
                 if measures:
                     words = one.failed or "  ".join(f"{k} {v:.3f}" for k, v in _scores(one, table.keys).items())
@@ -135,13 +140,13 @@ def _simulated(arguments: Arguments, name: str, table: StressTable, asked: Seque
     return result
 
 
-def _scores(scored: Scored, keys: Sequence[str]) -> dict[str, float]:
+def _scores(scored: Measured, keys: Sequence[str]) -> dict[str, float]:
     """The numbers of one drive that are known."""
     means = {key: float(scored.errors[key].mean()) for key in keys if key in scored.errors}
     return {key: value for key, value in means.items() if np.isfinite(value)}
 
 
-def _means(scored: Sequence[Scored], keys: Sequence[str]) -> dict[str, Any]:
+def _means(scored: Sequence[Measured], keys: Sequence[str]) -> dict[str, Any]:
     each = [_scores(one, keys) for one in scored]
     there = {key: [one[key] for one in each if key in one] for key in keys}
     means = {key: float(np.mean(values)) for key, values in there.items() if values}

@@ -43,7 +43,8 @@ from training.data.faults import FAULTS, SensedDrive, faulted
 from training.data.features import Networks
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 from training.recordings.recording_source import DataArguments, open_recorded
-from training.scoring.honesty import estimates_of, odometry_covariances, within
+from training.scoring.honesty import estimates_of, odometry_covariances
+from training.scoring.metrics import within
 
 FACTORS = (0.7, 1.0, 1.4, 2.0)
 """Factors that are tried. Less than the first is not honest on Doom maps that nothing was trained on."""

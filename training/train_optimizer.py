@@ -32,7 +32,7 @@ from training.common.training import Figures, Training, save_weights
 from training.data.batches import Batch
 from training.data.data_source import Domain
 from training.data.feature_store import training_stores
-from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, loops_of, rmse_figures
+from training.data.trajectories import StoredTrajectories, correction_scale, loops_of, rmse_figures, stretch_data
 from training.recordings.recording_source import NO_LOOPS, SourceArguments, open_source
 
 HEADING_WEIGHT = 0.3
@@ -226,7 +226,7 @@ def main(arguments: Arguments) -> dict[str, float]:
         optimizer = fresh.with_smoother(smoother)
     training = OptimizerTraining(arguments, optimizer, domain, place.config.registration)
     few = source.recorded is not None
-    data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
+    data = stretch_data(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)
     metrics = run.validate(training, data)
     if not run.is_first:

@@ -31,7 +31,7 @@ from training.common.training import Figures, Training, save_weights
 from training.data.batches import Batch
 from training.data.data_source import MIRRORED_STORE, TRAIN_STORE
 from training.data.feature_store import training_stores
-from training.data.trajectories import StoredTrajectories, StretchData, correction_scale, rmse_figures
+from training.data.trajectories import StoredTrajectories, correction_scale, rmse_figures, stretch_data
 from training.recordings.recording_source import SourceArguments, open_source
 from training.train_local import lasting_deviation
 
@@ -132,7 +132,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     smoother, begun = initial_smoother(arguments, local.config)
     training = SmootherTraining(arguments, smoother, *scales)
     few = source.recorded is not None
-    data = StretchData(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
+    data = stretch_data(train, validation, arguments.steps, arguments.batch_size, arguments.seed, few)
     run.fit(training, data)
     metrics = run.validate(training, data)
     if not run.is_first:

@@ -31,7 +31,7 @@ from training.data.doom_drives import MAZES, ROOMS, VALIDATION_MAPS, Map
 from training.data.features import OPTIMIZER_INPUTS
 from training.data.worlds import VALIDATION_SEEDS
 from training.scoring.doom_rows import Features, gtsam_graph, local, ours
-from training.scoring.lidar_errors import WITHIN_DEVIATIONS, absolute_error_m
+from training.scoring.metrics import WITHIN_DEVIATIONS, absolute_error_m, off_by
 from training.scoring.online_estimate import with_origin
 
 BELIEFS = (0.7, 0.8, 0.9)
@@ -59,14 +59,10 @@ HARM_BELOW_M = 0.2
 class Arguments:
     """Settings of the choice."""
 
-    seeds: int = 5
-    """Drives of each validation map, and twice as many through generated levels."""
-    frames: int = 1000
-    """Frames of a drive."""
-    weights: Path = records.WEIGHTS
-    """Folder with doom/*.safetensors, which gets the optimizer."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets doom.gtsam.json."""
+    seeds: int = 5  # Drives of each validation map, and twice as many through generated levels.
+    frames: int = 1000  # Frames of a drive.
+    weights: Path = records.WEIGHTS  # Folder with doom/*.safetensors, which gets the optimizer.
+    out: Path = records.ROOT / "training" / "results"  # Folder that gets doom.gtsam.json.
     runs: Path = records.ROOT / "runs"
     """Folder of what is kept of each drive."""
 
@@ -118,8 +114,7 @@ def covariance_scale(core: OnlineTrajectory, features: list[Features]) -> float:
     needed = []
     for one in features:
         found = ours(core)(one)
-        off = np.abs(found.published - one["truth"])
-        off[:, 2] = np.abs(np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2])))
+        off = off_by(found.published, one["truth"])
         variances = np.diagonal(found.covariances, axis1=1, axis2=2)
         needed.append((np.square(off / WITHIN_DEVIATIONS) / variances).max(axis=1))
     return float(np.quantile(np.concatenate(needed), WANTED))

@@ -74,14 +74,11 @@ _SMALLEST_GAIN = 2e-3  # of the error: less is noise, and the value that was the
 class Arguments:
     """Settings of the search."""
 
-    world: WorldName
-    """World to tune for."""
-    trajectories: int = 0
-    """Validation trajectories of each table of results; 0 for all."""
+    world: WorldName  # World to tune for.
+    trajectories: int = 0  # Validation trajectories of each table of results; 0 for all.
     form: Literal["loops", "registered", "smoothed"] = "loops"
     """Odometry of the graph: that of the local network, registered again, or as our optimizer smooths it."""
-    passes: int = 2
-    """Largest number of passes over all groups."""
+    passes: int = 2  # Largest number of passes over all groups.
     weights: Path = records.WEIGHTS
     """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
     out: Path = records.ROOT / "training" / "results"

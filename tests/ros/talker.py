@@ -23,7 +23,12 @@ class Talker(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__("talker", namespace="test")
+        self.declare_parameter("speed", 7)
         self.declare_parameter("gain", 0.5)
+        self.declare_parameter("frame", "base_link")
+        self.declare_parameter("enabled", True)
+        self.declare_parameter("steps", [1, 2, 3])
+        self.declare_parameter("names", ["a", "b"])
         self.add_on_set_parameters_callback(self._check)
         best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -93,11 +93,11 @@ def test_a_burst_is_taken_whole(optimizer: Optimizer) -> None:
     assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 501)]
 
 
-def test_a_stream_that_ends_within_an_optimisation_leaves_the_whole_path_optimised(optimizer: Optimizer) -> None:
+def test_a_stream_that_ends_with_a_meta_pose_leaves_the_whole_path_optimised(optimizer: Optimizer) -> None:
     paths = optimizer.probe.collect(PathMessage, "ngo/path")
     optimizer.meet()
     drive = optimizer.drive()
-    steps = drive.steps(1, 40)  # the fifth meta-pose is complete, and one of five iterations done
+    steps = drive.steps(1, 40)  # the fifth meta-pose is complete, and not optimised
     core = OnlineTrajectory.load(optimizer.weights, iterations_per_step=1)
     for step in steps:
         core.update(messages.relative_step(step))

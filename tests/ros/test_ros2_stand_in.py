@@ -23,7 +23,7 @@ from ros2_stand_in import cli  # noqa: E402
 from ros2_stand_in.cli import CommandError  # noqa: E402
 from ros2_stand_in.graph import interface  # noqa: E402
 from ros2_stand_in.services import parse_value  # noqa: E402
-from ros2_stand_in.topics import echo_text  # noqa: E402
+from ros2_stand_in.topics import RateWindow, echo_text  # noqa: E402
 
 ROS2 = TOOLS / "ros2"
 TIMEOUT_S = 60.0
@@ -58,9 +58,7 @@ def listed(*arguments: str, expected: list[str]) -> list[str]:
 def talker() -> Iterator[None]:
     process = subprocess.Popen([sys.executable, str(Path(__file__).with_name("talker.py"))], env=environment())
     try:
-        names = ["/parameter_events", "/rosout", "/test/header", "/test/image", "/test/path", "/test/status"]
-        names.append("/test/talker/transition_event")
-        assert listed("topic", "list", expected=names) == names
+        assert listed("node", "list", expected=["/test/talker"]) == ["/test/talker"]
         yield
     finally:
         process.send_signal(signal.SIGINT)
@@ -76,7 +74,7 @@ def test_help_says_that_it_is_a_stand_in_and_what_it_serves() -> None:
     assert cli.SERVED in text
 
 
-@pytest.mark.parametrize("arguments", [["bag", "record"], ["launch"], ["topic", "hz", "/x"], ["param", "dump", "/n"]])
+@pytest.mark.parametrize("arguments", [["bag", "record"], ["launch"], ["topic", "info", "/x"], ["param", "dump", "/n"]])
 def test_another_command_gives_one_line_that_names_the_served_ones(arguments: list[str]) -> None:
     result = ros2(*arguments)
     assert result.returncode == 2
@@ -186,6 +184,30 @@ def test_a_wrong_type_name_is_refused(name: str) -> None:
         interface(name, "msg")
 
 
+# Rates
+
+
+def test_the_rate_is_the_real_commands_report() -> None:
+    rate = RateWindow(window=10_000)
+    reports = []
+    for index in range(0, 25):
+        rate.add(1_000_000_000 + index * 100_000_000)
+        reports.append(rate.report())
+    # The first interval only starts the clock; a report follows each second after it.
+    assert [index for index, report in enumerate(reports) if report] == [11, 21]
+    assert reports[11] == "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 11"
+
+
+def test_the_rate_goes_by_the_window_alone() -> None:
+    rate = RateWindow(window=2)
+    for time_ns in (0, 7_000_000_000, 7_100_000_000, 7_400_000_000):
+        rate.add(time_ns)
+        last = rate.report()
+    assert last is None, "a second report within the same second"
+    rate.add(9_400_000_000)
+    assert rate.report() == "average rate: 0.870\n\tmin: 0.300s max: 2.000s std dev: 0.85000s window: 2"
+
+
 # Parameter values
 
 
@@ -215,10 +237,14 @@ def test_a_value_has_the_type_that_yaml_takes_it_for(text: str, field: str, valu
 @pytest.mark.processes
 @pytest.mark.usefixtures("talker")
 class TestAgainstARealNode:
+    def test_node_list(self) -> None:
+        """Without --all as the fixture sees it."""
+        assert re.search(r"^/_ros2cli_\d+$", ros2("node", "list", "--all").stdout, re.MULTILINE)
+
     def test_topic_list(self) -> None:
-        """Without types as the fixture sees it."""
         names = ["/parameter_events", "/rosout", "/test/header", "/test/image", "/test/path", "/test/status"]
         names.append("/test/talker/transition_event")
+        assert listed("topic", "list", expected=names) == names
         types = ["rcl_interfaces/msg/ParameterEvent", "rcl_interfaces/msg/Log", "std_msgs/msg/Header"]
         types += ["sensor_msgs/msg/Image", "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticStatus"]
         types.append("lifecycle_msgs/msg/TransitionEvent")
@@ -257,13 +283,67 @@ class TestAgainstARealNode:
         _, errors = process.communicate(timeout=TIMEOUT_S)
         assert (process.returncode, errors) == (int(signal.SIGINT), "")
 
+    def test_hz(self) -> None:
+        command = [sys.executable, str(ROS2), "topic", "hz", "/test/header"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        if first.startswith("WARNING: topic"):  # discovery took long on a busy machine
+            first = process.stdout.readline()
+        text = first + process.stdout.readline()
+        process.terminate()
+        assert process.wait(TIMEOUT_S) == 0
+        process.stdout.close()
+        numbers = r"min: (\d+\.\d{3})s max: (\d+\.\d{3})s std dev: \d+\.\d{5}s window: (\d+)"
+        found = re.fullmatch(rf"average rate: (\d+\.\d{{3}})\n\t{numbers}\n", text)
+        assert found, text
+        # A busy machine keeps the talker from its rate, but the report is of one second or more of what came.
+        rate, shortest_s, longest_s, window = map(float, found.groups())
+        # Times are printed in whole milliseconds: a period may be half a millisecond longer or shorter.
+        assert shortest_s - 0.001 < 1.0 / rate < longest_s + 0.001
+        assert window / rate > 0.99 and rate < 30.0
+
+    def test_param_list(self) -> None:
+        own = ["enabled", "frame", "gain", "names", "speed", "steps"]
+        lines = ros2("param", "list", "/test/talker").stdout.splitlines()
+        assert set(own) <= {line.removeprefix("  ") for line in lines}
+        assert lines == sorted(lines)
+        every = ["/test/talker:", *lines]
+        assert listed("param", "list", expected=every) == every
+
+    @pytest.mark.parametrize(
+        ("name", "line"),
+        [
+            ("speed", "Integer value is: 7"),
+            ("gain", "Double value is: 0.5"),
+            ("frame", "String value is: base_link"),
+            ("enabled", "Boolean value is: True"),
+            ("steps", "Integer values are: array('q', [1, 2, 3])"),
+            ("names", "String values are: ['a', 'b']"),
+        ],
+    )
+    def test_param_get(self, name: str, line: str) -> None:
+        assert listed("param", "get", "/test/talker", name, expected=[line]) == [line]
+
+    def test_param_get_without_the_type(self) -> None:
+        arguments = "param", "get", "test/talker", "frame", "--hide-type"
+        assert listed(*arguments, expected=["base_link"]) == ["base_link"]
+
     def test_param_set(self) -> None:
         said = ["Set parameter successful"]
         assert listed("param", "set", "/test/talker", "gain", "0.25", expected=said) == said
+        assert listed("param", "get", "/test/talker", "gain", expected=["Double value is: 0.25"])[0].endswith("0.25")
 
     def test_param_set_refused_by_the_node(self) -> None:
         result = ros2("param", "set", "/test/talker", "gain", "2.0")
         assert (result.stdout, result.stderr) == ("", "Setting parameter failed: gain is at most 1\n")
+
+    def test_service_list(self) -> None:
+        wanted = {"/test/mute", "/test/talker/change_state", "/test/talker/get_parameters"}
+        deadline = time.monotonic() + TIMEOUT_S
+        while not wanted <= set(lines := ros2("service", "list").stdout.splitlines()):
+            assert time.monotonic() < deadline, lines
+        assert lines == sorted(lines)
 
     def test_service_call(self) -> None:
         result = ros2("service", "call", "/test/mute", "std_srvs/srv/SetBool", "{data: true}")
@@ -289,16 +369,18 @@ class TestAgainstARealNode:
         assert line in result.stderr
 
     def test_lifecycle(self) -> None:
+        assert listed("lifecycle", "get", "/test/talker", expected=["unconfigured [1]"]) == ["unconfigured [1]"]
         refused = ros2("lifecycle", "set", "/test/talker", "activate")
         assert refused.returncode == 1
         assert refused.stderr.startswith("Unknown transition requested, available ones are:\n- configure [1]\n")
         assert ros2("lifecycle", "set", "/test/talker", "configure").stdout == "Transitioning successful\n"
-        # Inactive now: it can be activated.
-        assert ros2("lifecycle", "set", "test/talker", "activate").stdout == "Transitioning successful\n"
+        assert listed("lifecycle", "get", "test/talker", expected=["inactive [2]"]) == ["inactive [2]"]
 
-    def test_a_node_or_topic_that_is_not_there(self) -> None:
-        result = ros2("param", "set", "/test/nobody", "speed", "1")
+    def test_a_node_topic_or_parameter_that_is_not_there(self) -> None:
+        result = ros2("param", "get", "/test/nobody", "speed")
         assert (result.returncode, result.stderr) == (1, "Node not found\n")
+        result = ros2("param", "get", "/test/talker", "nothing")
+        assert (result.returncode, result.stderr) == (1, "Parameter not set\n")
         result = ros2("topic", "echo", "/test/nothing")
         assert result.stdout == "WARNING: topic [/test/nothing] does not appear to be published yet\n"
         assert (result.returncode, result.stderr) == (

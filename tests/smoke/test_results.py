@@ -109,7 +109,9 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
     networks = (train_end_to_end, train_local, train_optimizer, train_place)
-    toy.refuse(monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.scoring.error_cache.scores")
+    toy.refuse(
+        monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.scoring.prefix_errors.scores"
+    )
     assert results.main(arguments(folder), toy.scripts("maze2d", folder)) == result
 
 
@@ -128,7 +130,7 @@ def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, di
         for name, content in kept.items():
             (old / name).write_bytes(content)
     before = result["tables"]["cycles"]["ngo_5"]["position_rmse"]["seeds"]
-    assert [np.mean(one.scores[STEPS]["position_rmse"]) for one in found] == [before[1], before[1]]
+    assert [np.mean(one.errors[f"{STEPS}:position_rmse"]) for one in found] == [before[1], before[1]]
     assert before[0] != before[1]
 
 

@@ -146,7 +146,7 @@ def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, An
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
     scripts = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_smoother, tune_pose_graph)
-    calls = ("training.prerequisites.make_odometry", "training.scoring.error_cache.scores")
+    calls = ("training.prerequisites.make_odometry", "training.scoring.prefix_errors.scores")
     toy.refuse(monkeypatch, scripts, *calls)
     assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result
 

@@ -11,7 +11,8 @@ pytestmark = pytest.mark.slow
 
 
 def test_the_table_of_one_world(tmp_path: Path) -> None:
-    main(Arguments(worlds=("maze2d",), split="validation", mazes=2, frames=40, out=tmp_path, docs=tmp_path))
+    folders = {"out": tmp_path, "docs": tmp_path, "runs": tmp_path / "runs"}
+    main(Arguments(worlds=("maze2d",), split="validation", mazes=2, frames=40, **folders))
     result = json.loads((tmp_path / "map.json").read_text())
     table = result["tables"]["maze2d"]
     assert list(table) == ["odometry", "corrected", "true"]

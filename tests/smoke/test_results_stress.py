@@ -73,7 +73,8 @@ def test_results_of_a_toy_log(
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == (2 + 1) * len(there)  # one of the changes is the same for every seed
     page = (tmp_path / "docs" / "results_stress.md").read_text()
-    assert "## toy" in page and all(f"`{name}`" in page for name in CHANGES)
+    assert {bar["name"] for bar in result["bars"]} >= {"toy, half_covered, ours, translation_m"}
+    assert "## Bars" in page and "## toy" in page and all(f"`{name}`" in page for name in CHANGES)
 
     def no_run(*_: object) -> None:
         raise AssertionError("a cell was measured again")

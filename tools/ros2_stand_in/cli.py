@@ -5,11 +5,17 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-SERVED = "run, topic list|echo, param set, service call, lifecycle set"
-VERBS = {"topic": ("list", "echo"), "param": ("set",), "service": ("call",), "lifecycle": ("set",)}
+SERVED = "run, topic list|echo|hz, node list, param list|get|set, service list|call, lifecycle get|set"
+VERBS = {
+    "topic": ("list", "echo", "hz"),
+    "node": ("list",),
+    "param": ("list", "get", "set"),
+    "service": ("list", "call"),
+    "lifecycle": ("get", "set"),
+}
 DESCRIPTION = f"""\
 This is not the real `ros2` command but a stand-in for it: the ROS 2 wheels come without one.
 It serves exactly: {SERVED}. They print the same as the real command.
@@ -52,13 +58,28 @@ def make_parser() -> argparse.ArgumentParser:
     verb.add_argument("--once", action="store_true", help="print the first message received and then exit")
     verb.add_argument("--field", help="echo a selected field of a message; '.' selects sub-fields")
     verb.add_argument("-f", "--full-length", action="store_true", help="output all elements of arrays and strings")
+    verb = of["topic"].add_parser("hz", help="print the average receiving rate to screen")
+    verb.add_argument("topic_name", help="name of the topic to listen to, e.g. /odom")
+    verb.add_argument("-w", "--window", type=int, default=10000, help="messages that the rate is calculated from")
+    verb = of["node"].add_parser("list", help="output a list of available nodes")
+    verb.add_argument("-a", "--all", action="store_true", help="display all nodes even hidden ones")
+    verb = of["param"].add_parser("list", help="output a list of available parameters")
+    verb.add_argument("node_name", nargs="?", help="name of the node")
+    verb = of["param"].add_parser("get", help="get a parameter")
+    verb.add_argument("node_name", help="name of the node")
+    verb.add_argument("parameter_name", help="name of the parameter")
+    verb.add_argument("--hide-type", action="store_true", help="hide the type information")
     verb = of["param"].add_parser("set", help="set a parameter")
-    for name, what in (("node_name", "name of the node"), ("parameter_name", "its name"), ("value", "in YAML")):
-        verb.add_argument(name, help=what)
+    verb.add_argument("node_name", help="name of the node")
+    verb.add_argument("parameter_name", help="name of the parameter")
+    verb.add_argument("value", help="its new value, in YAML")
+    of["service"].add_parser("list", help="output a list of available services")
     verb = of["service"].add_parser("call", help="call a service")
     verb.add_argument("service_name", help="name of the service, e.g. /ngo_node/pause")
     verb.add_argument("service_type", help="type of the service, e.g. std_srvs/srv/SetBool")
     verb.add_argument("values", nargs="?", default="{}", help="values of the request, in YAML")
+    verb = of["lifecycle"].add_parser("get", help="get the state of a node")
+    verb.add_argument("node_name", help="name of the node")
     verb = of["lifecycle"].add_parser("set", help="trigger a transition")
     verb.add_argument("node_name", help="name of the node")
     verb.add_argument("transition", help="label or number of the transition, e.g. configure")
@@ -98,15 +119,21 @@ def dispatch(options: argparse.Namespace) -> int:
         raise CommandError(f"rclpy cannot be imported ({error}); open the environment first: . ./env.sh") from None
     from ros2_stand_in import services, topics
 
-    if options.command == "service":
-        return services.call_service(options.service_name, options.service_type, options.values)
-    if options.command == "lifecycle":
-        return services.change_state(options.node_name, options.transition)
-    if options.command == "param":
-        return services.set_parameter(options.node_name, options.parameter_name, options.value)
-    if options.verb == "list":
-        return topics.print_list(show_types=options.show_types)
-    return topics.echo(options.topic_name, options.message_type, options.once, options.field, options.full_length)
+    o = options
+    commands: dict[tuple[str, str], Callable[[], int]] = {
+        ("topic", "list"): lambda: topics.print_list("topic", o.show_types),
+        ("topic", "echo"): lambda: topics.echo(o.topic_name, o.message_type, o.once, o.field, o.full_length),
+        ("topic", "hz"): lambda: topics.hz(o.topic_name, o.window),
+        ("node", "list"): lambda: topics.print_list("node", include_hidden=o.all),
+        ("param", "list"): lambda: services.print_parameters(o.node_name),
+        ("param", "get"): lambda: services.print_parameter(o.node_name, o.parameter_name, o.hide_type),
+        ("param", "set"): lambda: services.set_parameter(o.node_name, o.parameter_name, o.value),
+        ("service", "list"): lambda: topics.print_list("service"),
+        ("service", "call"): lambda: services.call_service(o.service_name, o.service_type, o.values),
+        ("lifecycle", "get"): lambda: services.print_state(o.node_name),
+        ("lifecycle", "set"): lambda: services.change_state(o.node_name, o.transition),
+    }
+    return commands[o.command, o.verb]()
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -19,6 +19,10 @@ from ros2_stand_in.cli import CommandError
 DISCOVERY_TIMEOUT_S = 5.0
 WAIT_S = 0.1
 
+# Participants answer a newcomer at once, but where an answer comes late or is lost (a busy machine) they announce
+# themselves every 3 s: what is seen before that may lack some of them.
+LIST_LEAST_S = 3.5
+
 Found = TypeVar("Found")
 
 _received: list[int] = []
@@ -53,6 +57,22 @@ def spin_while(node: Node, condition: Callable[[], bool]) -> None:
     """Take messages while the condition holds and nothing has told the command to end."""
     while not _received and condition():
         rclpy.spin_once(node, timeout_sec=WAIT_S)
+
+
+def settle(node: Node) -> None:
+    """Give every node the time to appear."""
+    end = time.monotonic() + LIST_LEAST_S
+    spin_while(node, lambda: time.monotonic() < end)
+
+
+def node_names(node: Node) -> list[str]:
+    """Full names of the nodes that are seen now, sorted."""
+    return sorted(f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a name in the graph has a part that starts with an underscore."""
+    return any(part.startswith("_") for part in name.split("/"))
 
 
 def poll(find: Callable[[], Found | None], timeout_s: float = DISCOVERY_TIMEOUT_S) -> Found | None:

@@ -1,17 +1,39 @@
-"""`ros2 service call`, `ros2 param set` and `ros2 lifecycle set`."""
+"""`ros2 service call`, `ros2 param` and `ros2 lifecycle`."""
 
 import datetime
 import sys
 from typing import Any
 
 import yaml
-from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 from rclpy.parameter import get_parameter_value
 
 from ros2_stand_in.cli import CommandError
-from ros2_stand_in.graph import call, command_node, interface, poll, spin_while
+from ros2_stand_in.graph import (
+    call,
+    command_node,
+    interface,
+    is_hidden,
+    node_names,
+    poll,
+    settle,
+    spin_while,
+)
+
+_LABELS = {
+    1: ("Boolean value is", "bool"),
+    2: ("Integer value is", "integer"),
+    3: ("Double value is", "double"),
+    4: ("String value is", "string"),
+    5: ("Byte values are", "byte_array"),
+    6: ("Boolean values are", "bool_array"),
+    7: ("Integer values are", "integer_array"),
+    8: ("Double values are", "double_array"),
+    9: ("String values are", "string_array"),
+}
+"""Of each type of a parameter: the real command's label, and the field of its value."""
 
 
 def fill(message: Any, values: Any) -> None:
@@ -77,6 +99,45 @@ def set_parameter(node_name: str, parameter_name: str, value: str) -> int:
         print(f"Set parameter successful{reason}")
     else:
         print(f"Setting parameter failed{reason}", file=sys.stderr)
+    return 0
+
+
+def print_parameters(node_name: str | None) -> int:
+    """`ros2 param list [NODE]`."""
+    with command_node() as node:
+        names = [_absolute(node_name)] if node_name else []
+        if not node_name:
+            settle(node)
+            offered = dict(node.get_service_names_and_types())  # a node may do without parameter services
+            found = [name for name in node_names(node) if not is_hidden(name)]
+            names = [name for name in found if f"{name}/list_parameters" in offered]
+        for name in names:
+            response = call(node, ListParameters, f"{name}/list_parameters", ListParameters.Request())
+            print(
+                *([] if node_name else [f"{name}:"]), *(f"  {one}" for one in sorted(response.result.names)), sep="\n"
+            )
+    return 0
+
+
+def print_parameter(node_name: str, parameter_name: str, hide_type: bool) -> int:
+    """`ros2 param get NODE PARAMETER`."""
+    request = GetParameters.Request(names=[parameter_name])
+    with command_node() as node:
+        response = call(node, GetParameters, f"{_absolute(node_name)}/get_parameters", request)
+    if not response.values or response.values[0].type == ParameterType.PARAMETER_NOT_SET:
+        raise CommandError("Parameter not set")
+    (value,) = response.values
+    label, field = _LABELS[value.type]
+    content = getattr(value, f"{field}_value")
+    print(content if hide_type else f"{label}: {content}")
+    return 0
+
+
+def print_state(node_name: str) -> int:
+    """`ros2 lifecycle get NODE`."""
+    with command_node() as node:
+        state = call(node, GetState, f"{_absolute(node_name)}/get_state", GetState.Request()).current_state
+    print(f"{state.label} [{state.id}]")
     return 0
 
 

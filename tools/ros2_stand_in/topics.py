@@ -1,6 +1,8 @@
-"""`ros2 topic list` and `echo`, which prints messages as YAML."""
+"""`ros2 topic list`, `echo`, which prints messages as YAML, and `hz`; lists of nodes and services."""
 
 import array
+import collections
+import math
 import sys
 import time
 from typing import Any
@@ -14,13 +16,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from ros2_stand_in.cli import CommandError
-from ros2_stand_in.graph import command_node, interface, poll, spin_while
+from ros2_stand_in.graph import command_node, interface, is_hidden, node_names, poll, settle, spin_while
 
 ECHO_DEPTH = 10
 TRUNCATE_LENGTH = 128
-# Participants answer a newcomer at once, but where an answer comes late or is lost (a busy machine) they announce
-# themselves every 3 s: what is seen before that may lack some of them.
-LIST_LEAST_S = 3.5
+REPORT_PERIOD_NS = 1_000_000_000
 
 
 def plain(value: Any, truncate_length: int | None) -> Any:
@@ -59,14 +59,15 @@ def echo_text(message: Any, field: str | None = None, truncate_length: int | Non
     return text + "---"
 
 
-def print_list(show_types: bool) -> int:
-    """`ros2 topic list [-t]`."""
+def print_list(kind: str, show_types: bool = False, include_hidden: bool = False) -> int:
+    """`ros2 topic list [-t]`, `ros2 service list` and `ros2 node list [-a]`."""
     with command_node() as node:
-        end = time.monotonic() + LIST_LEAST_S
-        spin_while(node, lambda: time.monotonic() < end)
-        topics = sorted(node.get_topic_names_and_types())
-    for name, types in topics:
-        if not any(part.startswith("_") for part in name.split("/")):
+        settle(node)
+        found = [(name, [""]) for name in node_names(node)]
+        if kind != "node":
+            found = node.get_topic_names_and_types() if kind == "topic" else node.get_service_names_and_types()
+    for name, types in sorted(found):
+        if include_hidden or not is_hidden(name):
             print(f"{name} [{', '.join(types)}]" if show_types else name)
     return 0
 
@@ -91,14 +92,20 @@ def matching_qos(node: Node, topic: str) -> QoSProfile:
     )
 
 
+def full_name(node: Node, topic: str) -> str:
+    """The topic's absolute name."""
+    try:
+        name: str = expand_topic_name(topic, node.get_name(), node.get_namespace())
+        validate_full_topic_name(name)
+    except (ValueError, InvalidTopicNameException) as error:
+        raise CommandError(str(error).strip()) from None
+    return name
+
+
 def echo(topic: str, type_name: str | None, once: bool, field: str | None, full_length: bool) -> int:
     """`ros2 topic echo TOPIC [TYPE]`."""
     with command_node() as node:
-        try:
-            name: str = expand_topic_name(topic, node.get_name(), node.get_namespace())
-            validate_full_topic_name(name)
-        except (ValueError, InvalidTopicNameException) as error:
-            raise CommandError(str(error).strip()) from None
+        name = full_name(node, topic)
         found = poll(lambda: published_type(node, name)) if type_name is None else type_name
         if found is None:
             print(f"WARNING: topic [{topic}] does not appear to be published yet")
@@ -119,4 +126,60 @@ def echo(topic: str, type_name: str | None, once: bool, field: str | None, full_
 
         node.create_subscription(kind, name, show, matching_qos(node, name))
         spin_while(node, lambda: not (shown and once))
+    return 0
+
+
+class RateWindow:
+    """Times between the last messages of a topic, and the report on them that the real command prints."""
+
+    def __init__(self, window: int) -> None:
+        self._intervals_ns: collections.deque[int] = collections.deque(maxlen=window)
+        self._last_ns: int | None = None
+        self._reported_ns: int | None = None
+
+    def add(self, now_ns: int) -> None:
+        """Count a message that was received at this time."""
+        if self._last_ns is not None:
+            self._intervals_ns.append(now_ns - self._last_ns)
+        self._last_ns = now_ns
+
+    def report(self) -> str | None:
+        """The report, at most once a second and only after new messages; else None."""
+        if not self._intervals_ns or self._last_ns is None:
+            return None
+        if self._reported_ns is None:
+            self._reported_ns = self._last_ns
+        if self._last_ns < self._reported_ns + REPORT_PERIOD_NS:
+            return None
+        self._reported_ns = self._last_ns
+        seconds = 1e-9 * np.array(self._intervals_ns)
+        rate = 1.0 / seconds.mean() if seconds.any() else 0.0
+        return (
+            f"average rate: {rate:.3f}\n\tmin: {seconds.min():.3f}s max: {seconds.max():.3f}s "
+            f"std dev: {seconds.std():.5f}s window: {len(seconds)}"
+        )
+
+
+def hz(topic: str, window: int) -> int:
+    """`ros2 topic hz TOPIC`."""
+    if window < 1:
+        raise CommandError("value must be a positive integer")
+    with command_node() as node:
+        name = full_name(node, topic)
+        found = poll(lambda: published_type(node, name))
+        if found is None:
+            print(f"WARNING: topic [{topic}] does not appear to be published yet", flush=True)
+            found = poll(lambda: published_type(node, name), timeout_s=math.inf)
+        if found is None:  # told to end before anybody published
+            return 0
+        rate, kind = RateWindow(window), interface(found, "msg")
+        # Only the arrival counts, so the message is not converted (raw).
+        node.create_subscription(kind, name, lambda _: rate.add(time.time_ns()), matching_qos(node, name), raw=True)
+
+        def show() -> bool:
+            if (report := rate.report()) is not None:
+                print(report, flush=True)
+            return True
+
+        spin_while(node, show)
     return 0

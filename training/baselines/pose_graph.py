@@ -34,28 +34,19 @@ _DRIFT_RAD_A_M = 0.2
 class PoseGraphSettings:
     """Settings of the pose graph. A scale multiplies the deviation that a network states."""
 
-    block: int = 8
-    """Steps in a meta-pose."""
-    odometry_position_scale: float = 4.0
-    """Scale of the odometry's deviations in position."""
-    odometry_heading_scale: float = 2.0
-    """Scale of the odometry's deviations in heading."""
+    block: int = 8  # Steps in a meta-pose.
+    odometry_position_scale: float = 4.0  # Scale of the odometry's deviations in position.
+    odometry_heading_scale: float = 2.0  # Scale of the odometry's deviations in heading.
     odometry_gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of a step's x, y and turn: a constant calibration of the odometry."""
-    odometry_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Bias that is then added to each step (m, m, rad)."""
+    odometry_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Bias that is then added to each step (m, m, rad).
     search: LoopSearch = field(default_factory=lambda: LoopSearch(per_pose=4, most=500, views=1))
     """Which pairs of frames become loop candidates."""
-    min_logit: float = 2.0
-    """Belief from which on a loop enters the graph."""
-    loop_position_scale: float = 1.0
-    """Scale of the loops' deviations in position."""
-    loop_heading_scale: float = 0.5
-    """Scale of the loops' deviations in heading."""
-    kernel: Kernel = "geman_mcclure"
-    """Robust kernel over loops."""
-    kernel_width: float = 2.0
-    """Parameter of the kernel over loops, in deviations."""
+    min_logit: float = 2.0  # Belief from which on a loop enters the graph.
+    loop_position_scale: float = 1.0  # Scale of the loops' deviations in position.
+    loop_heading_scale: float = 0.5  # Scale of the loops' deviations in heading.
+    kernel: Kernel = "geman_mcclure"  # Robust kernel over loops.
+    kernel_width: float = 2.0  # Parameter of the kernel over loops, in deviations.
     drift_m: float = 1.0
     """Drift of the odometry that the graph allows at first. It is added in squares to each loop's deviation, a fifth of
     it in rad to that of the heading. Each stage has a quarter of it, the last one none (graduated non-convexity). With

@@ -109,17 +109,8 @@ class Run:
         self._check_arguments()
         self.curves = Curves(folder / "metrics.csv", datapoints)
         self.best = None if best is None or data is None else BestWeights(best)
-        self.trainer = make_trainer(
-            folder,
-            epochs,
-            arguments.seed,
-            arguments.precision,
-            [SameStart(folder), self.curves, *([] if self.best is None else [self.best])],
-            accelerator=arguments.accelerator,
-            devices=arguments.devices,
-            num_nodes=arguments.num_nodes,
-            strategy=arguments.strategy,
-        )
+        callbacks = [SameStart(folder), self.curves, *([] if self.best is None else [self.best])]
+        self.trainer = make_trainer(folder, epochs, arguments, callbacks)
         self.is_first = bool(self.trainer.is_global_zero)
         if why and self.is_first:
             print(f"precision {arguments.precision}: {why} (--precision chooses another)", flush=True)
@@ -189,21 +180,21 @@ def _now() -> str:
 
 
 def make_trainer(
-    folder: Path, epochs: int, seed: int, precision: str, callbacks: Sequence[Callback] = (), **options: Any
+    folder: Path, epochs: int, arguments: TrainerArguments, callbacks: Sequence[Callback]
 ) -> lightning.Trainer:
-    """A trainer that keeps ``metrics.csv`` and ``last.ckpt`` in ``folder`` after each epoch, and shows its progress."""
-    lightning.seed_everything(seed, workers=True)
+    """A trainer that keeps ``last.ckpt`` in ``folder`` after each epoch, and shows its progress; seeds all draws."""
+    lightning.seed_everything(arguments.seed, workers=True)
     torch.set_float32_matmul_precision("high")
     checkpoint = ModelCheckpoint(dirpath=folder, filename="last", save_top_k=1, enable_version_counter=False)
     return lightning.Trainer(
         max_epochs=epochs,
-        precision=precision,  # type: ignore[arg-type]
+        accelerator=arguments.accelerator,
+        devices=arguments.devices,
+        num_nodes=arguments.num_nodes,
+        strategy=arguments.strategy,
+        precision=arguments.precision,  # type: ignore[arg-type]
         gradient_clip_val=1.0,
-        callbacks=[
-            checkpoint,
-            *(callbacks or [Curves(folder / "metrics.csv")]),
-            TQDMProgressBar(refresh_rate=20, leave=True),
-        ],
+        callbacks=[checkpoint, *callbacks, TQDMProgressBar(refresh_rate=20, leave=True)],
         logger=False,
         reload_dataloaders_every_n_epochs=1,
         # The streams deal the training data out themselves; every process measures all of the validation data, so that
@@ -211,7 +202,6 @@ def make_trainer(
         use_distributed_sampler=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
-        **options,
     )
 
 

@@ -74,6 +74,13 @@ def check_networks(store: Path, local_description: dict[str, Any], place_descrip
         raise records.RunError(f"{store} was made with other networks than the present ones; remove it to make it anew")
 
 
+def begin_store(store: Path, local_description: dict[str, Any], place_description: dict[str, Any]) -> None:
+    """Make the folder of a store, or go on with it, for features of these networks; raises as ``check_networks``."""
+    check_networks(store, local_description, place_description)
+    store.mkdir(parents=True, exist_ok=True)
+    (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
+
+
 def training_stores(
     folder: Path,
     names: Sequence[str],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from ngo_estimator.checkpoint import load_local, load_place
 from training.data.drive_plan import Drives
-from training.data.feature_store import NETWORKS_FILE, STORED, check_count, check_networks, fill, open_store
+from training.data.feature_store import STORED, begin_store, check_count, fill, open_store
 from training.data.features import features_of
 from training.data.worlds import DRAWN, MazeSize, World
 
@@ -59,10 +58,8 @@ def kidnapped_drives(
     stores: dict[str, Features] = {}
     for name, drives in planned_drives(world, split, aliased, count).items():
         store = folder / world.name / "relocalisation" / f"{split}_{'aliased_' * aliased}{name}"
-        store.mkdir(parents=True, exist_ok=True)
         check_count(store, count)
-        check_networks(store, local_description, place_description)
-        (store / NETWORKS_FILE).write_text(json.dumps([local_description["sha256"], place_description["sha256"]]))
+        begin_store(store, local_description, place_description)
         fill(store, world, drives, (0, 1), features)
         stores[name] = open_store(store, (*STORED, "poses"))
     return stores

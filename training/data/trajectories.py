@@ -6,10 +6,9 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import lightning
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import IterableDataset
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans
@@ -18,6 +17,7 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from ngo_estimator.ngo.registered_odometry import registered_steps
 from training.data.batches import ALL, Batch, Share
+from training.data.data_module import StreamedData
 from training.data.feature_store import open_store
 
 _LOOP = "loop_"  # a batch holds the fields of its Loops under their names with this in front
@@ -170,7 +170,14 @@ class RandomStretches(IterableDataset[Batch]):
             yield data.batch(chosen.tolist(), start, length)
 
 
-class StretchData(lightning.LightningDataModule):
+def stretch_data(
+    train: StoredTrajectories,
+    validation: StoredTrajectories,
+    steps: int,
+    batch_size: int,
+    seed: int,
+    few: bool = False,
+) -> StreamedData:
     """``RandomStretches`` to train on, and whole trajectories to be measured on.
 
     Args:
@@ -178,32 +185,16 @@ class StretchData(lightning.LightningDataModule):
         few: whether the trajectories are few, as of recordings: then a batch has at most as many stretches as there
             are trajectories, and an epoch a batch for each, but ``_FEWEST_BATCHES`` at least.
     """
+    if few:
+        steps, batch_size = min(steps, max(_FEWEST_BATCHES, len(train))), min(batch_size, len(train))
 
-    def __init__(
-        self,
-        train: StoredTrajectories,
-        validation: StoredTrajectories,
-        steps: int,
-        batch_size: int,
-        seed: int,
-        few: bool = False,
-    ) -> None:
-        super().__init__()
-        self._train, self._seed = train, seed
-        self._steps = min(steps, max(_FEWEST_BATCHES, len(train))) if few else steps
-        self._batch_size = min(batch_size, len(train)) if few else batch_size
+    def whole() -> list[Batch]:
         rows = np.array_split(np.arange(len(validation)), max(1, len(validation) // _TOGETHER))
-        self.validation = [validation.batch(chosen.tolist(), 0, validation.steps) for chosen in rows]
+        return [validation.batch(chosen.tolist(), 0, validation.steps) for chosen in rows]
 
-    def train_dataloader(self) -> DataLoader[Batch]:
-        assert self.trainer is not None
-        share = Share(self.trainer.global_rank, self.trainer.world_size)
-        epoch = self.trainer.current_epoch
-        data = RandomStretches(self._train, self._steps, self._batch_size, self._seed, epoch, share)
-        return DataLoader(data, batch_size=None)
-
-    def val_dataloader(self) -> DataLoader[Batch]:
-        return DataLoader(self.validation, batch_size=None)  # type: ignore[arg-type]
+    return StreamedData(
+        lambda epoch, share: RandomStretches(train, steps, batch_size, seed, epoch, share), whole, workers=0
+    )
 
 
 def rmse_figures(name: str, poses: torch.Tensor, truth: torch.Tensor) -> dict[str, torch.Tensor]:

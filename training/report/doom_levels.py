@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -12,6 +11,7 @@ from ngo_sim.episodes import record_episode
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.mazes import draw_maze
 from ngo_sim.rooms_level import rooms_textmap
+from training.report.pictures import panels, save
 
 _LEVELS = {
     **{f"rooms, seed {seed}": (Maze3DConfig(level="rooms", width=160, height=120), seed) for seed in (7, 8, 11, 12)},
@@ -23,27 +23,23 @@ _FRAMES = (0, 150, 300, 450, 599)
 
 def draw_levels(path: Path) -> None:
     """Draw each kind of level: its plan with a drive, where there is one, and pictures of the drive."""
-    across = 1 + len(_FRAMES)
-    figure, axes = plt.subplots(len(_LEVELS), across, figsize=(3 * across, 2.4 * len(_LEVELS)))
-    for row, (title, (config, seed)) in zip(axes, _LEVELS.items(), strict=True):
-        env = Maze3D(config)
+    figure, axes = panels(len(_LEVELS) * (1 + len(_FRAMES)), 1 + len(_FRAMES), 3.0, 2.4)
+    for title, (config, seed) in _LEVELS.items():
+        env, plan = Maze3D(config), next(axes)
         drive = record_episode(env, env.default_driver, _FRAMES[-1] + 1, seed)
         env.close()
         if drive.maze is not None:
-            draw_maze(row[0], drive.maze)
+            draw_maze(plan, drive.maze)
         elif config.level == "rooms":
-            draw_plan(row[0], rooms_textmap(*(np.random.default_rng(_sequence(seed, stream)) for stream in (7, 4))))
-        row[0].plot(*drive.poses_xyyaw[:, :2].T, color="tab:blue", linewidth=0.8)
-        row[0].set_title(title, fontsize=9)
-        row[0].set_aspect("equal")
-        row[0].axis("off")
-        for axis, frame in zip(row[1:], _FRAMES, strict=True):
+            draw_plan(plan, rooms_textmap(*(np.random.default_rng(_sequence(seed, stream)) for stream in (7, 4))))
+        plan.plot(*drive.poses_xyyaw[:, :2].T, color="tab:blue", linewidth=0.8)
+        plan.set_title(title, fontsize=9)
+        plan.set_aspect("equal")
+        plan.axis("off")
+        for frame, axis in zip(_FRAMES, axes, strict=False):
             axis.imshow(drive.observations[frame])
             axis.axis("off")
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=50)
-    plt.close(figure)
+    save(figure, path, dpi=50)
 
 
 def draw_plan(axes: Axes, text: str) -> None:

@@ -4,12 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 
 from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
-from training.report.results_page import interval, markdown, number
+from training.report.page import interval, markdown, number
+from training.report.page import page as whole
+from training.report.pictures import panels, save
 from training.scoring.doom_rows import METRICS, ROWS
 
 _TITLES = {
@@ -48,7 +49,7 @@ def page(result: dict[str, Any], weights: Path) -> str:
         parts.append(f"## {title}\n\n" + markdown(["Map", "Path, m", *(f"`{row}`" for row in ROWS)], rows))
     parts.append("## Training\n\n" + markdown(["Network", "Command", "Minutes", "Datapoints/s"], _trainings(weights)))
     parts.append(_LEVELS)
-    return "\n\n".join(parts) + "\n"
+    return whole(parts)
 
 
 def _ratios(maps: dict[str, Any], returns: dict[str, float]) -> str:
@@ -87,23 +88,17 @@ def _trainings(weights: Path) -> list[list[str]]:
 
 def draw(path: Path, tracks: dict[str, dict[str, np.ndarray]]) -> None:
     """Draw the paths ``(steps, 2)`` of all rows on the first drive of each map."""
-    across = 5
-    down = -(-len(tracks) // across)
-    figure, axes = plt.subplots(down, across, figsize=(3.2 * across, 3.0 * down), squeeze=False)
-    for axis in axes.flat:
-        axis.axis("off")
-    for axis, (name, lines) in zip(axes.flat, tracks.items(), strict=False):
-        for row, line in lines.items():
-            if row != "actions_only":  # it leaves the picture
-                axis.plot(line[:, 0], line[:, 1], color=_COLOURS[row], linewidth=2.0 if row == "truth" else 0.8)
+    shown = [row for row in _COLOURS if row != "actions_only"]  # which leaves the picture
+    figure, axes = panels(len(tracks), 5, 3.2, 3.0)
+    for axis, (name, lines) in zip(axes, tracks.items(), strict=True):
+        for row in (row for row in lines if row in shown):
+            axis.plot(*lines[row].T, color=_COLOURS[row], linewidth=2.0 if row == "truth" else 0.8)
         axis.set_title(name, fontsize=8)
         axis.set_aspect("equal")
-    handles = [Line2D([], [], color=_COLOURS[row], label=row) for row in _COLOURS if row != "actions_only"]
+        axis.axis("off")
+    handles = [Line2D([], [], color=_COLOURS[row], label=row) for row in shown]
     figure.legend(handles=handles, loc="lower right", ncols=2)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=70)
-    plt.close(figure)
+    save(figure, path, dpi=70)
 
 
 _INTRODUCTION = """# Doom maps that nobody trained on

@@ -2,15 +2,18 @@
 
 from typing import Any
 
+from training.report.page import Column, markdown, short
+from training.report.page import page as whole
+
 _WORLDS = {"maze2d": "2D mazes", "maze3d": "3D mazes", "doom": "Doom's scenarios, with the weights of `maze3d`"}
-_COLUMNS = {
-    "unfamiliar": ("Unfamiliar (%)", 100.0),
-    "odometry_m": ("Odometry RMSE (m)", 1.0),
-    "corrected_m": ("Corrected RMSE (m)", 1.0),
-    "deviation_m": ("Published deviation, median (m)", 1.0),
-    "within_odometry": ("`odom` within 3 deviations (%)", 100.0),
-    "within_published": ("`ngo/pose` within 3 deviations (%)", 100.0),
-}
+_COLUMNS = (
+    Column("unfamiliar", "Unfamiliar (%)", short, 100.0),
+    Column("odometry_m", "Odometry RMSE (m)", short),
+    Column("corrected_m", "Corrected RMSE (m)", short),
+    Column("deviation_m", "Published deviation, median (m)", short),
+    Column("within_odometry", "`odom` within 3 deviations (%)", short, 100.0),
+    Column("within_published", "`ngo/pose` within 3 deviations (%)", short, 100.0),
+)
 
 _INTRODUCTION = """# Results: faults of the sensor, and worlds that the networks do not know
 
@@ -38,18 +41,13 @@ def page(result: dict[str, Any]) -> str:
                 f"On clean drives deviations grow by {100.0 * (growth - 1.0):.1f} % (`ngo/pose`) and "
                 f"{100.0 * (odometry - 1.0):.1f} % (`odom`), in the mean of the drives' medians. The bar is 20 %."
             )
-    return "\n\n".join(parts) + "\n"
+    return whole(parts)
 
 
 def _table(rows: dict[str, Any]) -> str:
-    header = ["Drives", *(title for title, _ in _COLUMNS.values()), "Corrected / odometry, largest"]
-    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    for name, row in rows.items():
-        cells = [_cell(row[key], scale) for key, (_, scale) in _COLUMNS.items()]
-        lines.append(f"| {name} | {' | '.join(cells)} | {row['corrected_to_odometry']['largest']:.3f} |")
-    return "\n".join(lines)
-
-
-def _cell(value: dict[str, Any], scale: float) -> str:
-    mean, low, high = (scale * number for number in (value["mean"], *value["ci95"]))
-    return f"{mean:.3g} [{low:.3g}, {high:.3g}]"
+    header = ["Drives", *(column.title for column in _COLUMNS), "Corrected / odometry, largest"]
+    lines = (
+        [name, *(column.cell(row) for column in _COLUMNS), f"{row['corrected_to_odometry']['largest']:.3f}"]
+        for name, row in rows.items()
+    )
+    return markdown(header, lines)

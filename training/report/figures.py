@@ -7,10 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,10 +17,11 @@ from ngo_sim.mazes import draw_maze
 from training.baselines.deepvo import DEEPVO
 from training.report import attention_map
 from training.report.maze_views import in_maze, maze_and_start
+from training.report.pictures import save
 from training.report.training_records import learning_curve, run_folder
-from training.scoring.error_cache import Evaluation
 from training.scoring.row_estimators import Arrays
 from training.scoring.scores import METRICS, Metric, in_sentence
+from training.scoring.table import Measured
 from training.scoring.table_rows import ROWS, Sources, rows_of
 
 TRUTH, LOCAL_COLOR, CORRECTED = "#1f6fd6", "#2ca02c", "#ff7f0e"
@@ -62,36 +59,34 @@ MAIN_ROWS = (
 )
 CORRECTED_ROW = "ngo_5"
 
-Tables = dict[str, dict[str, list[Evaluation]]]
+Tables = dict[str, dict[str, list[Measured]]]
 
 
 def draw_all(
     folder: Path, sources: Sources, split: str, stores: dict[str, Arrays], evaluations: Tables, result: dict[str, Any]
 ) -> dict[str, str]:
     """Write every figure into ``folder``; returns the name of each file and what it shows."""
-    folder.mkdir(parents=True, exist_ok=True)
     images: dict[str, str] = {}
 
-    def save(kind: str, caption: str, figure: Figure | None) -> None:
+    def add(kind: str, caption: str, figure: Figure | None) -> None:
         if figure is not None:
             name = f"results_{sources.world.name}_{kind}.png"
-            figure.savefig(folder / name, dpi=130)
-            plt.close(figure)
+            save(figure, folder / name, dpi=130, tight=False)
             images[name] = caption
 
     metric = METRICS[sources.world.name][0]
-    save(
+    add(
         "trajectories",
         f"Trajectories with the median and the largest {in_sentence(metric.title)} of `{CORRECTED_ROW}` in each table: "
         "odometry green, corrected orange, truth blue; the first training seed.",
         trajectories(sources, split, stores, evaluations),
     )
-    save(
+    add(
         "error_by_frames",
         "Error against the number of frames that the estimator had seen; bands are 95 % intervals.",
         by_prefix(result, _absolute(sources.world.name), "frames", lambda _, steps: float(steps)),
     )
-    save(
+    add(
         "percent_by_distance",
         "Error as a ratio to the distance travelled.",
         by_prefix(
@@ -101,12 +96,12 @@ def draw_all(
             lambda table, steps: float(result["path_m"][table][str(steps)]),
         ),
     )
-    save(
+    add(
         "learning_curves",
         "Learning curves on validation: networks, and optimizers with the mean and range of the training seeds.",
         learning_curves(sources, len(result["seeds"])),
     )
-    save(
+    add(
         "attention",
         "Where one meta-pose looks in the last iteration, over the maze (it is the star; a dot is a meta-pose, the "
         "darker and larger the more attention it gets) and over time, with the true revisits and its loop closures.",
@@ -124,15 +119,15 @@ def trajectories(sources: Sources, split: str, stores: dict[str, Arrays], evalua
     for row, (table, arrays) in zip(panels, stores.items(), strict=True):
         found = evaluations[table]
         steps = arrays["truth"].shape[1]
-        corrected, odometry = (found[name][0].scores[steps][metric.key] for name in (CORRECTED_ROW, "local"))
+        corrected, odometry = (found[name][0].errors[f"{steps}:{metric.key}"] for name in (CORRECTED_ROW, "local"))
         order = np.argsort(corrected)
         for axes, what, k in ((row[0], "median", int(order[len(order) // 2])), (row[1], "largest", int(order[-1]))):
             maze, start = maze_and_start(sources.world, table, split, k)
             draw_maze(axes, maze)
             for poses, color, label, width in (
                 (np.asarray(arrays["truth"][k]), TRUTH, "truth", 2.4),
-                (found["local"][0].poses[k], LOCAL_COLOR, "local", 1.1),
-                (found[CORRECTED_ROW][0].poses[k], CORRECTED, f"corrected ({CORRECTED_ROW})", 1.1),
+                (found["local"][0].drawn["poses"][k], LOCAL_COLOR, "local", 1.1),
+                (found[CORRECTED_ROW][0].drawn["poses"][k], CORRECTED, f"corrected ({CORRECTED_ROW})", 1.1),
             ):
                 xy = in_maze(start, poses)[:, :2]
                 axes.plot(xy[:, 0], xy[:, 1], color=color, linewidth=width, label=label, alpha=0.9)

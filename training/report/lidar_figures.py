@@ -4,17 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 
 from training.data.batches import seen_from_first
-from training.scoring.lidar_scores import Scored
+from training.report.pictures import panels, save
+from training.scoring.table import Measured
 
-Drives = Mapping[str, Mapping[str, Scored]]
+Drives = Mapping[str, Mapping[str, Measured]]
 
 _MANY = 4  # smaller pictures of more drives
 _DRAWN = {"buildings": 4, "aliased": 2}
@@ -46,31 +42,26 @@ def _drawable(drives: Drives) -> Drives:
 
 
 def _draw(path: Path, drives: Drives) -> None:
-    many = len(drives) > _MANY
-    columns = min(3 if many else 2, len(drives))
-    lines = -(-len(drives) // columns)
-    width, height = (4.6, 4.0) if many else (7.0, 6.0)
-    figure, axes = plt.subplots(lines, columns, figsize=(width * columns, height * lines), squeeze=False)
-    for axis in axes.flat[len(drives) :]:
-        axis.set_visible(False)
-    for axis, (name, rows) in zip(axes.flat, drives.items(), strict=False):
+    across, width, height = (3, 4.6, 4.0) if len(drives) > _MANY else (2, 7.0, 6.0)
+    figure, axes = panels(len(drives), across, width, height)
+    for axis, (name, rows) in zip(axes, drives.items(), strict=True):
         _draw_drive(axis, name, rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.tight_layout()
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
+    save(figure, path, dpi=90)
 
 
-def _draw_drive(axis: Any, name: str, rows: Mapping[str, Scored]) -> None:
+def _draw_drive(axis: Any, name: str, rows: Mapping[str, Measured]) -> None:
     ours = rows["ours"]
-    if len(ours.walls):
-        axis.plot(*ours.walls.T, ",", color="0.45", rasterized=True)
-    if "wheels" in rows and len(rows["wheels"].path):
-        axis.plot(*seen_from_first(rows["wheels"].path)[:, :2].T, color="tab:red", linewidth=0.7, label="wheels")
-    if len(ours.truth):
-        axis.plot(*seen_from_first(ours.truth)[:, :2].T, color="black", linewidth=1.6, label="truth")
-    axis.plot(*ours.path[:, :2].T, color="tab:blue", linewidth=0.8, label="corrected")
-    shown = np.concatenate((ours.walls, ours.path[:, :2]))
+    walls, path, truth = (ours.drawn[name] for name in ("walls", "path", "truth"))
+    if len(walls):
+        axis.plot(*walls.T, ",", color="0.45", rasterized=True)
+    if "wheels" in rows and not rows["wheels"].failed:
+        axis.plot(
+            *seen_from_first(rows["wheels"].drawn["path"])[:, :2].T, color="tab:red", linewidth=0.7, label="wheels"
+        )
+    if len(truth):
+        axis.plot(*seen_from_first(truth)[:, :2].T, color="black", linewidth=1.6, label="truth")
+    axis.plot(*path[:, :2].T, color="tab:blue", linewidth=0.8, label="corrected")
+    shown = np.concatenate((walls, path[:, :2]))
     low, high = np.percentile(shown, 0.5, axis=0), np.percentile(shown, 99.5, axis=0)
     margin = 0.05 * float((high - low).max()) + 0.5
     axis.set_xlim(low[0] - margin, high[0] + margin)

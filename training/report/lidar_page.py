@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from training.report.page import figures, markdown, signed, with_interval
+from training.report.page import page as whole
 from training.scoring.lidar_bars import NETWORKS_POSITION_M
 from training.scoring.lidar_rows import ROWS
 
@@ -73,12 +75,11 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         "`maze2d`, the simulator's own scanner:",
         _table(result["tables"]["maze2d"], _BUILDING_COLUMNS),
     ]
-    if images:
-        parts += ["## Figures", *(f"![{caption}](images/{name})\n\n{caption}" for name, caption in images.items())]
+    parts += figures(images)
     for title, lines in (("Skipped", result["skipped"]), ("Failed", result["failed"])):
         if lines:
             parts += [f"## {title}", "\n".join(f"- {line}" for line in lines)]
-    return "\n\n".join(parts) + "\n"
+    return whole(parts)
 
 
 def _ablation(result: Mapping[str, Any]) -> list[str]:
@@ -156,23 +157,23 @@ _BUILDING_COLUMNS = {
 
 def _table(rows: Mapping[str, Any], columns: Mapping[str, str]) -> str:
     shown = {key: title for key, title in columns.items() if any(key in numbers for numbers in rows.values())}
-    body = [[_title(row), *(_number(numbers.get(key)) for key in shown)] for row, numbers in rows.items()]
+    body = [[_title(row), *(_cell(numbers, key) for key in shown)] for row, numbers in rows.items()]
     counts = [max((number.get("drives", 0) for number in numbers.values()), default=0) for numbers in rows.values()]
     if not any(counts):  # one log
-        return _markdown(["", *shown.values()], body)
+        return markdown(["", *shown.values()], body)
     counted = [[name, str(count), *numbers] for (name, *numbers), count in zip(body, counts, strict=True)]
-    return _markdown(["", "drives", *shown.values()], counted)
+    return markdown(["", "drives", *shown.values()], counted)
 
 
 def _across(logs: Mapping[str, Any], *keys: str) -> str:
     """One metric, the first of these that a row has: a line a row, a column a log."""
 
     def found(numbers: Mapping[str, Any]) -> str:
-        return next((_number(numbers[key]) for key in keys if key in numbers), "")
+        return next((_cell(numbers, key) for key in keys if key in numbers), "")
 
     rows = list(dict.fromkeys(row for numbers in logs.values() for row in numbers if found(numbers[row])))
     body = [[_title(row), *(found(logs[log].get(row, {})) for log in logs)] for row in rows]
-    return _markdown(["", *logs], body)
+    return markdown(["", *logs], body)
 
 
 def _title(row: str) -> str:
@@ -194,11 +195,11 @@ _SOLVERS = {
 def _against_ours(paired: Mapping[str, Any]) -> str:
     """How much larger each row's ATE is than ours, with its interval, in one line each."""
     body = [
-        [_title(row), _signed(numbers["ate_m"]["relative_percent"], ".1f")]
+        [_title(row), with_interval(numbers["ate_m"]["relative_percent"], signed(1))]
         for row, numbers in paired.items()
         if "ate_m" in numbers
     ]
-    return _markdown(["ATE against ours, same drives", "%"], body)
+    return markdown(["ATE against ours, same drives", "%"], body)
 
 
 def _differences(paired: Mapping[str, Any]) -> str:
@@ -211,26 +212,21 @@ def _differences(paired: Mapping[str, Any]) -> str:
         [
             _title(row),
             _title(numbers["with"]),
-            *(_signed(numbers[key]["difference"], ".4f") if key in numbers else "" for key in keys),
+            *(with_interval(numbers[key]["difference"], signed(4)) if key in numbers else "" for key in keys),
         ]
         for row, numbers in paired.items()
         if row not in _FED
     ]
-    return _markdown(["difference of", "to", *keys.values()], body)
-
-
-def _signed(numbers: Mapping[str, Any], digits: str) -> str:
-    low, high = numbers["ci95"]
-    return f"{numbers['mean']:+{digits}} [{low:+{digits}}, {high:+{digits}}]"
+    return markdown(["difference of", "to", *keys.values()], body)
 
 
 def _scanners(result: Mapping[str, Any]) -> str:
     tables = {**result["scanners"], "maze2d": result["tables"]["maze2d"]}
     body = [
-        [name, _number(rows.get("ours_without_wheels", {}).get("position_rmse_m")), f"{NETWORKS_POSITION_M[name]:.2f}"]
+        [name, _cell(rows.get("ours_without_wheels", {}), "position_rmse_m"), f"{NETWORKS_POSITION_M[name]:.2f}"]
         for name, rows in tables.items()
     ]
-    return _markdown(["scanner", "ours, without wheels", "networks of 0.1.0"], body)
+    return markdown(["scanner", "ours, without wheels", "networks of 0.1.0"], body)
 
 
 def _bars(found: Sequence[Mapping[str, Any]]) -> str:
@@ -243,20 +239,12 @@ def _bars(found: Sequence[Mapping[str, Any]]) -> str:
         ]
         for bar in found
     ]
-    return _markdown(["", "value", "bar", "met"], body)
+    return markdown(["", "value", "bar", "met"], body)
 
 
-def _number(numbers: Mapping[str, Any] | None) -> str:
-    if numbers is None or numbers["mean"] is None:
-        return ""
-    mean = _digits(numbers["mean"])
-    return mean if numbers["ci95"] is None else f"{mean} [{_digits(numbers['ci95'][0])}, {_digits(numbers['ci95'][1])}]"
+def _cell(numbers: Mapping[str, Any], key: str) -> str:
+    return with_interval(numbers.get(key), _digits)
 
 
 def _digits(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}" if abs(value) >= 1.0 else f"{value:.4f}"
-
-
-def _markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

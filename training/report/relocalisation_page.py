@@ -2,18 +2,22 @@
 
 from typing import Any
 
+from training.report.page import Column, markdown, short, table
+from training.report.page import page as whole
+
 _TITLES = {
     "ours": "ours (`mode:=localization`)",
     "nearest_code": "`nearest_code`: the pose of the most similar place code, from a similarity of 0.99 on",
     "particle_filter": "`particle_filter`: AMCL's model on the map's ranges, starting anywhere in free space",
     "oracle_place": "`oracle_place`: the truly nearest frame of the map is given, and measured",
 }
-_COLUMNS = {
-    "success": ("Success (%)", 100.0),
-    "false_claims": ("False claims (%)", 100.0),
-    "frames_to_success": ("Frames to success", 1.0),
-    "heading_rmse_deg": ("Heading RMSE after (deg)", 1.0),
-}
+_COLUMNS = (
+    Column("starts", "Starts", lambda value: f"{value:.0f}"),
+    Column("success", "Success (%)", short, 100.0),
+    Column("false_claims", "False claims (%)", short, 100.0),
+    Column("frames_to_success", "Frames to success", short),
+    Column("heading_rmse_deg", "Heading RMSE after (deg)", short),
+)
 _WORLDS = {
     "maze2d": "2D mazes",
     "maze3d": "3D mazes",
@@ -25,13 +29,13 @@ _WORLDS = {
 def page(result: dict[str, Any]) -> str:
     """The page of a JSON's content."""
     parts = [_INTRODUCTION.format(**result)]
-    for table, rows in result["tables"].items():
-        parts.append(f"## {_WORLDS[table]}\n\n{_map_line(result['maps'][table])}\n\n{_table(rows)}")
-        if lines := _table({row: numbers for row, numbers in result["unmapped"][table].items() if len(numbers) > 1}):
+    for name, rows in result["tables"].items():
+        parts.append(f"## {_WORLDS[name]}\n\n{_map_line(result['maps'][name])}\n\n{_table(rows)}")
+        if lines := _table({row: numbers for row, numbers in result["unmapped"][name].items() if len(numbers) > 1}):
             parts.append(f"Starts in parts that the map does not show, where silence is right:\n\n{lines}")
     if result["logs"]:
         parts.append(_LOGS.format(**result["logs"]) + "\n\n" + _log_table(result["logs"]["tables"]))
-    return "\n\n".join(parts) + "\n"
+    return whole(parts)
 
 
 _LOGS = """## Real logs of a lidar
@@ -45,21 +49,18 @@ later, or never. `aces`, `mit-csail`, `belgioioso`, `freiburg-101` and `seattle`
 
 
 def _log_table(tables: dict[str, Any]) -> str:
-    lines = [
-        "| Log | Start | Starts | Right | False claims | Way to a right claim, median (m) | Processor time (s/m) |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    header = "Log", "Start", *_COUNTS.values(), "Way to a right claim, median (m)", "Processor time (s/m)"
+    lines: list[list[object]] = []
     for log, kinds in tables.items():
         for kind, numbers in kinds.items():
             way = "" if numbers["way_to_success_m"] is None else f"{numbers['way_to_success_m']:.1f}"
             cost = "" if numbers["processor_s_per_m"] is None else f"{numbers['processor_s_per_m']:.2f}"
-            cells = (f"`{log}`", kind, numbers["starts"], numbers["right"], numbers["false_claims"], way, cost)
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
+            lines.append([f"`{log}`", kind, *(numbers[name] for name in _COUNTS), way, cost])
     sums = [sum(kinds[kind][name] for kinds in tables.values() for kind in kinds) for name in _COUNTS]
-    return "\n".join((*lines, "| all | | " + " | ".join(map(str, sums)) + " | | |"))
+    return markdown(header, [*lines, ["all", "", *sums, "", ""]])
 
 
-_COUNTS = ("starts", "right", "false_claims")
+_COUNTS = {"starts": "Starts", "right": "Right", "false_claims": "False claims"}
 
 _INTRODUCTION = """# Relocalisation: kidnapped starts in a saved map
 
@@ -94,18 +95,7 @@ def _map_line(maps: dict[str, Any]) -> str:
 def _table(rows: dict[str, Any]) -> str:
     if not rows:
         return ""
-    lines = [
-        "| Row | Starts | " + " | ".join(title for title, _ in _COLUMNS.values()) + " |",
-        "|---|" + "---|" * (len(_COLUMNS) + 1),
-    ]
-    for row, numbers in rows.items():
-        cells = [_cell(numbers.get(name), factor) for name, (_, factor) in _COLUMNS.items()]
-        lines.append(f"| {_TITLES[row]} | {numbers['starts']['mean']:.0f} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _cell(number: dict[str, Any] | None, factor: float) -> str:
-    if number is None:
-        return ""
-    low, high = number["ci95"]
-    return f"{factor * number['mean']:.3g} [{factor * low:.3g}, {factor * high:.3g}]"
+    counted = {
+        _TITLES[row]: {**numbers, "starts": {**numbers["starts"], "ci95": None}} for row, numbers in rows.items()
+    }
+    return table(counted, _COLUMNS, "Row")

@@ -1,9 +1,11 @@
 """The page of a world's results in Markdown, made from the JSON alone."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from training.data.worlds import World
+from training.report.page import figures, interval, joined, markdown, number, signed, with_interval
+from training.report.page import page as whole
 from training.scoring.oracle_rows import LIMITS
 from training.scoring.scores import METRICS, Metric
 from training.scoring.table_rows import ROWS
@@ -20,14 +22,14 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
         f"{result['steps']} steps a table, {result['split']} split. In brackets are 95 % bootstrap intervals over "
         "trajectories. No trajectory is aligned with the truth but for its first pose. "
         + (
-            f"Optimizers were trained with the seeds {_joined(result['seeds'])}: their numbers are means over these, "
+            f"Optimizers were trained with the seeds {joined(result['seeds'])}: their numbers are means over these, "
             "and the smallest and largest mean of a single seed stand beside them. "
             if several
             else ""
         )
         + "Numbers in full are in "
         f"[`training/results/{world.name}.json`](../training/results/{world.name}.json); what they mean is in "
-        "[results.md](results.md).",
+        "[results.md](explanation/results.md).",
     ]
     for name, table in result["tables"].items():
         length = f"{result['path_m'][name][str(result['steps'])]:.0f} m driven on average"
@@ -46,36 +48,15 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
             ]
         if result["attention"].get(name):
             parts += ["### Attention", _attention(result["attention"][name])]
-    parts += ["## Figures", *(f"![{caption}](images/{name})\n\n{caption}" for name, caption in images.items())]
     parts += [
+        *figures(images),
         "## Trainings",
         "Time is what went into the weights; throughput and memory are of all processes together. Data are "
         "simulated while the networks train, so that throughput is of both.",
         _trainings(result["trainings"]),
         _generation(result["data_generation"]),
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def number(value: float) -> str:
-    """Three significant digits, without an exponent."""
-    magnitude = abs(value)
-    digits = 0 if magnitude >= 100 else 1 if magnitude >= 10 else 2 if magnitude >= 1 else 3
-    if 0 < magnitude < 0.1:
-        digits = 4 if magnitude >= 0.01 else 5
-    return f"{value:.{digits}f}"
-
-
-def interval(entry: dict[str, Any]) -> str:
-    """A mean with its interval in brackets, of ``{mean, ci95}``."""
-    low, high = entry["ci95"]
-    return f"{number(entry['mean'])} [{number(low)}, {number(high)}]"
-
-
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return whole(parts)
 
 
 def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
@@ -94,17 +75,17 @@ def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
 
 def _bias(result: dict[str, Any], name: str) -> str:
     bias = result["local_bias_deg"][name]
-    low, high = (f"{value:+.4f}" for value in bias["ci95"])
-    return f"Mean heading error of a step of the local network: {bias['mean']:+.4f} deg [{low}, {high}]."
+    shown = with_interval(bias, signed(4)).replace(" [", " deg [")
+    return f"Mean heading error of a step of the local network: {shown}."
 
 
 def _pairs(pairs: dict[str, Any], metric: Metric) -> str:
     def cells(name: str, entry: dict[str, Any]) -> list[str]:
         row, other = name.split("_vs_")
         difference, relative = entry[metric.key]["difference"], entry[metric.key]["relative_percent"]
-        low, high = (f"{value:+.1f}" for value in relative["ci95"])
         apart = "yes" if difference["ci95"][0] > 0 or difference["ci95"][1] < 0 else "no"
-        return [f"`{row}`", f"`{other}`", f"{relative['mean']:+.1f} % [{low}, {high}]", interval(difference), apart]
+        change = with_interval(relative, signed(1)).replace(" [", " % [")
+        return [f"`{row}`", f"`{other}`", change, interval(difference), apart]
 
     header = ["Row", "Against", f"{metric.title}, relative", f"Difference, {metric.unit}", "Interval excludes zero"]
     return markdown(header, (cells(name, entry) for name, entry in pairs.items()))
@@ -171,14 +152,9 @@ def _generation(speed: dict[str, float]) -> str:
     memory = _unit(speed, "peak_memory_mb", 1.0 / 1024.0, "GiB")
     return (
         "Data alone (`python -m training.throughput`), datapoints/s with "
-        f"{speed['workers']:.0f} worker process(es): {_joined(made)}; peak memory {memory}."
+        f"{speed['workers']:.0f} worker process(es): {joined(made)}; peak memory {memory}."
     )
 
 
 def _unit(entry: dict[str, Any], key: str, factor: float, unit: str) -> str:
     return f"{number(factor * entry[key])} {unit}" if entry.get(key) else ""
-
-
-def _joined(values: Iterable[object]) -> str:
-    *most, last = map(str, values)
-    return f"{', '.join(most)} and {last}" if most else last

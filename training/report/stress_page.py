@@ -27,6 +27,8 @@ def page(result: dict[str, Any]) -> str:
     """The page of a JSON's content."""
     parts = [_INTRODUCTION.format(**result)]
     parts += [f"## {log}\n\n{_table(table)}" for log, table in result["logs"].items()]
+    if result["bars"]:
+        parts.append("## Bars\n\n" + _bars(result["bars"]))
     parts += [_simulated(name, table) for name, table in result["tables"].items() if table]
     parts.append("## The changes\n\n" + _changes())
     return "\n\n".join(parts) + "\n"
@@ -88,6 +90,13 @@ def _both(numbers: dict[str, Any], metres: str, degrees: str) -> str:
     values = [one[metres] for one in numbers["seeds"].values()]
     spread = f" ± {(max(values) - min(values)) / 2:.2g}" if len(values) > 1 else ""
     return f"{numbers[metres]:.3f}{spread} / {numbers[degrees]:.2f}"
+
+
+def _bars(bars: list[dict[str, Any]]) -> str:
+    missed = [bar for bar in bars if not bar["met"]]
+    body = [[bar["name"], f"{bar['value']:.3f}", f"{bar['at_most']:.3f}"] for bar in missed]
+    text = f"{len(bars) - len(missed)} of {len(bars)} are met. Missed are:"
+    return f"{text}\n\n{_markdown([['', 'error (m)', 'at most (m)'], ['---'] * 3, *body])}"
 
 
 def _changes() -> str:

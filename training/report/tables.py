@@ -8,12 +8,13 @@ import torch
 
 from ngo_estimator.geometry import se2
 from training.data.worlds import World
-from training.scoring.error_cache import Evaluation
+from training.scoring.prefix_errors import stacked
 from training.scoring.scores import METRICS
 from training.scoring.statistics import compare, mean_interval
+from training.scoring.table import Measured
 
-Table = Mapping[str, Sequence[Evaluation]]
-"""The evaluations of each row, one for each training seed."""
+Table = Mapping[str, Sequence[Measured]]
+"""The measurements of each row, one for each training seed."""
 
 PAIRS = (
     ("local", "local_calibrated"),
@@ -41,11 +42,6 @@ PAIRS = (
 """Rows that are compared on the same trajectories."""
 
 
-def stacked(row: Sequence[Evaluation], steps: int, metric: str) -> np.ndarray:
-    """A metric of a row ``(seeds, trajectories)`` after so many steps."""
-    return np.stack([evaluation.scores[steps][metric] for evaluation in row])
-
-
 def table_json(table: Table, prefixes: Sequence[int], steps: int, world: World) -> dict[str, Any]:
     """``ROW.METRIC.{mean, ci95, seeds}`` of whole trajectories, and ``ROW.prefixes.STEPS.METRIC.{mean, ci95}``."""
     return {
@@ -62,7 +58,7 @@ def rows_json(table: Table, steps: int, world: World) -> dict[str, Any]:
     return {row: _metrics(found, steps, world) for row, found in table.items()}
 
 
-def _metrics(row: Sequence[Evaluation], steps: int, world: World) -> dict[str, Any]:
+def _metrics(row: Sequence[Measured], steps: int, world: World) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for metric in METRICS[world.name]:
         values = stacked(row, steps, metric.key)

@@ -9,15 +9,13 @@ import numpy as np
 import torch
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.baselines.loop_factors import found_loops
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.data.batches import action_histories, relative_poses
-from training.scoring.lidar_errors import WITHIN_DEVIATIONS, absolute_error_m
-from training.scoring.metrics import path_length_m, trajectory_error
-from training.scoring.online_estimate import steps_of, with_origin
+from training.scoring.metrics import absolute_error_m, trajectory_error, within
+from training.scoring.online_estimate import carried_covariances, online_run, steps_of, with_origin
 from training.scoring.row_estimators import seen_in
 
 ROWS = ("actions_only", "local", "gtsam", "ours")
@@ -83,11 +81,7 @@ def _windows(errors: np.ndarray) -> np.ndarray:
 def odometry(relative: np.ndarray, covariances: np.ndarray) -> Estimate:
     """The trajectory of steps ``(steps, 3)``, each with its covariance ``(3, 3)``, independent of the others."""
     poses = se2.r2g(torch.from_numpy(relative).double()).numpy()
-    found, covariance = [], np.zeros((3, 3))
-    for pose, step, own in zip(poses, relative.astype(np.float64), covariances, strict=True):
-        covariance = propagate(covariance, pose, step, own)
-        found.append(covariance)
-    return Estimate(poses, poses, np.array(found))
+    return Estimate(poses, poses, carried_covariances(poses, relative.astype(np.float64), covariances))
 
 
 def local(features: Features) -> Estimate:
@@ -120,13 +114,8 @@ def ours(core: OnlineTrajectory) -> Callable[[Features], Estimate]:
     """The online core, as ``ngo_node`` publishes it."""
 
     def estimate(features: Features) -> Estimate:
-        core.reset()
-        updates = [core.update(step) for step in steps_of(features)]
-        core.finish()
-        trajectory = core.trajectory()
-        assert trajectory is not None
-        published = np.array([update.pose_xyyaw for update in updates])
-        return Estimate(trajectory.poses_xyyaw[1:], published, np.array([update.covariance for update in updates]))
+        run = online_run(core, steps_of(features))
+        return Estimate(run.trajectory.poses_xyyaw[1:], run.published, run.covariances)
 
     return estimate
 
@@ -152,12 +141,8 @@ def errors_of(estimate: Estimate, truth: np.ndarray) -> dict[str, float]:
     share of the published poses whose x, y and heading each lie within three of their deviations of the truth.
     """
     true, found = with_origin(truth), with_origin(estimate.poses)
-    off = np.abs(estimate.published - truth)
-    off[:, 2] = np.abs(np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2])))
-    deviations = np.sqrt(np.diagonal(estimate.covariances, axis1=1, axis2=2))
     return {
         "translation_percent": trajectory_error(found, true).final_percent,
         "ate_m": absolute_error_m(found, true),
-        "within_3_std": float((off <= WITHIN_DEVIATIONS * deviations).all(axis=1).mean()),
-        "path_m": path_length_m(true),
+        "within_3_std": within(estimate.published, estimate.covariances, truth),
     }

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_arrays import between, compose
+from ngo_estimator.geometry.se2 import between, compose
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.cycle_agreement import chain_poses
 from ngo_estimator.graph.relative_poses import RelativePoses

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
-from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.data.batches import seen_from_first
 from training.data.faults import SensedDrive
-
-WITHIN = 3.0
-"""Deviations."""
+from training.scoring.metrics import within
+from training.scoring.online_estimate import carried_covariances, online_run
 
 _STAMP_NS = 1_000_000_000
 
@@ -56,23 +54,15 @@ def honest_run(local: LocalOdometry, online: OnlineTrajectory, drive: SensedDriv
     """Run a drive through both estimators, which begin anew."""
     truth = seen_from_first(drive.poses_xyyaw)[1:]
     steps = estimates_of(local, drive)
-    online.reset()
-    published, covariances = [], []
-    for step in steps:
-        update = online.update(step)
-        published.append(update.pose_xyyaw)
-        covariances.append(update.covariance)
-    online.finish()
-    trajectory = online.trajectory()
-    assert trajectory is not None
+    run = online_run(online, steps)
     odometry = np.stack([step.odom_xyyaw for step in steps])
     of_odometry = odometry_covariances(odometry, steps)
     return HonestRun(
         rmse_m(odometry, truth),
-        rmse_m(trajectory.poses_xyyaw[1:], truth),
+        rmse_m(run.trajectory.poses_xyyaw[1:], truth),
         within(odometry, of_odometry, truth),
-        within(np.stack(published), np.stack(covariances), truth),
-        _median_deviation(np.stack(covariances)),
+        within(run.published, run.covariances, truth),
+        _median_deviation(run.covariances),
         _median_deviation(of_odometry),
         float(np.mean([step.unlikeness > 1.0 for step in steps])),
         float(np.mean([step.repeated for step in steps])),
@@ -81,19 +71,8 @@ def honest_run(local: LocalOdometry, online: OnlineTrajectory, drive: SensedDriv
 
 def odometry_covariances(odometry: np.ndarray, steps: list[LocalEstimate]) -> np.ndarray:
     """Covariances ``(n, 3, 3)`` of the poses in ``odom``, as ``local_node`` publishes them."""
-    covariance, found = np.zeros((3, 3)), []
-    for pose, step in zip(odometry, steps, strict=True):
-        covariance = propagate(covariance, pose, step.relative_xyyaw, step.covariance)
-        found.append(covariance)
-    return np.stack(found)
-
-
-def within(poses: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> float:
-    """Share of poses ``(n, 3)`` with x, y and heading each within three of their own deviations of the truth."""
-    off = np.abs(poses - truth)
-    off[:, 2] = np.abs(np.remainder(poses[:, 2] - truth[:, 2] + np.pi, 2.0 * np.pi) - np.pi)
-    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    return float((off <= WITHIN * deviations).all(axis=1).mean())
+    relative, covariances = ([getattr(step, name) for step in steps] for name in ("relative_xyyaw", "covariance"))
+    return carried_covariances(odometry, np.stack(relative), np.stack(covariances))
 
 
 def rmse_m(poses: np.ndarray, truth: np.ndarray) -> float:

@@ -20,6 +20,9 @@ IN_TIME = 50
 MOST_M, MOST_DEG = 0.5, 5.0
 """Errors up to which a pose is right."""
 
+NUMBERS = ("success", "false_claims", "frames", "heading_rmse_deg", "wrong_later", "lost")
+"""What is said of a start."""
+
 _LEAST_MAPPED = 0.9  # share of the frames in time that lie where the map has frames
 
 Features = dict[str, np.ndarray]
@@ -89,8 +92,8 @@ def scored(errors: MapErrors, start: int, claims: list[np.ndarray | None]) -> di
     found = [(k, *errors.of(start + 1 + k, pose)) for k, pose in enumerate(claims) if pose is not None]
     right = [metres <= MOST_M and degrees <= MOST_DEG for _, metres, degrees in found]
     success = bool(found) and right[0] and found[0][0] < IN_TIME
-    nothing = dict.fromkeys(("frames", "heading_rmse_deg", "wrong_later", "lost"), math.nan)
-    result = {"success": float(success), "false_claims": float(bool(found) and not right[0]), **nothing}
+    result = dict.fromkeys(NUMBERS, math.nan)
+    result |= {"success": float(success), "false_claims": float(bool(found) and not right[0])}
     if success:
         headings = np.array([degrees for _, _, degrees in found])
         after = len(claims) - found[0][0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,17 @@ def log_starts(drive: LidarDrive, weights: Path, count: int) -> Iterator[LogStar
     for start in np.linspace(half, max(half, int(ends) - 1), count).astype(np.int64).tolist():
         shown = away_m[start : int(np.searchsorted(way_m, way_m[start] + _MAPPED_WAY_M))] <= 2.0 * ScanMatcher.place_m
         yield _start(Localiser(matcher), errors, steps, way_m, start, bool(shown.mean() >= _LEAST_MAPPED))
+
+
+def as_arrays(starts: list[LogStart]) -> dict[str, np.ndarray]:
+    """The starts as arrays ``(starts,)``, to be kept."""
+    return {field.name: np.array([getattr(start, field.name) for start in starts]) for field in fields(LogStart)}
+
+
+def starts_of(arrays: dict[str, np.ndarray]) -> list[LogStart]:
+    """The starts that ``as_arrays`` made arrays of."""
+    columns = (arrays[field.name].tolist() for field in fields(LogStart))
+    return [LogStart(*values) for values in zip(*columns, strict=True)]
 
 
 def summary_of(starts: list[LogStart]) -> dict[str, Any]:

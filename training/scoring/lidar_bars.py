@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from training.scoring.lidar_scores import Scored
+from training.scoring.table import Measured
 
-Table = Mapping[str, Mapping[str, Scored]]
-"""Scored rows by the drive's name, then the row's."""
+Table = Mapping[str, Mapping[str, Measured]]
+"""By the drive's name, then the row's."""
 
 PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
     "aces": {"cartographer_published": {"translation_m": 0.0375, "rotation_deg": 0.373}},
@@ -74,24 +74,19 @@ def bars(tables: Mapping[str, Table], scanners: Mapping[str, Table]) -> list[Bar
     ]
 
 
-_RELATION_LIMITS: tuple[tuple[str, str, str, float], ...] = (
-    ("aces", "ours", "translation_m", 0.0375),
-    ("aces", "ours", "rotation_deg", 0.373),
-    ("aces", "ours", "far_m", 0.06),
-    ("aces", "ours_without_wheels", "translation_m", 0.549),
-    ("aces", "ours_without_wheels", "rotation_deg", 2.2),
-    ("mit-csail", "ours", "translation_m", 0.0319),
-    ("mit-csail", "ours", "rotation_deg", 0.369),
-    ("mit-csail", "ours", "far_m", 0.055),
-    ("mit-csail", "ours_without_wheels", "translation_m", 0.0319),
-    ("mit-csail", "ours_without_wheels", "rotation_deg", 0.40),
-)
+_RELATION_LIMITS: dict[tuple[str, str], dict[str, float]] = {
+    ("aces", "ours"): {"translation_m": 0.0375, "rotation_deg": 0.373, "far_m": 0.06},
+    ("aces", "ours_without_wheels"): {"translation_m": 0.549, "rotation_deg": 2.2},
+    ("mit-csail", "ours"): {"translation_m": 0.0319, "rotation_deg": 0.369, "far_m": 0.055},
+    ("mit-csail", "ours_without_wheels"): {"translation_m": 0.0319, "rotation_deg": 0.40},
+}
 
 
 def _relation_bars(logs: Table) -> Iterator[Bar]:
-    for log, row, key, most in _RELATION_LIMITS:
-        if log in logs and key in (errors := _of(logs[log], row)):
-            yield Bar(f"{log}, {row}: {key}", float(errors[key].mean()), most=most)
+    for (log, row), limits in _RELATION_LIMITS.items():
+        errors = _of(logs.get(log, {}), row)
+        for key in (key for key in limits if key in errors):
+            yield Bar(f"{log}, {row}: {key}", float(errors[key].mean()), most=limits[key])
 
 
 def _mapper_bars(logs: Table) -> Iterator[Bar]:
@@ -155,5 +150,5 @@ def _covariance_bars(tables: Mapping[str, Table]) -> Iterator[Bar]:
                 yield Bar(f"{table}, {row}: truth within three deviations", float(np.mean(found)), least=0.95)
 
 
-def _of(rows: Mapping[str, Scored], row: str) -> dict[str, np.ndarray]:
+def _of(rows: Mapping[str, Measured], row: str) -> dict[str, np.ndarray]:
     return rows[row].errors if row in rows else {}

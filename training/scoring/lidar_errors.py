@@ -4,13 +4,12 @@ import numpy as np
 
 from training.data.batches import seen_from_first
 from training.data.lidar_drives import Reference, ReferencePoses, Relations, TruePoses
-from training.scoring.metrics import trajectory_error
+from training.scoring.metrics import absolute_error_m, off_by, trajectory_error, within
 from training.scoring.relations import interpolated, relation_errors
 
 Errors = dict[str, np.ndarray]
 """Errors by the metric's key, each ``(samples,)``: one a relation, or a single one of a whole trajectory."""
 
-WITHIN_DEVIATIONS = 3.0
 _FINEST = 1e-3  # m and rad
 
 
@@ -48,16 +47,6 @@ def lidar_errors(reference: Reference | None, stamps_ns: np.ndarray, poses_xyyaw
     }
 
 
-def absolute_error_m(estimate_xyyaw: np.ndarray, reference_xyyaw: np.ndarray) -> float:
-    """Root mean square distance of positions, both ``(n, 3)``, after the planar rigid motion that makes it least."""
-    estimate, reference = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (estimate_xyyaw, reference_xyyaw))
-    x, y = estimate.T
-    dot, cross = (estimate * reference).sum(), (x * reference[:, 1] - y * reference[:, 0]).sum()
-    cosine, sine = np.cos(np.arctan2(cross, dot)), np.sin(np.arctan2(cross, dot))
-    turned = np.stack((cosine * x - sine * y, sine * x + cosine * y), axis=-1)
-    return float(np.sqrt(((turned - reference) ** 2).sum(axis=1).mean()))
-
-
 def covariance_errors(truth: TruePoses, stamps_ns: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> Errors:
     """How well the covariances ``(n, 3, 3)`` of published poses ``(n, 3)`` tell their errors.
 
@@ -67,15 +56,13 @@ def covariance_errors(truth: TruePoses, stamps_ns: np.ndarray, poses: np.ndarray
     of a mm and a mrad are added.
     """
     start, true = truth.stamps_ns[0], seen_from_first(truth.poses_xyyaw)
-    off = poses - interpolated((truth.stamps_ns - start) * 1e-9, true, (stamps_ns - start) * 1e-9)
-    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    within = (np.abs(off) <= WITHIN_DEVIATIONS * deviations).all(axis=1)
+    true_then = interpolated((truth.stamps_ns - start) * 1e-9, true, (stamps_ns - start) * 1e-9)
+    off = off_by(poses, true_then)
     published = covariances + _FINEST**2 * np.eye(3)
     mahalanobis = np.einsum("ni,ni->n", off, np.linalg.solve(published, off[..., None])[..., 0])
     likelihood = -0.5 * (mahalanobis + np.linalg.slogdet(published).logabsdet + 3.0 * np.log(2.0 * np.pi))
     return {
-        "within_three_deviations": np.array([within.mean()]),
+        "within_three_deviations": np.array([within(poses, covariances, true_then)]),
         "negative_log_likelihood": np.array([-likelihood.mean()]),
     }
 

@@ -182,7 +182,7 @@ def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
         run.online.walls(_MOST_WALL_POINTS),
         {
             "keys": run.online.graph.keys,
-            "loops": len(run.online.graph.loop_weights),
+            "loops": len(run.online.graph.closed),
             "lag_s": run.front.lag_s,
             "unsure": run.front.unsure,
         },

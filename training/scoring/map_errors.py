@@ -8,6 +8,7 @@ import numpy as np
 
 from ngo_estimator.mapping.occupancy_grid import OccupancyConfig, OccupancyGrid, OccupancyMap
 from ngo_estimator.mapping.range_scan import range_scan
+from training.data.batches import seen_from_first
 from training.data.episodes import wall_ranges
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def true_map(maze: Maze, poses_xyyaw: np.ndarray, angles_rad: np.ndarray, resolu
     Args:
         poses_xyyaw: in the maze's frame ``(frames, 3)``; angles_rad: of the rays ``(rays,)``, in the robot's frame.
     """
-    from_first = seen_from(poses_xyyaw[0], poses_xyyaw)
+    from_first = seen_from_first(poses_xyyaw)
     ranges = wall_ranges(maze, poses_xyyaw, angles_rad).astype(np.float64)
     grid = OccupancyGrid(resolution_m)
     for pose, seen in zip(from_first, ranges, strict=True):
@@ -59,13 +60,6 @@ def mean_entropy_bits(found: OccupancyMap) -> float:
     """Mean entropy of the cells that anything is known of: a map whose scans contradict each other has more."""
     share = np.clip(found.values[found.values != _UNKNOWN] / 100.0, 0.005, 0.995)
     return float(-(share * np.log2(share) + (1.0 - share) * np.log2(1.0 - share)).mean())
-
-
-def seen_from(first: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses ``(n, 3)`` in the frame of the pose ``first``."""
-    cos, sin = np.cos(first[2]), np.sin(first[2])
-    x, y = (poses[:, :2] - first[:2]).T
-    return np.column_stack((cos * x + sin * y, -sin * x + cos * y, poses[:, 2] - first[2]))
 
 
 def _is_wall(maze: Maze, first: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -6,6 +6,9 @@ import numpy as np
 
 from training.data.batches import seen_from_first
 
+WITHIN_DEVIATIONS = 3.0
+"""Deviations within which an honest estimate has the truth."""
+
 
 @dataclass(frozen=True)
 class TrajectoryError:
@@ -43,3 +46,31 @@ def trajectory_error(estimate_xyyaw: np.ndarray, truth_xyyaw: np.ndarray) -> Tra
         final_percent=float(100.0 * position[-1] / length),
         heading_rmse_deg=float(np.degrees(np.sqrt(np.mean(heading**2)))),
     )
+
+
+def off_by(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Differences ``(n, 3)`` of poses and truth ``(n, 3)``, headings within half a turn."""
+    off = poses - truth
+    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    return np.asarray(off)
+
+
+def within(poses: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> float:
+    """Share of poses ``(n, 3)`` with x, y and heading each within three of their own deviations of the truth."""
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return float((np.abs(off_by(poses, truth)) <= WITHIN_DEVIATIONS * deviations).all(axis=1).mean())
+
+
+def absolute_error_m(estimate_xyyaw: np.ndarray, reference_xyyaw: np.ndarray) -> float:
+    """Root mean square distance of positions, both ``(n, 3)``, after the planar rigid motion that makes it least."""
+    estimate, reference = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (estimate_xyyaw, reference_xyyaw))
+    x, y = estimate.T
+    dot, cross = (estimate * reference).sum(), (x * reference[:, 1] - y * reference[:, 0]).sum()
+    cosine, sine = np.cos(np.arctan2(cross, dot)), np.sin(np.arctan2(cross, dot))
+    turned = np.stack((cosine * x - sine * y, sine * x + cosine * y), axis=-1)
+    return float(np.sqrt(((turned - reference) ** 2).sum(axis=1).mean()))
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.square(values).mean()))

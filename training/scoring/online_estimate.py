@@ -1,25 +1,41 @@
 """The online estimate: each pose as it was when its frame was the newest."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory
 
 
-def run_online(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> Trajectory:
-    """The trajectory after all steps in ``features``, which are those of ``features_of``; ``core`` begins anew."""
+@dataclass(frozen=True)
+class OnlineRun:
+    """``trajectory`` after all steps; ``published`` ``(steps, 3)`` and ``covariances`` ``(steps, 3, 3)`` at each."""
+
+    trajectory: Trajectory
+    published: np.ndarray
+    covariances: np.ndarray
+
+
+def online_run(core: OnlineTrajectory, steps: Iterable[RelativeStep]) -> OnlineRun:
+    """The core, which begins anew, over the steps of a drive."""
     core.reset()
-    for step in steps_of(features):
-        core.update(step)
+    updates = [core.update(step) for step in steps]
     core.finish()
     trajectory = core.trajectory()
     assert trajectory is not None
-    return trajectory
+    published = (np.array([getattr(update, name) for update in updates]) for name in ("pose_xyyaw", "covariance"))
+    return OnlineRun(trajectory, *published)
+
+
+def run_online(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> Trajectory:
+    """The trajectory after all steps in ``features``, which are those of ``features_of``; ``core`` begins anew."""
+    return online_run(core, steps_of(features)).trajectory
 
 
 def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.ndarray:
@@ -53,3 +69,12 @@ def steps_of(features: dict[str, np.ndarray]) -> Iterator[RelativeStep]:
 def with_origin(poses: np.ndarray) -> np.ndarray:
     """Poses ``(steps + 1, 3)`` with the origin in front of those after each step."""
     return np.concatenate((np.zeros((1, 3)), poses))
+
+
+def carried_covariances(poses: np.ndarray, relative: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """Covariances ``(n, 3, 3)`` of the poses ``(n, 3)`` after independent steps ``(n, 3)`` with these of their own."""
+    covariance, found = np.zeros((3, 3)), []
+    for pose, step, own in zip(poses, relative, covariances, strict=True):
+        covariance = propagate(covariance, pose, step, own)
+        found.append(covariance)
+    return np.array(found)

@@ -39,14 +39,13 @@ class Networks:
     world: str
     pair_head: PairHead
     search: LoopSearch
-    identity: str
 
     @classmethod
     def load(cls, world: World, weights: Path) -> Networks:
         """The networks in the folder of all weights."""
-        optimizer, description = load_optimizer(weights / world.name, world.name)
+        optimizer, _ = load_optimizer(weights / world.name, world.name)
         place, _ = load_place(weights / world.name, world.name)
-        return cls(world.name, place.pair_head, optimizer.config.search, str(description["sha256"]))
+        return cls(world.name, place.pair_head, optimizer.config.search)
 
 
 def row_of(name: str, networks: Networks, known: KnownMap, second: Features) -> Row:

@@ -86,9 +86,9 @@ def join_row() -> Row:
 def _ours_with_joins(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
     found, run = ours(runs, pipeline), runs.run(pipeline)
     graph, truth = run.online.graph, _truth(runs.drive)
-    rows = np.searchsorted(truth.stamps_ns, run.trajectory.stamps_ns[graph.loop_frames])
-    wrong = wrong_joins(truth.poses_xyyaw, rows, graph.loop_relative)
-    facts = {"wrong_loops": wrong.sum(), "wrong_believed": (wrong & (graph.loop_weights > _BELIEVED)).sum()}
+    rows = np.searchsorted(truth.stamps_ns, run.trajectory.stamps_ns[graph.closed.pairs])
+    wrong = wrong_joins(truth.poses_xyyaw, rows, graph.closed.relative)
+    facts = {"wrong_loops": wrong.sum(), "wrong_believed": (wrong & (graph.closed.weight > _BELIEVED)).sum()}
     return dataclasses.replace(found, facts={**found.facts, **facts})
 
 

@@ -17,8 +17,8 @@ from training.data.sensor_log import SensorLog
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_identity, read_drive
 from training.scoring.lidar_rows import ROWS, Row
-from training.scoring.lidar_scores import DriveSource
 from training.scoring.stress_rows import join_row, loop_facts, visit_facts, with_facts
+from training.scoring.table import Drive
 
 _MOST_SCANS = 6000  # of a short drive: some robots stand for minutes
 _MOST_SCANS_LONG = 20_000
@@ -31,7 +31,7 @@ _SIMULATED = (building2d, building_drives, lidar_changes)
 class StressTable:
     """Drives by the name of their group, the rows of each drive, and the keys of the numbers that are published."""
 
-    groups: Mapping[str, Sequence[DriveSource]]
+    groups: Mapping[str, Sequence[Drive]]
     rows: Mapping[str, Row]
     keys: Sequence[str]
 
@@ -84,14 +84,14 @@ def joins(size: Size) -> StressTable:
 
 def car(path: Path) -> StressTable:
     """A recording whose end lies on its way: how far is the second visit from the first?"""
-    source = DriveSource(path.name.partition(".")[0], log_identity(path), partial(read_drive, path), _READ)
+    source = Drive(path.name.partition(".")[0], log_identity(path), partial(read_drive, path), _READ)
     rows = {name: with_facts(name, visit_facts) for name in ("wheels", "ours", "ours_without_wheels")}
     keys = ("metres", "degrees", "share", "share_before")
     return StressTable({source.name: [source]}, rows, [f"second_visit_{key}" for key in keys])
 
 
-def _source(name: str, size: Size, make: Callable[[], LidarDrive]) -> DriveSource:
-    return DriveSource(name, f"{name}, factor {size.factor:g} on the length", make, _SIMULATED)
+def _source(name: str, size: Size, make: Callable[[], LidarDrive]) -> Drive:
+    return Drive(name, f"{name}, factor {size.factor:g} on the length", make, _SIMULATED)
 
 
 def _changed(change: str, seed: int, length_m: float) -> LidarDrive:

@@ -7,7 +7,7 @@ import pytest
 
 from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 from ngo_sim.mazes import Maze
-from training.scoring.map_errors import intersections, mean_entropy_bits, seen_from, true_map
+from training.scoring.map_errors import intersections, mean_entropy_bits, true_map
 
 ROOM = Maze(np.array([[1, 1, 1, 1, 1], [1, 0, 0, 0, 1], [1, 1, 1, 0, 1], [1, 0, 0, 0, 1], [1, 1, 1, 1, 1]], bool))
 ALL_ROUND = np.linspace(-math.pi, math.pi, 2000, endpoint=False)
@@ -45,11 +45,6 @@ def test_the_true_map_is_what_can_be_seen_in_the_frame_of_the_first_pose() -> No
     walls = true.origin_xy + 0.1 * (np.column_stack((columns, rows)) + 0.5)
     beside = walls[np.abs(walls[:, 1]) < 0.3]
     assert np.abs(np.abs(beside[:, 0]) - 0.5).max() < 0.06
-
-
-def test_poses_are_seen_from_the_first() -> None:
-    poses = np.array([[1.0, 2.0, math.pi / 2.0], [1.0, 5.0, math.pi]])
-    np.testing.assert_allclose(seen_from(poses[0], poses), [[0.0, 0.0, 0.0], [3.0, 0.0, math.pi / 2.0]], atol=1e-12)
 
 
 def test_a_coin_has_one_bit() -> None:

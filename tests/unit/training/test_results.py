@@ -6,22 +6,20 @@ import pytest
 from training.data.batches import seen_from_first
 from training.data.episodes import GROUP, simulate
 from training.data.worlds import world_named
-from training.report import results_page, tables
+from training.report import tables
 from training.report.maze_views import in_maze, maze_and_start
-from training.report.results_page import number, page
+from training.report.results_page import page
 from training.results import Arguments
-from training.scoring.error_cache import Evaluation
 from training.scoring.scores import METRICS
+from training.scoring.table import Measured
 
 WORLD = world_named("maze2d")
 KEYS = [metric.key for metric in METRICS["maze2d"]]
 
 
-def evaluation(errors: list[float]) -> Evaluation:
-    values = {key: np.array(errors) for key in KEYS}
-    return Evaluation(
-        np.zeros((len(errors), 8, 3), np.float32), {4: {k: 0.5 * v for k, v in values.items()}, 8: values}
-    )
+def evaluation(errors: list[float]) -> Measured:
+    values = np.array(errors)
+    return Measured({f"{steps}:{key}": share * values for steps, share in ((4, 0.5), (8, 1.0)) for key in KEYS})
 
 
 TABLE = {
@@ -110,27 +108,6 @@ def test_every_line_of_a_table_has_as_many_cells() -> None:
         elif block:
             assert len({row.replace(" | ", "|").count("|") for row in block}) == 1, block
             block = []
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (123.4, "123"),
-        (12.34, "12.3"),
-        (1.234, "1.23"),
-        (0.1234, "0.123"),
-        (0.01234, "0.0123"),
-        (-0.5, "-0.500"),
-        (0.0, "0.000"),
-    ],
-)
-def test_numbers_have_three_digits(value: float, text: str) -> None:
-    assert number(value) == text
-
-
-def test_joined_words() -> None:
-    assert results_page._joined([0]) == "0"
-    assert results_page._joined([0, 1, 2]) == "0, 1 and 2"
 
 
 @pytest.mark.parametrize("index", [1, GROUP + 1])

@@ -11,14 +11,15 @@ from ngo_estimator.ngo.pose_aggregation import in_block_poses
 BLOCK = 8
 
 
-@pytest.mark.parametrize("own_shares", [False, True])
+@pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize(("blocks", "behind"), [(0, 5), (1, 0), (1, 7), (40, 3)])
-def test_frames_follow_corrected_nodes_as_in_the_optimizer(blocks: int, behind: int, own_shares: bool) -> None:
+def test_frames_follow_corrected_nodes_as_in_the_optimizer(blocks: int, behind: int, joined: bool) -> None:
     rng = np.random.default_rng(20000)
     odometry = rng.normal(0.0, 3.0, (blocks * BLOCK + 1 + behind, 3))
     nodes = rng.normal(0.0, 3.0, (blocks + 1, 3))
-    even = np.arange(1, BLOCK + 1)[None] / BLOCK
-    shares = rng.uniform(size=(blocks, BLOCK)) if own_shares and blocks > 1 else even
+    shares, joins = np.tile(np.arange(1, BLOCK + 1) / BLOCK, (blocks, 1)), np.zeros(0, np.int64)
+    if joined and blocks:  # the third frame of the last block: the motion that nobody saw is the one that is corrected
+        shares[-1], joins = np.arange(1, BLOCK + 1) >= 3, np.array([(blocks - 1) * BLOCK + 3])
 
     steps, corrected = torch.from_numpy(odometry), torch.from_numpy(nodes)
     starts, whole = steps[: blocks * BLOCK + 1 : BLOCK].unsqueeze(1), blocks * BLOCK
@@ -32,4 +33,6 @@ def test_frames_follow_corrected_nodes_as_in_the_optimizer(blocks: int, behind: 
             se2.compose(corrected[-1:], se2.between(starts[-1], steps[whole + 1 :])),
         )
     )
-    np.testing.assert_allclose(frames_between_nodes(nodes, odometry, BLOCK, shares), expected, atol=1e-13)
+    np.testing.assert_allclose(
+        frames_between_nodes(nodes, odometry, BLOCK * np.arange(blocks + 1), joins), expected, atol=1e-13
+    )

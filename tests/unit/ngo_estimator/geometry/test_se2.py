@@ -139,3 +139,25 @@ def test_gradients_are_those_of_finite_differences(function) -> None:  # noqa: A
 def test_r2g_of_a_long_trajectory_in_float32_stays_within_a_millimetre() -> None:
     steps = random_poses(2000) * torch.tensor([0.05, 0.01, 0.05])
     assert (se2.r2g(steps.float()).double() - se2.r2g(steps))[:, :2].norm(dim=-1).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["compose", "between"])
+@pytest.mark.parametrize(("of_a", "of_b"), [((3,), (3,)), ((20, 3), (20, 3)), ((3,), (20, 3)), ((5, 1, 3), (4, 3))])
+def test_arrays_give_what_tensors_give(name: str, of_a: tuple[int, ...], of_b: tuple[int, ...]) -> None:
+    a, b = (3.0 * torch.randn(*shape, dtype=torch.float64) for shape in (of_a, of_b))
+    function = getattr(se2, name)
+    result = function(a.numpy(), b.numpy())
+    assert isinstance(result, np.ndarray)
+    np.testing.assert_allclose(result, function(a, b).numpy(), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["wrapped", "inverse", "r2g", "g2r"])
+def test_arrays_are_accumulated_and_undone_as_tensors(name: str) -> None:
+    poses = random_poses(4, 20)
+    function = getattr(se2, name)
+    np.testing.assert_allclose(function(poses.numpy()), function(poses).numpy(), atol=1e-12)
+
+
+def test_half_a_turn_of_arrays_is_positive() -> None:
+    angles = np.array([-np.pi, np.pi, 0.0, 3.0 * np.pi])
+    np.testing.assert_allclose(se2.wrap(angles), [np.pi, np.pi, 0.0, np.pi], atol=1e-15)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep
-from ngo_estimator.data.state_arrays import Arrays, StateError
+from ngo_estimator.data.state_arrays import Arrays, StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
 
@@ -49,23 +49,23 @@ def test_a_step_in_the_same_key_scans_is_as_sure_as_its_registration() -> None:
 
 
 def test_a_chain_comes_back_from_its_state() -> None:
-    chain, other = straight(joins=True), KeyScanChain(FLOOR)
-    other.restore(chain.state())
-    assert chain.state().keys() == other.state().keys()
-    for name, array in chain.state().items():
-        np.testing.assert_array_equal(other.state()[name], array)
+    expected = state_of(straight(joins=True))
+    found = state_of(restore(KeyScanChain(FLOOR), expected))
+    assert found.keys() == expected.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array)
 
 
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda state: {"frames": state["frames"][:-1]},
-        lambda state: {"frames": state["frames"][::-1].copy()},
-        lambda state: {"joins": np.array((1,))},
-        lambda state: {"before": np.zeros((4, 3))},
+        lambda state: {"_frames._nodes.rows": state["_frames._nodes.rows"][:-1]},
+        lambda state: {"_frames._nodes.rows": state["_frames._nodes.rows"][::-1].copy()},
+        lambda state: {"_frames._joins.rows": np.array((9,))},
+        lambda state: {"_before": np.zeros((4, 3))},
     ],
 )
 def test_parts_that_do_not_belong_together_are_refused(damage: Callable[[Arrays], Arrays]) -> None:
-    state = straight().state()
+    state = state_of(straight())
     with pytest.raises(StateError, match=r"there are not|not there"):
-        KeyScanChain(FLOOR).restore({**state, **damage(state)})
+        restore(KeyScanChain(FLOOR), {**state, **damage(state)})

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.graph import key_frames
 from ngo_estimator.graph.key_frames import KeyFrame
 from ngo_estimator.graph.meta_nodes import MetaNodes
@@ -45,10 +45,9 @@ def test_a_correction_is_spread_over_the_nodes_between_two_key_frames(nodes: Met
 
 def test_nodes_are_restored_as_they_were(nodes: MetaNodes) -> None:
     nodes.move(nodes.all()[nodes.active[1:]] + [0.0, 0.4, 0.0])
-    restored = MetaNodes(2)
-    restored.restore(nodes.state(), NO_CODES, NO_CODES)
+    restored = restore(MetaNodes(2), state_of(nodes))
     assert restored.first == 5 and restored.largest_move_m == nodes.largest_move_m
     np.testing.assert_array_equal(restored.all(), nodes.all())
     np.testing.assert_array_equal(restored.all(before=True), nodes.all(before=True))
     with pytest.raises(StateError, match="key frames do not end where the window begins"):
-        MetaNodes(2).restore(nodes.state() | {"first": np.array(4)}, NO_CODES, NO_CODES)
+        restore(MetaNodes(2), state_of(nodes) | {"first": np.array(4)})

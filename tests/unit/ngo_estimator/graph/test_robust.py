@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ngo_estimator.geometry.planar_arrays import between
+from ngo_estimator.geometry.se2 import between
 from ngo_estimator.graph.corrector import GraphProblem, normal_equations
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.relative_poses import RelativePoses

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep
-from ngo_estimator.data.state_arrays import StateError
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
@@ -49,10 +48,3 @@ def test_a_doubted_loop_waits_until_enough_loops_agree() -> None:
     assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 4), lost)) == 0
     assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 5), lost)) == 1
     assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 5), lost)) == 0
-
-
-@pytest.mark.parametrize("name", ["used", "doubted"])
-def test_a_state_with_loops_that_are_not_there_is_refused(name: str) -> None:
-    selection = ScanLoopSelection(ScanGraphConfig())
-    with pytest.raises(StateError, match=f"'{name}' names loops"):
-        selection.restore({**selection.state(), name: np.array((3,))}, 3)

@@ -1,27 +1,27 @@
-"""A part of taking in a block that fails costs itself alone."""
+"""A search that fails costs itself alone."""
 
 from typing import Any
 
 import numpy as np
 
 from ngo_estimator.graph.meta_nodes import MetaNodes
-from ngo_estimator.loops.kept_loops import KeptLoops
+from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.slam.block_intake import BlockIntake
 
 
 class Recorded:
     """Stands for the odometry and the loops, and records what is asked of them."""
 
-    registrations, std = 0, None
+    std = None
 
     def __init__(self, fails: str = "") -> None:
         self.asked, self._fails = list[str](), fails
 
-    def _take(self, name: str) -> KeptLoops:
+    def _take(self, name: str) -> PlaceLoops:
         self.asked.append(name)
         if name == self._fails:
             raise ArithmeticError("no\nnumber")
-        return KeptLoops.none()
+        return PlaceLoops.none()
 
     def aggregate(self, block: int) -> None:
         self._take("aggregate")
@@ -29,10 +29,10 @@ class Recorded:
     def look(self, *given: Any) -> None:
         self._take("look")
 
-    def measure(self) -> KeptLoops:
+    def measure(self) -> PlaceLoops:
         return self._take("measure")
 
-    def find_overlaps(self, *given: Any) -> KeptLoops:
+    def find_overlaps(self, *given: Any) -> PlaceLoops:
         return self._take("overlaps")
 
 
@@ -43,37 +43,19 @@ def intake(recorded: Any, blocks: int = 1, overlaps: bool = True) -> BlockIntake
     return BlockIntake(recorded, nodes, recorded, overlaps, 1.0)
 
 
-def test_parts_are_done_in_their_order() -> None:
+def test_searches_follow_the_features_in_their_order() -> None:
     recorded = Recorded()
-    newest = intake(recorded)
-    newest.begin()
-    assert newest.left == newest.parts == 4
-    faults = [newest.do() for _ in range(4)]
-    assert faults == [""] * 4 and newest.left == 0
+    assert intake(recorded).take() == ""
     assert recorded.asked == ["aggregate", "look", "measure", "overlaps"]
 
 
-def test_what_fails_is_said_in_a_line_and_the_rest_of_the_part_is_done() -> None:
+def test_what_fails_is_said_in_a_line_and_the_rest_is_done() -> None:
     recorded = Recorded(fails="look")
-    newest = intake(recorded, overlaps=False)
-    newest.begin()
-    assert [newest.do(), newest.do()] == ["", "the search for loops failed, ArithmeticError: no number"]
+    assert intake(recorded, overlaps=False).take() == "the search for loops failed, ArithmeticError: no number"
     assert recorded.asked == ["aggregate", "look", "measure"]
 
 
 def test_overlaps_are_looked_for_under_fresh_poses_alone() -> None:
     recorded = Recorded()
-    newest = intake(recorded, blocks=3)
-    newest.begin()
-    for _ in range(newest.parts):
-        newest.do()
+    intake(recorded, blocks=3).take()
     assert "overlaps" not in recorded.asked
-
-
-def test_a_restored_intake_looks_again_where_measuring_is_next() -> None:
-    recorded = Recorded()
-    recorded.registrations = 3
-    newest = intake(recorded, overlaps=False)
-    assert newest.resume(1) == "" and recorded.asked == ["look"]
-    newest.do()
-    assert recorded.asked == ["look", "measure", "aggregate"]

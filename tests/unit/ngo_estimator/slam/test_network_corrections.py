@@ -1,10 +1,9 @@
 """Corrections of the network fit a window that has moved since."""
 
 import numpy as np
-import pytest
 import torch
 
-from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.data.state_arrays import restore, state_of
 from ngo_estimator.ngo.meta_poses import Correction
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 
@@ -29,12 +28,7 @@ def test_old_blocks_are_left_out_and_new_ones_are_stiff_and_not_adjusted() -> No
 
 def test_they_are_restored_as_they_were() -> None:
     given = known()
-    restored = NetworkCorrections.from_state(given.state(), 2)
+    restored = restore(NetworkCorrections.none(), state_of(given))
     assert restored.first == given.first
     np.testing.assert_array_equal(restored.adjustment, given.adjustment)
     np.testing.assert_array_equal(restored.stiffness, given.stiffness)
-
-
-def test_those_of_another_number_of_iterations_are_refused() -> None:
-    with pytest.raises(StateError, match="adjustment"):
-        NetworkCorrections.from_state(known().state(), 3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.data.state_arrays import StateError
+from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
 from ngo_estimator.slam.step_log import StepLog
 from tests.unit.ngo_estimator.samples import small_optimizer
@@ -46,19 +46,12 @@ def test_a_recall_takes_sixteen_steps_back() -> None:
     np.testing.assert_array_equal(odometry.blind.any(axis=1), [False, False, True, True])
 
 
-def test_a_correction_is_spread_evenly_but_where_another_odometry_goes_on() -> None:
-    even = np.arange(1, 9) / 8
-    np.testing.assert_array_equal(drive(3).shares(), even[None])
-    np.testing.assert_array_equal(drive(3, joins=(11,)).shares(), [even, [0, 0, 1, 1, 1, 1, 1, 1], even])
-
-
 def test_blocks_that_do_not_belong_to_the_steps_are_refused() -> None:
-    state = drive(3).state()
-    restored = make()
-    restored.restore(state)
+    state = state_of(drive(3))
+    restored = restore(make(), state)
     np.testing.assert_array_equal(restored.std.slice(0), drive(3).std.slice(0))
-    for name in ("odometry", "blind"):
-        with pytest.raises(StateError, match="do not belong together"):
-            make().restore(state | {name: state[name][: -8 if name == "odometry" else -1]})
+    for name, cut in (("frames._odometry.rows", -8), ("_blind.rows", -1)):
+        with pytest.raises(StateError, match=r"do not belong together|not there"):
+            restore(make(), state | {name: state[name][:cut]})
     with pytest.raises(StateError, match="another odometry begins"):
-        make().restore(state | {"joins": np.array([25])})
+        restore(make(), state | {"frames._joins.rows": np.array([25])})

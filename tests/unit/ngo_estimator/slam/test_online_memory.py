@@ -116,45 +116,24 @@ def test_it_is_as_good_as_the_whole_trajectory_at_once_and_jumps_no_further() ->
     assert np.abs(difference[:, :2]).max() < 0.03 and np.abs(difference[:, 2]).max() < 0.02
 
 
-@pytest.mark.parametrize("per_step", [1, 2, 4])
-def test_iterations_may_be_spread_over_steps(per_step: int) -> None:
+def test_answers_before_an_optimisation_follow_the_last_pose_by_odometry() -> None:
     steps, _ = drive(LAP + 160)
-    at_once = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16)
-    spread = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=per_step)
-    later = -(-spread._graph.work // per_step) - 1
+    before = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16)
+    after = OnlineTrajectory(robust_graph(), SeesPoses(), 160, 16, iterations_per_step=1)
     for count, step in enumerate(steps, start=1):
-        expected, update = at_once.update(step), spread.update(step)
-        assert update.optimized == (count >= 8 and count % 8 == later)
-        if count % 8 >= later:
+        expected, update = before.update(step), after.update(step)
+        assert not update.optimized
+        if count % 8:
             np.testing.assert_allclose(update.pose_xyyaw, expected.pose_xyyaw, atol=1e-9)
             np.testing.assert_allclose(update.covariance, expected.covariance, rtol=1e-6, atol=1e-9)
-        if update.optimized:
-            a, b = spread.trajectory(), at_once.trajectory()
-            assert a is not None and b is not None
-            np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
-
-
-def test_each_step_does_one_part_of_an_update_where_that_is_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    spread = OnlineTrajectory(robust_graph(6), SeesPoses(), 160, 16, iterations_per_step=1)
-    graph, parts = spread._graph, [0]
-    do, iterate = graph._do, graph._iterate
-    monkeypatch.setattr(graph, "_do", lambda: (do(), parts.append(parts.pop() + 1)))
-    monkeypatch.setattr(graph, "_iterate", lambda: (iterate(), parts.append(parts.pop() + 1)))
-    assert graph.work == 8  # steps in a block
-    for count, step in enumerate(drive(LAP)[0], start=1):
-        spread.update(step)
-        assert parts == [int(count >= 8)], count
-        parts[0] = 0
-
-
-def test_more_iterations_than_steps_in_a_block_are_done_before_the_next_block() -> None:
-    steps, _ = drive(LAP + 80)
-    at_once = OnlineTrajectory(robust_graph(12), SeesPoses(), 160, 16)
-    spread = OnlineTrajectory(robust_graph(12), SeesPoses(), 160, 16, iterations_per_step=1)
-    for count, step in enumerate(steps, start=1):
-        expected, update = at_once.update(step), spread.update(step)
-        if count % 8 == 7:
-            np.testing.assert_allclose(update.pose_xyyaw, expected.pose_xyyaw, atol=1e-9)
+            assert after.correct() is None
+            continue
+        correction = after.correct()
+        assert expected.optimized and correction is not None and correction.optimized
+        np.testing.assert_allclose(correction.pose_xyyaw, expected.pose_xyyaw, atol=1e-9)
+        a, b = after.trajectory(), before.trajectory()
+        assert a is not None and b is not None
+        np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
 
 
 def test_loops_found_in_a_pause_are_closed_after_it() -> None:
@@ -171,15 +150,16 @@ def test_loops_found_in_a_pause_are_closed_after_it() -> None:
     assert rmse(whole.poses_xyyaw[lap], truth[lap]) < 0.5 * rmse(whole.odometry_xyyaw[lap], truth[lap])
 
 
-def test_finish_ends_what_has_begun() -> None:
+def test_finish_does_what_is_due() -> None:
     steps, _ = drive(80)
     at_once = OnlineTrajectory(robust_graph(), SeesPoses())
-    spread = OnlineTrajectory(robust_graph(), SeesPoses(), iterations_per_step=1)
+    later = OnlineTrajectory(robust_graph(), SeesPoses(), iterations_per_step=1)
     for step in steps:
         at_once.update(step)
-        spread.update(step)
-    spread.finish()
-    a, b = spread.trajectory(), at_once.trajectory()
+        later.update(step)
+    assert later.unfinished
+    later.finish()
+    a, b = later.trajectory(), at_once.trajectory()
     assert a is not None and b is not None
     np.testing.assert_array_equal(a.poses_xyyaw, b.poses_xyyaw)
 

@@ -568,7 +568,7 @@ def test_loading_checks_that_the_networks_belong_together(tmp_path: Path) -> Non
     assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_spread_over_steps_loops_are_judged_anew_more_often_than_the_network_runs(
+def test_with_answers_first_loops_are_judged_anew_more_often_than_the_network_runs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     optimizer, kinds = small_optimizer("loops", True), []

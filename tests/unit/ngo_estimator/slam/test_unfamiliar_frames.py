@@ -60,7 +60,7 @@ def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back(
     late = [replace(step, unlikeness=2.0 if k >= told else 0.0) for k, step in enumerate(steps)]
     core = OnlineTrajectory.load(WEIGHTS / "maze2d", world="maze2d")
     trajectory, _ = corrected(late, core)
-    assert core._graph.loop_frames[:, 1].max() <= told - 16
+    assert core._graph.closed.pairs[:, 1].max() <= told - 16
     ends = [told - 16, told]
     found, came = (between(*of[ends]) for of in (trajectory.poses_xyyaw, trajectory.odometry_xyyaw))
     np.testing.assert_allclose(found, came, atol=1e-4)
@@ -121,7 +121,7 @@ def test_place_codes_alone_close_no_loop_across_a_blind_stretch(tmp_path: Path) 
     def across(stretch: range) -> int:
         core.reset()
         corrected([replace(step, unlikeness=2.0 if k in stretch else 0.0) for k, step in enumerate(steps)], core)
-        believed = core._graph.loop_frames[core._graph.loop_weights > 0.1]
+        believed = core._graph.closed.pairs[core._graph.closed.weight > 0.1]
         return int(((believed[:, 0] < half) & (believed[:, 1] >= half)).sum())
 
     assert across(range(0)) > 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ngo_estimator.geometry.planar_arrays import between, compose
+from ngo_estimator.geometry.se2 import between, compose
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.robust import Robust
 from training import results_graphs

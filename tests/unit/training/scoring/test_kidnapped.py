@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from training.scoring.kidnapped import FRAMES, KnownMap, MapErrors, scored, starts
+from training.scoring.kidnapped_logs import LogStart, as_arrays, starts_of, summary_of
 
 TRUTH = np.stack((np.arange(200) * 0.1, np.zeros(200), np.zeros(200)), axis=-1)
 
@@ -61,3 +62,23 @@ def test_right_late_wrong_and_silent_starts() -> None:
     later = scored(errors, 0, some)
     assert later["success"] == 1.0 and later["lost"] == pytest.approx(0.25)
     assert later["wrong_later"] == pytest.approx(15 / 45)
+
+
+def test_starts_in_logs_are_counted_as_they_were_kept() -> None:
+    found = [
+        LogStart(True, True, True, 4.0, 0.1),
+        LogStart(True, True, False, 9.0, 0.3),
+        LogStart(True, True, True, 6.0, 0.2),
+        LogStart(False, False, False, math.nan, 0.4),
+    ]
+    read = starts_of(as_arrays(found))
+    assert summary_of(read) == summary_of(found)
+    assert summary_of(read)["mapped"] == {
+        "starts": 3,
+        "right": 2,
+        "false_claims": 1,
+        "way_to_success_m": 5.0,
+        "processor_s_per_m": pytest.approx(0.2),
+    }
+    assert summary_of(read)["unmapped"]["way_to_success_m"] is None
+    assert starts_of(as_arrays([])) == []

@@ -1,11 +1,11 @@
 import numpy as np
 
 from training.scoring.lidar_bars import Bar, bars
-from training.scoring.lidar_scores import Scored
+from training.scoring.table import Measured
 
 
-def scored(**errors: float | list[float]) -> Scored:
-    return Scored({name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in errors.items()})
+def scored(**errors: float | list[float]) -> Measured:
+    return Measured({name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in errors.items()})
 
 
 def by_name(found: list[Bar]) -> dict[str, Bar]:

@@ -27,9 +27,13 @@ class GrowingRows:
         self._buffer[self._used] = row
         self._used += 1
 
-    def restore(self, arrays: Arrays, name: str) -> None:
-        """Take all rows from the array ``name``, in place of those here; raises ``StateError``."""
-        rows = taken(arrays, name, self._buffer.dtype, -1, *self._buffer.shape[1:])
+    def state(self) -> Arrays:
+        """All rows."""
+        return {"rows": self.values.copy()}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take the rows of a ``state()``, in place of those here; raises ``StateError``."""
+        rows = taken(arrays, "rows", self._buffer.dtype, -1, *self._buffer.shape[1:])
         self._used = len(rows)
         self._buffer = rows if len(rows) else self._buffer
 
@@ -78,7 +82,7 @@ class SlidingRows:
 
     def state(self) -> Arrays:
         """The rows that are kept, and how many are not."""
-        return {"rows": self._buffer[: self._used], "dropped": np.array(self._dropped)}
+        return {"rows": self._buffer[: self._used].copy(), "dropped": np.array(self._dropped)}
 
     def restore(self, arrays: Arrays) -> None:
         """Take the rows of a ``state()``, in place of those here; raises ``StateError``."""

@@ -1,1 +1,1 @@
-"""Planar geometry: poses, covariances, registration of range scans."""
+"""Planar geometry: poses, covariances, registration of range scans. Of the paper there are r2g and g2r (``se2``)."""

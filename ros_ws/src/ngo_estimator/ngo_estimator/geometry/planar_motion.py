@@ -1,4 +1,4 @@
-"""Planar rigid motions as numpy arrays ``[x, y, yaw]`` (m, m, rad; REP-103), compiled: ``se2`` without torch.
+"""Planar rigid motions ``[x, y, yaw]`` (m, m, rad; REP-103) of single poses, compiled; ``se2`` has those of many.
 
 Poses have the shape ``(3,)`` where nothing else is said. ``compose(a, b)`` is ``a @ b``; the yaw of every result lies
 in ``(-pi, pi]``.
@@ -143,32 +143,39 @@ def squared_deviations(pose: Array, mean: Array, information: Array) -> float:
 
 
 @njit(cache=True)
-def frames_between_nodes(nodes: Array, odometry: Array, block: int, shares: Array) -> Array:
-    """Poses ``(frames, 3)`` of all frames, of which each ``block``-th is a node; those behind the last follow it.
+def frames_between_nodes(nodes: Array, odometry: Array, at: Array, joins: Array) -> Array:
+    """Poses ``(frames, 3)`` of all frames, some of which are nodes; those behind the last follow it.
 
-    Between two nodes the correction is spread over the frames.
+    What nodes moved against each other is spread evenly over the frames between, or is all in the step that joins.
 
     Args:
-        nodes: corrected poses ``(blocks + 1, 3)``.
+        nodes: corrected poses ``(nodes, 3)``.
         odometry: poses ``(frames, 3)`` by odometry.
-        shares: of a block's correction in that of each of its frames ``(1 or blocks, block)``.
+        at: the frames that are nodes ``(nodes,)``, ascending from 0.
+        joins: frames ``(n,)``, ascending, to which a step leads that another odometry made.
     """
     poses = np.empty_like(odometry)
     poses[0] = nodes[0]
-    blocks = len(nodes) - 1
-    for b in range(blocks + 1):
-        first, last = b * block, min((b + 1) * block, len(odometry) - 1)
+    joined, last_node = 0, len(nodes) - 1
+    for b in range(last_node + 1):
+        first = at[b]
+        last = at[b + 1] if b < last_node else len(odometry) - 1
         x0, y0, yaw0 = odometry[first]
         cos0, sin0 = math.cos(yaw0), math.sin(yaw0)
         x, y, yaw = nodes[b]
         cos, sin = math.cos(yaw), math.sin(yaw)
         moved = np.zeros(3)
-        if b < blocks:
+        if b < last_node:
             moved = between(nodes[b], nodes[b + 1]) - between(odometry[first], odometry[last])
             moved[2] = wrap(moved[2])
-        share = shares[b if len(shares) > 1 and b < blocks else 0]
+        join = 0
+        while joined < len(joins) and joins[joined] <= last:
+            join = joins[joined]
+            joined += 1
         for k in range(first + 1, last + 1):
-            part = share[k - first - 1]
+            part = (k - first) / (last - first)
+            if join > 0:
+                part = 1.0 if k >= join else 0.0
             to_x, to_y = odometry[k, 0] - x0, odometry[k, 1] - y0
             in_x = cos0 * to_x + sin0 * to_y + part * moved[0]
             in_y = -sin0 * to_x + cos0 * to_y + part * moved[1]
@@ -189,16 +196,5 @@ def carried(pose: Array, covariance: Array, odometry: Array, relative: Array, va
     last = pose
     for k in range(len(relative)):
         last = compose(pose, between(odometry[0], odometry[k + 1]))
-        yaw = last[2] - relative[k, 2]
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        lever = np.eye(3)
-        lever[0, 2] = -(sin * relative[k, 0] + cos * relative[k, 1])
-        lever[1, 2] = cos * relative[k, 0] - sin * relative[k, 1]
-        result = np.zeros((3, 3))
-        for i in range(3):
-            for j in range(3):
-                for m in range(3):
-                    for n in range(3):
-                        result[i, j] += lever[i, m] * covariance[m, n] * lever[j, n]
-        covariance = result + turned_covariance(yaw, np.diag(variance[k]))
+        covariance = propagated(covariance, last, relative[k], np.diag(variance[k]))
     return last, covariance

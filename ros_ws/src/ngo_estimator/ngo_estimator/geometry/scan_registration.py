@@ -1,6 +1,6 @@
 """Registration of range scans: where was this frame, seen from that one, so that their walls coincide?
 
-Not in the paper. A measurement of a network is the start, and its deviations a prior; each step pairs the points of one
+A measurement of a network is the start, and its deviations a prior; each step pairs the points of one
 scan with the lines between neighbouring points of the other, and takes a robust Gauss-Newton step on their distances
 (point-to-line ICP: Censi 2008), with less and less tolerance.
 """

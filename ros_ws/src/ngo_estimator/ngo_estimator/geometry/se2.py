@@ -23,7 +23,7 @@ Values = TypeVar("Values", "Tensor", NDArray[Any])
 
 def library(values: Values) -> Any:
     """The library of these, numpy or torch: what is called here has one name in both, and ``axis`` for its axes."""
-    return np if isinstance(values, np.ndarray) else sys.modules["torch"]
+    return np if isinstance(values, np.ndarray | np.generic) else sys.modules["torch"]
 
 
 def wrap(angle: Values) -> Values:

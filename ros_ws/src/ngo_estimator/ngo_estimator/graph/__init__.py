@@ -1,1 +1,1 @@
-"""The pose graph: nodes, key frames, factors, and the solver without gradients."""
+"""The pose graph: nodes, key frames, factors, and the solver without gradients. Not in the paper."""

@@ -1,6 +1,6 @@
 """Pose selection: a bounded choice of poses from before the window, which keeps old places recognisable.
 
-Not in the paper, whose trajectories end before they grow too long. Poses that leave the window come here; when there
+Poses that leave the window come here; when there
 are too many, those go whose place is told and covered by others. What stays forms a chain from the origin to the
 window, so that a correction reaches everything between.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ngo_estimator.data.state_arrays import Arrays, taken, taken_indices
+from ngo_estimator.data.state_arrays import Arrays, taken
 from ngo_estimator.geometry import se2
 
 SLACK = 32
@@ -116,23 +116,19 @@ class KeyFrames:
         own = {name: getattr(self, name) for name in ("nodes", "relative", "variance", "embeddings")}
         return {**own, "codes": codes, "poses": poses}
 
-    def restore(self, arrays: Arrays, below: int, embeddings: tuple[int, ...], codes: tuple[int, ...]) -> None:
-        """Take the key frames of a ``state()``, in place of those here; raises ``StateError``.
-
-        Their nodes are ``below`` a number. ``embeddings`` ``(block, embedding_size)`` and ``codes`` ``(frames,
-        code_length)`` are the shapes of one key frame.
-        """
+    def restore(self, arrays: Arrays) -> None:
+        """Take the key frames of a ``state()``, in place of those here; raises ``StateError``."""
         self._frames, self._stacked = [], {}
         if not arrays:
             return
-        nodes = taken_indices(arrays, "nodes", below)
+        nodes = taken(arrays, "nodes", np.int64, -1)
         count = len(nodes)
         columns = (
             taken(arrays, "relative", np.float64, count, 3),
             taken(arrays, "variance", np.float64, count, 3),
-            taken(arrays, "embeddings", np.float32, count, *embeddings),
-            taken(arrays, "codes", np.float32, count, *codes),
-            taken(arrays, "poses", np.float64, count, codes[0], 3),
+            taken(arrays, "embeddings", np.float32, count, -1, -1),
+            codes := taken(arrays, "codes", np.float32, count, -1, -1),
+            taken(arrays, "poses", np.float64, count, codes.shape[1], 3),
         )
         self._frames = [KeyFrame(node, *rows) for node, *rows in zip(nodes.tolist(), *columns, strict=True)]
 

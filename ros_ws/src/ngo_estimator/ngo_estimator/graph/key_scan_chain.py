@@ -8,10 +8,11 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
-from ngo_estimator.geometry import planar_arrays
+from ngo_estimator.data.state_arrays import require
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import bounded
-from ngo_estimator.geometry.planar_motion import between, compose, propagated
+from ngo_estimator.geometry.planar_motion import compose, propagated
+from ngo_estimator.graph.frames import Frames
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.scan_loop_thinning import largest_variances
 
@@ -24,9 +25,7 @@ class KeyScanChain:
 
     def __init__(self, floor: np.ndarray) -> None:
         self._floor = floor
-        self._odometry = GrowingRows((3,), np.float64)  # of all frames by relative poses alone, the first at the origin
-        self._odometry.append(np.zeros(3))
-        self._frames = GrowingRows((), np.int64)  # of the nodes
+        self._frames = Frames()
         self._nodes = GrowingRows((3,), np.float64)
         self._steps = GrowingRows((3,), np.float64)
         self._step_covariance = GrowingRows((3, 3), np.float64)  # for the optimisation
@@ -35,8 +34,7 @@ class KeyScanChain:
         self._key_stamp_ns = 0
         self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
         self._end = np.zeros((3, 3))  # covariance of the last node in the map
-        self._before = np.zeros((1, 3))
-        self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on, nodes all of them
+        self._before = np.zeros((0, 3))  # poses of the nodes before the last ``move``
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -49,7 +47,7 @@ class KeyScanChain:
     @property
     def frames(self) -> np.ndarray:
         """The frames that are nodes ``(keys,)``."""
-        return self._frames.values
+        return self._frames.nodes
 
     @property
     def edges(self) -> np.ndarray:
@@ -90,16 +88,13 @@ class KeyScanChain:
 
     def begin_at(self, stamp_ns: int) -> None:
         """Take the first frame, which is a node."""
-        self._frames.append(0)
         self._nodes.append(np.zeros(3))
         self._key_stamp_ns = stamp_ns
 
     def append(self, relative: np.ndarray, covariance: np.ndarray, joins: bool) -> None:
         """Take a step ``(3,)`` to the next frame with its covariance ``(3, 3)``; see ``ScanGraph.append``."""
-        self._odometry.append(compose(self._odometry.values[-1], relative.astype(np.float64)))
-        if joins:
-            self._joins.append(len(self._odometry) - 1)
-        self._since = propagated(self._since, self._since_node(), relative, covariance)
+        self._frames.append(relative, joins)
+        self._since = propagated(self._since, self._frames.since_node, relative, covariance)
 
     def append_node(self, key: KeyScanStep, joins: bool) -> None:
         """Make the newest frame, which ends at a key scan, a node."""
@@ -110,7 +105,7 @@ class KeyScanChain:
         else:
             covariance = published = bounded(self._since)
         covariance, published = covariance + self._floor, published + self._floor
-        since = self._since_node()
+        since = self._frames.since_node
         self._steps.append(since)
         self._step_covariance.append(covariance)
         self._step_variance.append(largest_variances(covariance[None])[0])
@@ -118,7 +113,7 @@ class KeyScanChain:
         pose = compose(self._nodes.values[-1], since)
         self._end = propagated(self._end, pose, since, published)
         self._nodes.append(pose)
-        self._frames.append(len(self._odometry) - 1)
+        self._frames.add_node()
         self._key_stamp_ns = key.scan.stamp_ns
         self._since = np.zeros((3, 3))
 
@@ -128,79 +123,36 @@ class KeyScanChain:
         self._nodes.values[:] = nodes
         self._end = end
 
-    def _since_node(self) -> np.ndarray:
-        """Pose ``(3,)`` of the newest frame, seen from the last node."""
-        since: np.ndarray = between(self._odometry.values[int(self._frames.values[-1])], self._odometry.values[-1])
-        return since
-
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
-        since = self._since_node()
+        since = self._frames.since_node
         pose = compose(self._nodes.values[-1], since)
         return pose, propagated(self._end, pose, since, self._since)
 
     def frame_poses(self, before: bool, nodes: np.ndarray | None) -> np.ndarray:
         """Poses of all frames ``(frames, 3)``, as they are or as they were before the last ``move``.
 
-        The difference between two nodes and their odometry is spread evenly over the frames between. With ``nodes``
-        ``(nodes, 3)`` these are the poses of the nodes.
+        With ``nodes`` ``(nodes, 3)`` these are the poses of the nodes.
         """
         nodes = (self._nodes.values if nodes is None else nodes).copy()
         if before:  # nodes that came since follow the last of those
             last = len(self._before) - 1
-            since = planar_arrays.between(nodes[last], nodes[last:])
+            since = se2.between(nodes[last], nodes[last:])
             nodes[: last + 1] = self._before
-            nodes[last:] = planar_arrays.compose(self._before[-1], since)
-        odometry, at = self._odometry.values, self._frames.values
-        starts, ends = nodes, odometry[at]
-        frames = np.arange(len(odometry))
-        segment = np.searchsorted(at, frames, side="right") - 1
-        within = planar_arrays.between(ends[segment], odometry)
-        bent = np.zeros_like(starts)
-        bent[:-1] = planar_arrays.between(starts[:-1], starts[1:]) - planar_arrays.between(ends[:-1], ends[1:])
-        bent[:, 2] = planar_arrays.wrap(bent[:, 2])
-        share = (frames - at[segment]) / np.append(np.diff(at), 1)[segment]
-        ends_at = np.append(at[1:], -1)  # the motion that nobody saw is the one that is corrected
-        share[np.isin(ends_at, self._joins.values)[segment]] = 0.0
-        return planar_arrays.compose(starts[segment], within + share[:, None] * bent[segment])
+            nodes[last:] = se2.compose(self._before[-1], since)
+        return self._frames.poses(nodes)
 
-    def _rows(self) -> dict[str, GrowingRows]:
-        return {
-            "odometry": self._odometry,
-            "frames": self._frames,
-            "joins": self._joins,
-            "nodes": self._nodes,
-            "steps": self._steps,
-            "step_covariance": self._step_covariance,
-            "published_covariance": self._published_covariance,
-            "step_variance": self._step_variance,
-        }
+    SAVED = (
+        "_frames", "_nodes", "_steps", "_step_covariance", "_published_covariance",
+        "_step_variance", "_key_stamp_ns", "_since", "_end", "_before",
+    )  # fmt: skip
 
-    def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``."""
-        return {
-            **{name: rows.values for name, rows in self._rows().items()},
-            "key_stamp_ns": np.array(self._key_stamp_ns, np.int64),
-            "since": self._since,
-            "end": self._end,
-            "before": self._before,
-        }
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        for name, rows in self._rows().items():
-            rows.restore(arrays, name)
-        self._key_stamp_ns = taken_integer(arrays, "key_stamp_ns", -(2**63))
-        self._since, self._end = taken(arrays, "since", np.float64, 3, 3), taken(arrays, "end", np.float64, 3, 3)
-        self._before = taken(arrays, "before", np.float64, -1, 3)
-        keys, frames = len(self), self._frames.values
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        keys = len(self)
         of_steps = (self._steps, self._step_covariance, self._published_covariance, self._step_variance)
         require(
-            keys > 0 and len(frames) == keys and {len(rows) for rows in of_steps} == {keys - 1},
+            keys > 0 and len(self.frames) == keys and {len(rows) for rows in of_steps} == {keys - 1},
             f"there are not {keys} key scans, and a step less",
         )
-        ordered = frames[0] == 0 and (np.diff(frames) > 0).all() and frames[-1] < len(self._odometry)
-        joined = np.isin(self._joins.values, frames[1:]).all()
-        require(
-            bool(ordered and joined) and 1 <= len(self._before) <= keys, "frames or nodes are named that are not there"
-        )
+        require(len(self._before) <= keys, "nodes were moved that are not there")

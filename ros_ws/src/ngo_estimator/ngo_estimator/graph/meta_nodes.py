@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
+from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between, between, compose
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
@@ -102,30 +102,15 @@ class MetaNodes:
             nodes[self._gone] = se2.compose(new[segment], relative + share[:, None] * bent[segment]).numpy()
         return nodes
 
-    def state(self) -> Arrays:
-        """All of them, for ``restore``."""
-        return {
-            "nodes": self.poses,
-            "first": np.array(self.first),
-            "kept": self._kept,
-            "gone": self._gone,
-            "active": self._moved,
-            "before": self._before,
-            **under("keys", self.keys.state()),
-        }
+    SAVED = ("_poses", "first", "keys", "_kept", "_gone", "_moved", "_before")
 
-    def restore(self, arrays: Arrays, embeddings: tuple[int, ...], codes: tuple[int, ...]) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``.
-
-        ``embeddings`` and ``codes`` are shapes as of ``KeyFrames.restore``.
-        """
-        self._poses.restore(arrays, "nodes")
-        self.first = taken_integer(arrays, "first")
-        self.keys.restore(part(arrays, "keys"), self.blocks + 1, embeddings, codes)
-        self._kept = taken(arrays, "kept", np.float64, -1, 3)
-        self._gone, self._moved = (taken_indices(arrays, name, self.blocks + 1) for name in ("gone", "active"))
-        self._before = taken(arrays, "before", np.float64, len(self._moved), 3)
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        keys = self.keys.nodes
+        for name, nodes in (("key frames", keys), ("gone", self._gone), ("active", self._moved)):
+            require_ascending(nodes, name, self.blocks + 1)
+        require(len(self._moved) == len(self._before), "poses of other nodes than those that moved are given")
         require(
-            self.first == (self.keys.nodes[-1] + 1 if len(self.keys) else 0) and len(self._kept) <= len(self.keys),
+            self.first == (keys[-1] + 1 if len(keys) else 0) and len(self._kept) <= len(keys),
             "key frames do not end where the window begins",
         )

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_arrays import between, wrap
+from ngo_estimator.geometry.se2 import between, wrap
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Which loops a graph needs: one between keys that it knows against each other already tells it nothing new.
 
-Not in the paper. What is kept is a spanner of the graph: where a loop is left out, a way over others is nearly as sure.
+What is kept is a spanner of the graph: where a loop is left out, a way over others is nearly as sure.
 The cost of an optimisation then follows what the robot saw, and not how often it saw it.
 """
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.row_buffers import SlidingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, under
+from ngo_estimator.data.state_arrays import Arrays, part, taken, under
 from ngo_estimator.graph.normal_equations import FactorisedInformation
 
 _MOST_DRIFT = 4.0
@@ -64,17 +64,16 @@ class SolvedGraph:
 
     def state(self) -> Arrays:
         """The same as arrays, for ``from_state``."""
-        own = {"result_keys": self.keys, "result_ends": np.array((self.first, self.last)), "end": self.end}
+        own = {"keys": self.keys, "ends": np.array((self.first, self.last)), "end": self.end}
         return own if self.information is None else own | under("information", self.information.state())
 
     @classmethod
-    def from_state(cls, arrays: Arrays, blocks: int) -> "SolvedGraph":
-        """Take a ``state()``, where there are so many blocks; raises ``StateError``."""
-        first, last = taken(arrays, "result_ends", np.int64, 2).tolist()
-        require(0 <= first <= last <= blocks, "an optimisation is of nodes that are not there")
+    def from_state(cls, arrays: Arrays) -> "SolvedGraph":
+        """Take a ``state()``; raises ``StateError``."""
+        first, last = taken(arrays, "ends", np.int64, 2).tolist()
         information = part(arrays, "information")
         return cls(
-            taken_indices(arrays, "result_keys", blocks + 1),
+            taken(arrays, "keys", np.int64, -1),
             first,
             last,
             taken(arrays, "end", np.float64, 3, 3),

@@ -1,6 +1,6 @@
 """How well a graph of key scans knows one of them against another: the covariance along the surest way between them.
 
-Not in the paper. One way tells less than all of them together, so that the covariance is no smaller than the graph's.
+One way tells less than all of them together, so that the covariance is no smaller than the graph's.
 """
 
 import numpy as np

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence, Set
 import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_indices, taken_integer
+from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.loops.walls_seen_through import PROFILE_BINS, range_profile
 
@@ -76,14 +76,14 @@ class KeyScanViews:
         return {
             "keys": np.array(len(self._profiles)),
             "profiles": np.array(profiles, np.float32).reshape(-1, PROFILE_BINS),
-            "middles": self._middles.values,
+            **under("middles", self._middles.state()),
             "forgotten": np.array(sorted(self._forgotten), np.int64),
         }
 
     def restore(self, arrays: Arrays) -> None:
         """Take a ``state()``, in place of what is here; raises ``StateError``."""
         count = taken_integer(arrays, "keys")
-        self._middles.restore(arrays, "middles")
+        self._middles.restore(part(arrays, "middles"))
         require(len(self._middles) == count, f"there are not {count} middles of key scans")
         forgotten = taken_indices(arrays, "forgotten", count)
         self._forgotten = set(forgotten.tolist())

@@ -1,6 +1,6 @@
 """Loop closures: the record of loops, and the search for them in whole trajectories.
 
-Not in the paper, whose attention has to learn all this. A loop says where a meta-pose lies relative to an earlier
+A loop says where a meta-pose lies relative to an earlier
 frame.
 """
 

@@ -13,16 +13,17 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, under
+from ngo_estimator.data.row_buffers import SlidingRows
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between
+from ngo_estimator.graph.frames import Frames
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
-from ngo_estimator.loops.kept_loops import KeptLoops
 from ngo_estimator.loops.loop_closure import Loops, LoopSearch, may_show_one_place
 from ngo_estimator.loops.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.loops.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, registered
 from ngo_estimator.loops.place_ambiguity import looks_like_everything, places_by_odometry
+from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.loops.place_map import PlaceMap
 from ngo_estimator.networks.place_encoder import PairHead
 
@@ -72,41 +73,29 @@ class OnlineLoops:
     """Finds and keeps the loops of a trajectory.
 
     Args:
-        odometry: global poses of all frames by odometry, the first frame's in front; its owner appends to it.
+        frames: of the trajectory; their owner appends to them.
         window: blocks in the window.
     """
 
-    def __init__(self, pair_head: PairHead, search: LoopSearch, block: int, window: int, odometry: GrowingRows) -> None:
+    def __init__(self, pair_head: PairHead, search: LoopSearch, block: int, window: int, frames: Frames) -> None:
         self._pair_head, self._search, self._block = pair_head, search, block
-        self._odometry = odometry
+        self._frames = frames
         keep = window * block + 2 * block + MARGIN
         self._codes = SlidingRows((pair_head.config.code_length,), np.float32, keep)
         self._embeddings = SlidingRows((pair_head.config.embedding_size,), np.float32, keep)
-        self._kept = KeptLoops.none()
+        self._kept = PlaceLoops.none()
         self._candidates: _Candidates | None = None
 
     def __len__(self) -> int:
         return len(self._kept)
 
-    def state(self) -> Arrays:
-        """All that the search keeps, for ``restore``."""
-        kept = under("kept", self._kept.state())
-        return {**under("codes", self._codes.state()), **under("embeddings", self._embeddings.state()), **kept}
+    SAVED = ("_codes", "_embeddings", "_kept")
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        self._codes.restore(part(arrays, "codes"))
-        self._embeddings.restore(part(arrays, "embeddings"))
-        self._kept = KeptLoops.from_state(part(arrays, "kept"))
-        frames, newest = len(self._odometry) - 1, int(self._kept.end.max(initial=0)) * self._block
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        frames, newest = len(self._frames) - 1, int(self._kept.end.max(initial=0)) * self._block
         require(len(self._codes) == len(self._embeddings) == frames, f"there are not {frames} place codes")
         require(newest <= frames, f"a loop ends at frame {newest} of {frames}")
-
-    @property
-    def key_frame_shapes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Shapes of the embeddings and of the codes of a key frame."""
-        config = self._pair_head.config
-        return (self._block, config.embedding_size), (self._block + 2 * MARGIN, config.code_length)
 
     def append(self, place_code: np.ndarray) -> None:
         """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
@@ -165,16 +154,16 @@ class OnlineLoops:
         return frames
 
     @torch.inference_mode()
-    def measure(self) -> KeptLoops:
+    def measure(self) -> PlaceLoops:
         """Loops to the frames that ``look`` found last, measured by their places; those from key frames last."""
         candidates, self._candidates = self._candidates, None
         if candidates is None:
-            return KeptLoops.none()
+            return PlaceLoops.none()
         frames = candidates.frames
         told = candidates.measured, candidates.log_scale
         measurement = registered(self._pair_head, candidates.views, *told, self._search.registrations)
         of_frame = torch.from_numpy(np.stack([frame.pose for frame in frames])).float()
-        found = KeptLoops.found(
+        found = PlaceLoops.found(
             np.array([frame.node for frame in frames]),
             candidates.node,
             np.array([frame.frame for frame in frames]),
@@ -183,12 +172,12 @@ class OnlineLoops:
             np.array([frame.similarity for frame in frames]),
             overlap=False,
         )
-        self._kept = self._kept.and_also(found)
+        self._kept = self._kept.extended(found)
         return found
 
     def _looks_like_everything(self, similarity: np.ndarray, first: int) -> bool:
         """Whether the newest frame looks like most places, by its similarity to the frames after step ``first`` on."""
-        at = torch.from_numpy(self._odometry.values[first + 1 : first + 1 + len(similarity), :2])
+        at = torch.from_numpy(self._frames.odometry[first + 1 : first + 1 + len(similarity), :2])
         places = places_by_odometry(at, 2.0 * self._pair_head.config.offset_scale_m)
         alike = torch.from_numpy(similarity)
         return bool(looks_like_everything(alike, places, torch.ones_like(alike, dtype=torch.bool)))
@@ -197,7 +186,7 @@ class OnlineLoops:
         """Similarity ``(n, frames)`` of the frames of blocks to the one after step ``last``, 0 for impossible ones."""
         if not self._search.drift_m:
             return similarity
-        odometry, steps = self._odometry.values, blocks[:, None] * self._block + np.arange(self._block)
+        odometry, steps = self._frames.odometry, blocks[:, None] * self._block + np.arange(self._block)
         earlier, newest = (torch.from_numpy(odometry[number + 1]) for number in (steps, last))
         possible = may_show_one_place(se2.between(earlier, newest), torch.from_numpy(last - steps), self._search)
         return np.where(possible.numpy(), similarity, 0.0)
@@ -216,7 +205,7 @@ class OnlineLoops:
     def _in_window(self, node: int, frame: int, similarity: float, last: int, offsets: _Offsets) -> _EarlierFrame:
         """A frame of the window, seen from ``node``; ``last`` is the newest frame."""
         at = np.clip(frame + _at(offsets, 0), 0, last)
-        odometry = self._odometry.values
+        odometry = self._frames.odometry
         poses = _seen_from(odometry[node * self._block], odometry[np.append(at, frame) + 1])
         return _EarlierFrame(node, frame, similarity, poses[-1], self._codes.at(at), poses[:-1])
 
@@ -231,7 +220,7 @@ class OnlineLoops:
         """Views of the pairs of these frames and the one before ``node``."""
         last = node * self._block - 1
         at = np.clip(last + _at(offsets, 1), 0, last)
-        odometry = self._odometry.values
+        odometry = self._frames.odometry
         codes = torch.from_numpy(np.stack([frame.codes for frame in frames], axis=1))
         later = torch.from_numpy(self._codes.at(at)).unsqueeze(1).expand_as(codes)
         from_frame = np.stack([_seen_from(frame.pose, frame.poses) for frame in frames], axis=1)
@@ -239,7 +228,7 @@ class OnlineLoops:
         return PairViews(codes, later, torch.from_numpy(from_frame).float(), to_end.expand(-1, len(frames), -1))
 
     @torch.inference_mode()
-    def find_overlaps(self, block: int, first: int, nodes: np.ndarray, keys: KeyFrames | None = None) -> KeptLoops:
+    def find_overlaps(self, block: int, first: int, nodes: np.ndarray, keys: KeyFrames | None = None) -> PlaceLoops:
         """Loops that end behind the block of this number, from nodes that share its walls under the current poses.
 
         They replace the overlaps from the window to this block that were found under earlier poses.
@@ -251,17 +240,17 @@ class OnlineLoops:
         """
         scans = self._pair_head.config.registration
         if scans is None or self._search.overlaps == 0:
-            return KeptLoops.none()
+            return PlaceLoops.none()
         end, last = block + 1, (block + 1) * self._block - 1
         before = self._kept.overlap & (self._kept.end == end) & (self._kept.start >= first)
         if before.any():
-            self._kept = self._kept.where(~before)
+            self._kept = self._kept[~before]
         in_window = np.arange(max(1, first), end - self._search.min_separation + 1)
         # The origin, the first key frame, has no code of its own.
         frames = [] if keys is None else [keys.frame(k) for k in range(1, len(keys))]
         earlier = in_window if keys is None else np.concatenate((keys.nodes[1:], in_window))
         if len(earlier) == 0:
-            return KeptLoops.none()
+            return PlaceLoops.none()
         codes = np.concatenate(
             (*[key.codes[MARGIN - 1 : MARGIN] for key in frames], self._codes.at(in_window * self._block - 1))
         )
@@ -271,7 +260,7 @@ class OnlineLoops:
         share[earlier > end - self._search.min_separation] = -np.inf
         best = self._most_similar(share[:, None], earlier, self._search.per_pose)
         chosen = [index for index, _, value in best if value >= LEAST_SHARED]
-        found = KeptLoops.none()
+        found = PlaceLoops.none()
         if chosen:
             # A node's own frame is the last one before its block.
             pairs = [
@@ -284,7 +273,7 @@ class OnlineLoops:
             of_ranges = views._replace(a=self._ranges(views.a), b=self._ranges(views.b))
             measurement, registered = measure_overlaps(scans, of_ranges, relative[chosen], self._search.registrations)
             embeddings = self._pair_head.embed(torch.stack((views.a[0], views.b[0])))
-            found = KeptLoops.found(
+            found = PlaceLoops.found(
                 earlier[chosen],
                 end,
                 np.array([pair.frame for pair in pairs]),
@@ -292,18 +281,17 @@ class OnlineLoops:
                 np.full(len(pairs), OVERLAP_LOGIT),
                 (embeddings[0] * embeddings[1]).sum(-1).double().numpy(),
                 overlap=True,
-            ).where(registered.numpy())
-        self._kept = self._kept.and_also(found)
+            )[registered.numpy()]
+        self._kept = self._kept.extended(found)
         return found
 
     def _ranges(self, codes: Tensor) -> Tensor:
         return codes[..., self._pair_head.config.code_size :].contiguous()
 
-    def limit_drift(self, found: KeptLoops, most_drift: np.ndarray) -> None:
+    def limit_drift(self, found: PlaceLoops, most_drift: np.ndarray) -> None:
         """Set how far the loops that were found last may be off at most: variances ``(n, 3)``."""
         newest = slice(len(self._kept) - len(found), None)
-        joined = (self._kept.start[newest], found.start), (self._kept.end[newest], found.end)
-        if not all(np.array_equal(kept, of_found) for kept, of_found in joined):
+        if not np.array_equal(self._kept.pairs[newest], found.pairs):
             raise ValueError("other loops were found since; expected the loops that were found last")
         self._kept.most_drift[newest] = most_drift
 
@@ -311,7 +299,7 @@ class OnlineLoops:
         """The key frame that ``node`` becomes when it leaves the window."""
         first = node * self._block
         at = np.maximum(np.arange(first - MARGIN, first + self._block + MARGIN), 0)
-        odometry = self._odometry.values
+        odometry = self._frames.odometry
         embeddings = self._embeddings.slice(first, first + self._block).copy()
         poses = _seen_from(odometry[first], odometry[at + 1])
         return KeyFrame(node, relative, variance, embeddings, self._codes.at(at), poses)
@@ -333,7 +321,7 @@ class OnlineLoops:
         self._kept = self._kept.without_doubtful(first, _MOST_TO_KEY_FRAMES)
 
     def reattach(self, nodes: np.ndarray, stay: np.ndarray, poses: np.ndarray, variance: np.ndarray) -> None:
-        """Hang the loops of key frames that go upon the ones before them; arguments as of ``KeptLoops.reattached``."""
+        """Hang the loops of key frames that go upon the ones before them; arguments as of ``PlaceLoops.reattached``."""
         self._kept = self._kept.reattached(nodes, stay, poses, variance, self._block)
 
     def loops(self, keys: np.ndarray, first: int, blocks: int) -> tuple[Loops, np.ndarray]:
@@ -354,7 +342,7 @@ class OnlineLoops:
             )
         )
         at_ends = self._embeddings.slice(first * self._block, blocks * self._block)[self._block - 1 :: self._block]
-        return kept.where(numbers).for_optimizer(keys, first, at_ends), numbers
+        return kept[numbers].for_optimizer(keys, first, at_ends), numbers
 
     def weigh(self, numbers: np.ndarray, weights: np.ndarray, information: np.ndarray) -> None:
         """Keep the optimizer's weights ``(n,)`` and information ``(n, 3)`` of the loops of ``loops``."""
@@ -367,27 +355,25 @@ class OnlineLoops:
 
     def ties(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that each loop joins ``(n, 2)``, the earlier one first, and its last weight ``(n,)``."""
-        return np.stack((self._kept.start, self._kept.end), axis=1), self._kept.weight
+        return self._kept.pairs, self._kept.weight
 
     def recall(self, first: int) -> None:
         """Forget what the frames after the steps from number ``first`` on look like, and their loops."""
         self._codes.slice(first)[:] = 0.0
         self._embeddings.slice(first)[:] = 0.0
-        self._kept = self._kept.where(self._kept.end * self._block <= first)
+        self._kept = self._kept[self._kept.end * self._block <= first]
 
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
         kept = self._kept
-        nodes = kept.start, kept.frame, kept.end
-        return _edges(self._odometry.values, *nodes, kept.measured, numbers, self._block)
+        return _edges(self._frames.odometry, kept.pairs, kept.frame, kept.relative, numbers, self._block)
 
 
 @njit(cache=True)
 def _edges(
     odometry: np.ndarray,
-    start: np.ndarray,
+    pairs: np.ndarray,
     frame: np.ndarray,
-    end: np.ndarray,
     measured: np.ndarray,
     numbers: np.ndarray,
     block: int,
@@ -395,8 +381,8 @@ def _edges(
     frames = np.empty((len(numbers), 2), np.int64)
     begins = np.empty((len(numbers), 3))
     for k, number in enumerate(numbers):
-        frames[k] = frame[number] + 1, end[number] * block
-        begins[k] = odometry[start[number] * block]
+        frames[k] = frame[number] + 1, pairs[number, 1] * block
+        begins[k] = odometry[pairs[number, 0] * block]
     return frames, all_between(all_between(begins, odometry[frames[:, 0]]), measured[numbers])
 
 

@@ -1,6 +1,6 @@
 """Scans searched in a submap by branch and bound (Hess et al. 2016, section V), then registered (Censi 2008).
 
-Not in the paper. A pose is believed where points lie on lines, no wall is seen through, and no other pose fits nearly
+A pose is believed where points lie on lines, no wall is seen through, and no other pose fits nearly
 as well. No fit is better than a wrong one.
 """
 

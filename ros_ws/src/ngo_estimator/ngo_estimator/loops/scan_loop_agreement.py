@@ -1,13 +1,10 @@
-"""Neighbouring loops of key scans that agree with each other: a loop is accepted when enough of them do.
-
-Not in the paper.
-"""
+"""Neighbouring loops of key scans that agree with each other: a loop is accepted when enough of them do."""
 
 import math
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_arrays import between, compose, wrap
+from ngo_estimator.geometry.se2 import between, compose, wrap
 from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 

@@ -1,7 +1,4 @@
-"""Where to look for loops of a key scan: earlier places near which the robot may be, and how wide to search there.
-
-Not in the paper.
-"""
+"""Where to look for loops of a key scan: earlier places near which the robot may be, and how wide to search there."""
 
 import math
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Finds loops of 2D lidar key scans, verified without learning.
 
-Not in the paper. A new key asks for loops with earlier keys near which the robot may be. Its scan and the scans of the
+A new key asks for loops with earlier keys near which the robot may be. Its scan and the scans of the
 keys before it are searched in a submap of an earlier key. A loop is accepted where they fit, near the graph's pose, and
 a neighbouring loop agrees. No loop is better than a wrong one.
 """
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ngo_estimator.data.state_arrays import Arrays, part, under
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, turned_covariance, wrap
 from ngo_estimator.loops.key_scan_views import KeyScanViews
@@ -73,15 +73,12 @@ class ScanLoopFinder:
         """Look for no more loops at these keys, whose scans are gone."""
         self.views.forget(keys)
 
-    def state(self) -> Arrays:
-        """All that later calls depend on, for ``restore``."""
-        return {**self.views.state(), **self._submaps.state(), **under("loops", self.loops.state())}
+    SAVED = ("views", "loops", "_submaps")
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        self.views.restore(arrays)
-        self.loops = ScanLoops.restored(part(arrays, "loops"), len(self.views))
-        self._submaps.restore(arrays)
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored loops between key scans that are not there."""
+        keys, pairs = len(self.views), self.loops.pairs
+        require(bool(((pairs >= 0) & (pairs < keys)).all()), f"a loop joins key scans that are not among the {keys}")
 
     def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: LoopCandidate) -> ScanLoops | None:
         """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, require, taken
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
@@ -17,9 +16,12 @@ from ngo_estimator.loops.scan_loops import ScanLoops
 class ScanLoopSelection:
     """Selects by row among all loops that were verified, which a caller gives as ``found``."""
 
+    SAVED = ("_used", "doubted")
+
     def __init__(self, config: ScanGraphConfig) -> None:
         self._config = config
-        self._doubted = np.zeros(0, np.int64)  # accepted loops for which too few speak as yet
+        self.doubted = np.zeros(0, np.int64)
+        """Accepted loops for which too few speak as yet."""
         self._used = GrowingRows((), np.int64)
 
     def __len__(self) -> int:
@@ -36,7 +38,7 @@ class ScanLoopSelection:
         A search tells a place from others within its window. A robot that may be farther away may be in another place
         that looks alike, which was not searched: then more loops must agree. A loop waits for as long as more may.
         """
-        rows = np.concatenate((self._doubted, fresh))
+        rows = np.concatenate((self.doubted, fresh))
         if len(rows) == 0:
             return rows
         config, windows = self._config, self._config.windows
@@ -52,7 +54,7 @@ class ScanLoopSelection:
         searched = (metres <= windows.most_m) & (turn <= math.radians(windows.most_deg))
         believed = searched | (loops.agreeing >= config.agreeing_beyond)
         may_grow = loops.pairs[:, 1] >= len(chain) - 1 - config.loops.neighbour_keys
-        self._doubted = rows[~believed & may_grow]
+        self.doubted = rows[~believed & may_grow]
         return rows[believed]
 
     def use(self, rows: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> bool:
@@ -74,19 +76,3 @@ class ScanLoopSelection:
         for row in rows[needed]:
             self._used.append(row)
         return bool(surprising.any())
-
-    def state(self) -> Arrays:
-        """All that later selections depend on, for ``restore``."""
-        return {"used": self._used.values, "doubted": self._doubted}
-
-    def restore(self, arrays: Arrays, found: int) -> None:
-        """Take a ``state()`` where so many loops were verified; raises ``StateError``."""
-        self._used.restore({"used": taken_rows(arrays, "used", found)}, "used")
-        self._doubted = taken_rows(arrays, "doubted", found)
-
-
-def taken_rows(arrays: Arrays, name: str, found: int) -> np.ndarray:
-    """The rows ``name`` ``(n,)`` among so many loops; raises ``StateError``."""
-    rows = taken(arrays, name, np.int64, -1)
-    require(bool(((rows >= 0) & (rows < found)).all()), f"'{name}' names loops that are not among the {found}")
-    return rows

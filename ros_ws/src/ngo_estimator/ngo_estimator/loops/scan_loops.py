@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.data.state_arrays import Arrays, require, taken
+from ngo_estimator.loops.loop_record import LoopRecord, rows
 
 EVIDENCE = ("response", "second_peak", "on_lines", "seen_through", "disagreement", "agreeing")
 """Columns of a loop's evidence.
@@ -14,80 +14,20 @@ sightings through walls, the distance from the graph's pose in deviations (a thi
 neighbouring loops that agree.
 """
 
-_ROWS: dict[str, tuple[type, tuple[int, ...]]] = {
-    "pairs": (np.int64, (2,)),
-    "relative": (np.float64, (3,)),
-    "covariance": (np.float64, (3, 3)),
-    "evidence": (np.float64, (len(EVIDENCE),)),
-    "accepted": (np.bool_, ()),
-}
-"""Type and shape of a loop's row in each array of ``ScanLoops``."""
-
 
 @dataclass(frozen=True)
-class ScanLoops:
+class ScanLoops(LoopRecord):
     """Loops between key scans.
 
-    Attributes:
-        pairs: indices of the keys ``(e, 2)``, the earlier first.
-        relative: pose of the later in the earlier ``(e, 3)`` (m, m, rad).
-        covariance: of these poses ``(e, 3, 3)``, along the axes of the earlier.
-        evidence: ``(e, 6)``, columns as named in ``EVIDENCE``.
-        accepted: whether to believe each ``(e,)``.
+    ``covariance`` ``(n, 3, 3)`` of ``relative``, along the axes of the earlier; ``evidence`` ``(n, 6)``, columns as
+    named in ``EVIDENCE``; ``accepted`` ``(n,)``, whether to believe each.
     """
 
-    pairs: np.ndarray
-    relative: np.ndarray
-    covariance: np.ndarray
-    evidence: np.ndarray
-    accepted: np.ndarray
-
-    def __post_init__(self) -> None:
-        count = len(self.pairs)
-        shapes = tuple(x.shape for x in (self.pairs, self.relative, self.covariance, self.evidence, self.accepted))
-        if shapes != ((count, 2), (count, 3), (count, 3, 3), (count, len(EVIDENCE)), (count,)):
-            raise ValueError(f"the arrays of loops have the shapes {shapes}; expected e rows of 2, 3, 3 x 3, 6 and 1")
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, rows: np.ndarray | slice) -> "ScanLoops":
-        """Some of the loops."""
-        return ScanLoops(
-            self.pairs[rows], self.relative[rows], self.covariance[rows], self.evidence[rows], self.accepted[rows]
-        )
+    covariance: np.ndarray = rows(np.float64, 3, 3)
+    evidence: np.ndarray = rows(np.float64, len(EVIDENCE))
+    accepted: np.ndarray = rows(np.bool_)
 
     @property
     def agreeing(self) -> np.ndarray:
-        """How many neighbouring loops agree with each ``(e,)``."""
+        """How many neighbouring loops agree with each ``(n,)``."""
         return self.evidence[:, EVIDENCE.index("agreeing")]
-
-    @staticmethod
-    def none() -> "ScanLoops":
-        """No loops."""
-        return ScanLoops(
-            np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, len(EVIDENCE))),
-            np.zeros(0, bool),
-        )  # fmt: skip
-
-    def extended(self, others: "ScanLoops") -> "ScanLoops":
-        """These loops, then the others."""
-        return ScanLoops(
-            np.concatenate((self.pairs, others.pairs)),
-            np.concatenate((self.relative, others.relative)),
-            np.concatenate((self.covariance, others.covariance)),
-            np.concatenate((self.evidence, others.evidence)),
-            np.concatenate((self.accepted, others.accepted)),
-        )
-
-    def state(self) -> Arrays:
-        """All of them, for ``restored``."""
-        return {name: getattr(self, name) for name in _ROWS}
-
-    @staticmethod
-    def restored(arrays: Arrays, keys: int) -> "ScanLoops":
-        """The loops of a ``state()`` between so many key scans; raises ``StateError``."""
-        pairs = taken(arrays, "pairs", np.int64, -1, 2)
-        rows = {name: taken(arrays, name, dtype, len(pairs), *shape) for name, (dtype, shape) in _ROWS.items()}
-        require(bool(((pairs >= 0) & (pairs < keys)).all()), f"a loop joins key scans that are not among the {keys}")
-        return ScanLoops(**rows)

@@ -1,7 +1,4 @@
-"""Key scans laid together in the frame of one of them: submaps of the map, and the newest scans.
-
-Not in the paper.
-"""
+"""Key scans laid together in the frame of one of them: submaps of the map, and the newest scans."""
 
 import math
 from collections import OrderedDict

@@ -1,7 +1,4 @@
-"""Walls that a scanner looked through: evidence that scans are not where they were put.
-
-Not in the paper.
-"""
+"""Walls that a scanner looked through: evidence that scans are not where they were put."""
 
 import math
 from collections.abc import Sequence

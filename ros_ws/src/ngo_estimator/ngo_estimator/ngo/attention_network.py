@@ -54,8 +54,9 @@ class AttentionNetwork(nn.Module):
             self.stiffness = _zero(nn.Conv1d(width, 3, 1))
 
     def attend(self, features: Tensor, place_similarity: Tensor | None) -> Tensor:
-        """Attention weights alpha ``(batch, poses, poses)`` of features ``(batch, poses, width)``.
+        """Attention weights ``(batch, poses, poses)`` of features F ``(batch, poses, width)``.
 
+        alpha_tu = C_tu / sum_v C_tv with C_tu = <q_t, f_u>, where q_t = ``query``(f_t); by default softmax_u(C_tu).
         ``place_similarity`` ``(batch, poses, poses)`` of the place codes pulls the attention as far as it was learned.
         """
         return self.attention_weights(features, self.place_logits(place_similarity))
@@ -111,11 +112,14 @@ class AttentionPhases:
         self._bias = torch.cat([head.bias for head in heads if head.bias is not None])
 
     def attend(self, state: GraphState) -> Tensor:
-        """Attention vectors a ``(batch, blocks, width)`` ("Attention Phase")."""
+        """Attention vectors a_t = sum_u alpha_tu f_u ``(batch, blocks, width)`` ("Attention Phase")."""
         return self._network.attention_weights(state.features, self._place_logits) @ state.features
 
     def optimise(self, state: GraphState, loops: Callable[[GraphState], Tensor]) -> tuple[GraphState, Tensor]:
-        """Both phases once: ``attend``, then "Optimization", Delta P + beta nabla P and the next features F.
+        """Both phases once: ``attend``, then "Optimization".
+
+        The convolutions h_1 .. h_L take [f_t, a_t], and give beta, nabla P and the next features F. The next relative
+        poses are Delta P + beta nabla P.
 
         Args:
             loops: gives the loops for the convolutions ``(batch, blocks, loop_channels)``.

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.se2 import Values, library
@@ -41,6 +41,14 @@ class MetaSteps:
     def key_frames(self) -> int:
         """Relative meta-poses in front of the blocks."""
         return self.relative.shape[1] - self.blocks
+
+    def without_fixed(self, before: Tensor, after: Tensor, stiffness: Tensor) -> tuple[Tensor, Tensor]:
+        """Relative poses ``(batch, poses, 3)`` and stiffness after both phases; those of fixed blocks as ``before``."""
+        if self.fixed is None:
+            return after, stiffness
+        which = self.fixed.unsqueeze(-1)
+        whole = nn.functional.pad(which, (0, 0, self.key_frames, 0))
+        return torch.where(whole, before, after), torch.where(which, torch.zeros_like(stiffness), stiffness)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""The Neural Graph Optimizer (paper, section "Neural Graph Optimization"), with and without loop closures."""
+"""The M iterations of the Neural Graph Optimizer (paper, section "Neural Graph Optimization").
+
+Each one attends and optimises, Delta P^(i) = Delta P^(i-1) + beta^(i) nabla P^(i) (``attention_network``). A look at
+the loops goes before it, and a step that closes them behind it (``loop_closing``).
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from ngo_estimator.loops.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.loops.overlaps import find_overlaps
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead
+from ngo_estimator.ngo import warm_start
 from ngo_estimator.ngo.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
 from ngo_estimator.ngo.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
 from ngo_estimator.ngo.loop_gates import RobustLoopGate, without_contradictions
@@ -115,9 +120,9 @@ class NeuralGraphOptimizerConfig:
 class NeuralGraphOptimizer(AttentionNetwork):
     """Redistributes the error of a trajectory by iterated attention and temporal convolution.
 
-    Each iteration attends over all meta-poses, passes features and attention through the convolutions, adds gated
-    adjustments to the relative meta-poses, and closes loops. A freshly initialised optimizer without loops returns its
-    input exactly; with loops it is a robust pose graph.
+    ``forward`` takes the relative poses of the local network and gives P^(M) = r2g(Delta P^(M)) and what led to it;
+    ``aggregate`` makes the meta-poses and their features F^(0), ``iterate`` runs the iterations. A freshly initialised
+    optimizer without loops returns its input exactly; with loops it is a robust pose graph.
     """
 
     def __init__(self, config: NeuralGraphOptimizerConfig) -> None:
@@ -235,25 +240,28 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if loops is None:
             return self._annealed(steps, NoLoopClosing(), self._phases(steps, loops, corrections))
         if corrections is not None and solution is not None:
-            return self._resumed(steps, loops, corrections, solution)
+            closing = self._loop_closing(steps, loops, solution)
+            return warm_start.resumed(closing, steps, corrections, solution, self.config.iterations)
         return self._annealed(steps, self._loop_closing(steps, loops), self._phases(steps, loops, corrections))
 
     def _annealed(
         self,
         steps: MetaSteps,
         closing: LoopClosing | NoLoopClosing,
-        phases: AttentionPhases | _NoNetwork | _Remembered,
+        phases: AttentionPhases | _NoNetwork | warm_start.Remembered,
     ) -> Iterator[OptimizedMetaPoses]:
-        """The results that begin at the odometry: all loops are judged, allowing for less of its drift each time."""
+        """The results that begin at the odometry Delta P^(0).
+
+        All loops are judged in each iteration, allowing for less of the odometry's drift each time.
+        """
         state, results = GraphState.initial(steps), []
         made: list[Correction] = []
         for iteration in range(self.config.iterations):
             closing.look(state, iteration)
             before = state.adjusted
             state, stiffness = phases.optimise(state, closing.channels)
-            if steps.fixed is not None:
-                adjusted, stiffness = _without_fixed(before, state.adjusted, stiffness, steps.fixed)
-                state = replace(state, adjusted=adjusted)
+            adjusted, stiffness = steps.without_fixed(before, state.adjusted, stiffness)
+            state = replace(state, adjusted=adjusted)
             if self.config.network:
                 made.append(Correction((state.adjusted - before)[:, steps.key_frames :], stiffness))
             state = closing.close(state, stiffness)
@@ -261,30 +269,13 @@ class NeuralGraphOptimizer(AttentionNetwork):
             left = self.config.iterations - 1 - iteration
             yield OptimizedMetaPoses(list(results), state.step_std, None if left else closing.closed, made, left)
 
-    def _resumed(
-        self, steps: MetaSteps, loops: Loops, corrections: Sequence[Correction], solution: Solution
-    ) -> Iterator[OptimizedMetaPoses]:
-        """The result that begins at an earlier solution (the warm start of ``iterate``).
-
-        New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last
-        one. Others keep what an annealing of all loops gave them.
-        """
-        adjusted, stiffness = steps.relative.clone(), corrections[-1].stiffness
-        adjusted[:, steps.key_frames :] += sum(adjustment for adjustment, _ in corrections)
-        if steps.fixed is not None:
-            adjusted, stiffness = _without_fixed(steps.relative, adjusted, stiffness, steps.fixed)
-        closing = self._loop_closing(steps, loops, solution)
-        iterations = (0, self.config.iterations - 1)
-        relative, step_std = closing.resume(adjusted, stiffness, solution.relative, iterations)
-        yield OptimizedMetaPoses([relative.to(steps.relative.dtype)], step_std, closing.closed)
-
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
-    ) -> AttentionPhases | _NoNetwork | _Remembered:
+    ) -> AttentionPhases | _NoNetwork | warm_start.Remembered:
         if not self.config.network:
             return _NoNetwork(self)
         if corrections is not None:
-            return _Remembered(corrections)
+            return warm_start.Remembered(corrections)
         similarity = None if loops is None else loops.embeddings @ loops.embeddings.mT
         return self.phases(steps.blocks, similarity, self.correction_std)
 
@@ -302,8 +293,7 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if solution is not None and not self.config.search.least_belief:
             which = np.flatnonzero(~solution.known)
         loops = self._judged(without_contradictions(loops, steps, which), steps)
-        # Where one goes on from a solution, overlaps were found on the way to it.
-        find_overlaps = partial(self.overlaps, steps, loops) if solution is None else _no_overlaps
+        find_overlaps = partial(self.overlaps, steps, loops)
         return LoopClosing(
             self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std, solution
         )
@@ -311,17 +301,6 @@ class NeuralGraphOptimizer(AttentionNetwork):
     def _judged(self, loops: Loops, steps: MetaSteps) -> Loops:
         least = self.config.search.least_belief
         return self.loop_judge.judged(loops, steps, least) if least else loops
-
-
-def _no_overlaps(poses: Tensor) -> None:
-    return None
-
-
-def _without_fixed(before: Tensor, after: Tensor, stiffness: Tensor, fixed: Tensor) -> tuple[Tensor, Tensor]:
-    """Relative poses and stiffness after the phases, without adjustments of the blocks that are ``fixed``."""
-    which = fixed.unsqueeze(-1)
-    whole = nn.functional.pad(which, (0, 0, before.shape[1] - fixed.shape[1], 0))
-    return torch.where(whole, before, after), torch.where(which, torch.zeros_like(stiffness), stiffness)
 
 
 class _NoNetwork:
@@ -333,17 +312,3 @@ class _NoNetwork:
     def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
         """The state as it is, and the stiffness ``(3,)``."""
         return state, self._stiffness
-
-
-class _Remembered:
-    """Stands for both phases where the network is not run: what it gave in another optimisation."""
-
-    def __init__(self, corrections: Sequence[Correction]) -> None:
-        self._corrections = iter(corrections)
-
-    def optimise(self, state: GraphState, loops: _Channels) -> tuple[GraphState, Tensor]:
-        """The state with the adjustments of the next iteration, and its stiffness."""
-        adjustment, stiffness = next(self._corrections)
-        adjusted = state.adjusted.clone()
-        adjusted[:, -adjustment.shape[1] :] += adjustment
-        return replace(state, adjusted=adjusted), stiffness

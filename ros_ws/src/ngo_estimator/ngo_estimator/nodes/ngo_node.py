@@ -150,7 +150,7 @@ class NgoNode(ManagedNode):
                 qos_overriding_options=overridable(),
             )
             listening.callback(self.destroy_subscription, initial)
-        # When no more relative poses come, nothing else would end an optimisation that is spread over them.
+        # When no more relative poses come, nothing else would publish the last correction.
         self._pending = self.create_timer(_PENDING_S, self._finish, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._pending.cancel()
         listening.callback(self.destroy_timer, self._pending)
@@ -192,11 +192,7 @@ class NgoNode(ManagedNode):
             self._status.dropped("relative pose", error)
             return
         except Exception:
-            # A fault of ours, not of the message: a robot is better off with a new map than without the node.
-            forgotten = "the map starts anew" if self._search is None else "the pose is looked for anew"
-            self.get_logger().error(f"internal error, {forgotten}:\n{traceback.format_exc()}")
-            self._forget()
-            self._status.dropped("relative pose", "internal error", warn=False)
+            self._on_internal_error()
             return
         self._status.received(step.stamp_ns)
         self._starts -= 1
@@ -206,6 +202,29 @@ class NgoNode(ManagedNode):
             self._on_found(found, step.tf_odom_xyyaw, publish=update is None)
         if update is not None:
             self._on_update(update, step.tf_odom_xyyaw)
+            self._correct()
+
+    def _on_internal_error(self) -> None:
+        """Begin anew: a fault of ours, and a robot is better off with a new map than without the node."""
+        forgotten = "the map starts anew" if self._search is None else "the pose is looked for anew"
+        self.get_logger().error(f"internal error, {forgotten}:\n{traceback.format_exc()}")
+        self._forget()
+        self._status.dropped("relative pose", "internal error", warn=False)
+
+    def _correct(self) -> None:
+        """Do what the newest relative pose made due: its pose is published, and the next one is still to come."""
+        try:
+            with self._status.timed("time a correction"):
+                update = self._core.correct()
+        except Exception:
+            self._on_internal_error()
+            return
+        if update is not None:
+            self._on_correction(update)
+        if self._core.unfinished or (update is not None and update.optimized):
+            self._pending.reset()
+        else:
+            self._pending.cancel()
 
     def _look_again(self, step: "RelativeStep") -> None:
         """Keep the map where the odometry begins anew, if the robot is to be found in it."""
@@ -245,10 +264,6 @@ class NgoNode(ManagedNode):
         # Loops only move when the optimizer ran; the first poses of a trajectory delete those of the last one.
         self._whole.changed(loops=update.optimized or begins)
         self._odom_xyyaw = odom_xyyaw
-        if self._core.unfinished:
-            self._pending.reset()
-        else:
-            self._pending.cancel()
 
     def _on_found(self, step: "LocalisedStep", odom_xyyaw: np.ndarray, publish: bool) -> None:
         """Tell what is new about the pose in the saved map, and publish it where it is known."""
@@ -271,15 +286,21 @@ class NgoNode(ManagedNode):
             self._out.publish(found.stamp_ns, pose, covariance, step.map_from_odom_xyyaw, odom_xyyaw)
 
     def _finish(self) -> None:
-        """End the optimisation that has begun."""
+        """Optimise what waits for relative poses that do not come, and publish map -> odom as it is since the last."""
         self._pending.cancel()
-        if self._paused or (update := self._core.finish()) is None:
-            return
+        if not self._paused and (update := self._core.finish()) is not None:
+            self._on_correction(update)
+        if self._latest is not None:
+            map_from_odom = self._origin.poses(self._latest.map_from_odom_xyyaw)
+            self._out.send_transform(self._latest.stamp_ns, map_from_odom, self._odom_xyyaw)
+
+    def _on_correction(self, update: "TrajectoryUpdate") -> None:
+        """Publish the trajectory that was corrected behind the newest pose; map -> odom follows with the next pose."""
         self._latest = update
         self._report.updated(update)
-        map_from_odom = self._origin.poses(update.map_from_odom_xyyaw)
-        self._out.send_transform(update.stamp_ns, map_from_odom, self._odom_xyyaw)
-        self._whole.changed(loops=True)
+        if update.optimized:
+            self._status.took("time an optimisation", self._core.optimization_s)
+            self._whole.changed(loops=True)
 
     def _trajectory(self) -> "Trajectory | None":
         """The whole trajectory, with its poses in map."""

@@ -140,8 +140,8 @@ class NgoNodeSettings(EstimatorSettings):
     )
     iterations_per_step: int = setting(
         1,
-        "Parts of an optimisation at each relative pose, which spreads its time; 0: all of them at the relative "
-        "pose that completes a meta-pose.",
+        "0: a meta-pose is optimised before its pose is published. From 1 on: behind it, from the last solution on, in "
+        "one piece.",
         minimum=0,
         maximum=100,
     )
@@ -180,7 +180,8 @@ class NgoNodeSettings(EstimatorSettings):
     loops_topic: str = topic("ngo/loops", "Loop closures as lines between poses.")
     path_rate_hz: float = setting(
         10.0,
-        "Highest rate of path_topic, trajectory_topic and loops_topic; 0: after every relative pose.",
+        "Highest rate of path_topic, trajectory_topic and loops_topic; 0: after every relative pose and every "
+        "correction.",
         minimum=0.0,
         maximum=1000.0,
         live=True,

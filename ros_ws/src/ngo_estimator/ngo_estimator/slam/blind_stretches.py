@@ -9,7 +9,6 @@ correction of many deviations stays, and so does each pose that a believed loop 
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.ngo.loop_gates import odometry_variances
@@ -39,14 +38,13 @@ def shrunk_corrections(
     poses = nodes.copy()
     first = int(cut.argmax())
     ends = np.arange(first + 1, len(nodes))
-    nodes_after = np.stack((np.full_like(ends, first), ends), axis=-1)
-    unknown = odometry_variances(nodes_after, odometry, np.where(cut[:, None], variance, 0.0))
+    from_first = np.stack((np.full_like(ends, first), ends), axis=-1)
+    unknown = odometry_variances(from_first, odometry, np.where(cut[:, None], variance, 0.0))
     changes = np.flatnonzero(np.diff(cut[first:].astype(np.int64))) + first + 1
     bounds = [first, *changes.tolist(), len(nodes) - 1]
     for start, end in zip(bounds[:-1], bounds[1:], strict=True):
         stretch = slice(start + 1, end + 1)
-        relative = se2.between(torch.from_numpy(nodes[start]), torch.from_numpy(nodes[stretch]))
-        moved = se2.compose(torch.from_numpy(poses[start]), relative).numpy()
+        moved = se2.compose(poses[start], se2.between(nodes[start], nodes[stretch]))
         if cut[start]:
             own = _shrunk(moved - odometry[stretch], unknown[start - first : end - first])
             moved = odometry[stretch] + own
@@ -65,7 +63,7 @@ def _untied(variance: np.ndarray, loops: np.ndarray) -> np.ndarray:
 
 def _shrunk(correction: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Differences of poses ``(n, 3)``, shrunk by the rule for motions of a variance ``(n, 3)``."""
-    correction = se2.wrapped(torch.from_numpy(correction)).numpy()
+    correction = se2.wrapped(correction)
     squared = np.square(correction) / np.maximum(variance, _LEAST_VARIANCE)
     share = np.clip(1.0 - 1.0 / np.maximum(squared.sum(axis=1), 1.0), 0.0, 1.0)
     shrunk: np.ndarray = correction * share[:, None]

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from ngo_estimator.graph.meta_nodes import MetaNodes
 from ngo_estimator.graph.solved_graph import SolvedGraph
-from ngo_estimator.loops.kept_loops import KeptLoops
 from ngo_estimator.loops.online_loops import OnlineLoops
+from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
 from ngo_estimator.slam.trajectory_update import fault_of
 
@@ -15,18 +15,17 @@ _FRESH = 2
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
 
-_Work = tuple[str, Callable[[int], None]]
-"""A piece of taking in a block: what it is called where it fails, and what does it for the block of a number."""
-
 
 class BlockIntake:
-    """Takes in the newest block in parts of about the same length.
+    """Takes in the newest block.
 
     Args:
         loops: takes the loops that are found by place codes; None: no loops are closed.
         overlaps: whether loops are found by shared walls as well.
         scale: factor of the graph's variances.
     """
+
+    SAVED = ("solved",)
 
     def __init__(
         self, odometry: OdometryBlocks, nodes: MetaNodes, loops: OnlineLoops | None, overlaps: bool, scale: float
@@ -35,50 +34,17 @@ class BlockIntake:
         self._overlaps, self._scale = overlaps, scale
         self.solved = SolvedGraph.none()
         """The last optimisation, set by its owner: it limits the drift of loops, and tells whether poses are fresh."""
-        self._all = self._all_parts()
-        self._left: list[tuple[_Work, ...]] = []
 
-    def _all_parts(self) -> list[tuple[_Work, ...]]:
-        aggregate: _Work = ("taking in a meta-pose", self._odometry.aggregate)
-        if self._loops is None:
-            return [(aggregate,)]
-        look, measure, again, shared = (
-            ("the search for loops", search)
-            for search in (self._look_for_places, self._measure_places, self._find_again, self._find_shared)
-        )
-        parts: list[tuple[_Work, ...]] = [(aggregate,), (look, measure)]
-        if self._odometry.registrations:  # then nothing is smoothed, which takes longer than features
-            parts = [(look,), (measure, aggregate)]
-        return [(again,), *parts, (shared,)] if self._overlaps else parts
-
-    @property
-    def parts(self) -> int:
-        """Parts of each block."""
-        return len(self._all)
-
-    @property
-    def left(self) -> int:
-        """Parts that are left of the newest block."""
-        return len(self._left)
-
-    def begin(self) -> None:
-        """Begin with a new block."""
-        self._left = list(self._all)
-
-    def resume(self, left: int) -> str:
-        """Go on in a restored graph with the last parts, so many; returns a fault as ``do``."""
-        self._left = self._all[self.parts - left :]
-        if self._left and self._left[0][0][1] == self._measure_places:
-            return self._done((("the search for loops", self._look_for_places),))
-        return ""
-
-    def do(self) -> str:
-        """Do the next part; returns a fault in words, or nothing. A fault costs loops or features, and nothing else."""
-        return self._done(self._left.pop(0))
-
-    def _done(self, part: tuple[_Work, ...]) -> str:
+    def take(self) -> str:
+        """Take in the newest block; returns a fault in words, or nothing. A fault costs loops or features alone."""
+        works: list[tuple[str, Callable[[int], None]]] = [("taking in a meta-pose", self._odometry.aggregate)]
+        if self._loops is not None:
+            searches = [self._look_for_places, self._measure_places]
+            if self._overlaps:
+                searches = [self._find_again, *searches, self._find_shared]
+            works += [("the search for loops", search) for search in searches]
         fault = ""
-        for name, work in part:
+        for name, work in works:
             try:
                 work(self._nodes.blocks - 1)
             except Exception as error:  # numerics of a library, or a fault of ours
@@ -112,7 +78,7 @@ class BlockIntake:
         if self._loops is not None and self._fresh:
             self._limit_drift(self._loops.find_overlaps(block, nodes.first, nodes.poses, nodes.keys))
 
-    def _limit_drift(self, found: KeptLoops) -> None:
+    def _limit_drift(self, found: PlaceLoops) -> None:
         nodes, std = self._nodes, self._odometry.std
         if self._loops is not None and len(nodes.keys) and len(found):
             limits = self.solved.most_drift(found.start, nodes.first, nodes.poses, std, self._scale)

@@ -2,100 +2,40 @@
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, StateError, part, require, taken, under
+from ngo_estimator.data.state_arrays import Arrays, StateError, attributes_of, require, with_attributes
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.slam.bridge import bridged
 from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.pose_graph import PoseGraph
 from ngo_estimator.slam.step_log import StepLog, TakenStep
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 
 AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
 
 
-class PoseGraph(Protocol):
-    """The owner of all poses in ``map``, of the newest covariance, and of the loops."""
-
-    loop_weights: np.ndarray
-    took_s: float
-    optimized: bool
-    """Whether an optimisation ended since the newest frame came."""
-    fault: str
-    """What failed since the newest frame came, in words; empty where nothing did."""
-
-    @property
-    def running(self) -> bool:
-        """Whether an optimisation has begun that is not done."""
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether there is anything left to optimise."""
-
-    @property
-    def window_fill(self) -> float:
-        """Share of the window that is in use."""
-
-    @property
-    def largest_move_m(self) -> float:
-        """How far the last optimisation moved a node at most."""
-
-    @property
-    def loop_frames(self) -> np.ndarray:
-        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
-
-    @property
-    def loop_relative(self) -> np.ndarray:
-        """Their measurements ``(loops, 3)``."""
-
-    @property
-    def loop_std(self) -> np.ndarray:
-        """Deviations ``(loops, 3)`` of these."""
-
-    def begin(self) -> None:
-        """Begin to optimise."""
-
-    def advance(self, iterations: int) -> bool:
-        """Do so many parts of the update; returns whether it is done."""
-
-    def finish(self) -> bool:
-        """Optimise what is left; returns whether there was anything."""
-
-    def abandon(self) -> None:
-        """Leave undone what has begun."""
-
-    def fail(self, error: Exception) -> None:
-        """Leave undone what has begun, and keep why: every node is where it was."""
-
-    def newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
-
-    def frame_poses(self, before: bool = False) -> np.ndarray:
-        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
-
-    def state(self) -> Arrays:
-        """All that later steps depend on."""
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
-
-
 class CorrectedTrajectory(ABC):
     """Takes steps into a log and a graph, and tells what each changed.
 
-    An update takes several parts, most of them iterations of an optimisation. ``iterations_per_step`` of them are done
-    at the step that begins it and at each one after it, so that no step takes much longer than the others.
+    A step is answered by the odometry behind the last corrected pose. ``correct`` does the work that it makes due: the
+    search for loops, and an optimisation. A live node calls it when it has published the answer, in the time until the
+    next step. Where nobody calls it, the next step begins with it. So results do not depend on who calls.
+
+    Args:
+        answers_first: False: the work is done before the step is answered.
     """
 
+    SAVED = ("_log", "_graph", "_online", "_optimized", "_odom")
     _graph: PoseGraph
 
-    def __init__(self, iterations_per_step: int) -> None:
-        self._iterations_per_step = iterations_per_step
+    def __init__(self, answers_first: bool) -> None:
+        self._answers_first = answers_first
         self._log = StepLog()
         self.reset()
 
@@ -116,8 +56,8 @@ class CorrectedTrajectory(ABC):
         """Give the graph what is known of the first frame."""
 
     @abstractmethod
-    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
-        """Give the graph a step; returns whether it is time to optimise."""
+    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
+        """Give the graph a step."""
 
     @property
     @abstractmethod
@@ -125,11 +65,13 @@ class CorrectedTrajectory(ABC):
         """What must be the same where a ``state()`` is restored: networks and settings, as JSON has them."""
 
     def state(self) -> Arrays:
-        """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step."""
+        """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step.
+
+        Work that is due is done before.
+        """
         require(self._log.steps > 0, "the trajectory is empty")
-        own = {"online": self._online.values, "optimized": np.array(self._optimized), "odom": self._odom}
-        arrays = own | under("log", self._log.state()) | under("graph", self._graph.state())
-        return {name: np.array(array, order="C") for name, array in arrays.items()}
+        self._work()
+        return attributes_of(self)
 
     def restored(self: AnyTrajectory, arrays: Arrays) -> AnyTrajectory:
         """Another trajectory with these networks and settings, in a ``state()``; this one stays as it is.
@@ -151,12 +93,8 @@ class CorrectedTrajectory(ABC):
         return other
 
     def _restore(self, arrays: Arrays) -> None:
-        self._log.restore(part(arrays, "log"))
-        self._graph.restore(part(arrays, "graph"))
+        with_attributes(self, arrays)
         self._loaded = True
-        self._online.restore(arrays, "online")
-        self._optimized = bool(taken(arrays, "optimized", np.bool_))
-        self._odom = taken(arrays, "odom", np.float64, 3)
         whole = self.trajectory()
         require(whole is not None, "the trajectory is empty")
         assert whole is not None
@@ -183,13 +121,14 @@ class CorrectedTrajectory(ABC):
         self._loaded = False  # and no step taken since
         self._online = GrowingRows((3,), np.float64)
         self._graph = self._new_graph()
-        self._optimized = False
+        self._due, self._optimize = False, True  # whether the graph has work, and may optimise
+        self._optimized, self._fault = False, ""  # since the last result
         self._odom = np.zeros(3)  # of the newest frame, on TF
 
     @property
     def fault(self) -> str:
-        """What failed in the last step, or in ``finish``, in words; empty where nothing did."""
-        return self._graph.fault
+        """What failed in the last step, in ``correct`` or in ``finish``, in words; empty where nothing did."""
+        return self._fault
 
     def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
         """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
@@ -203,6 +142,7 @@ class CorrectedTrajectory(ABC):
                 before.
         """
         step = self._checked(step)
+        self._begin_result()
         if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
             raise RejectedStep(
                 f"step to {step.stamp_ns} ns is of an odometry that began at {step.origin_stamp_ns} ns, or older than "
@@ -229,6 +169,7 @@ class CorrectedTrajectory(ABC):
         step = self._checked(step)
         if not self.may_join(step):
             raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
+        self._begin_result()
         relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
         return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
 
@@ -249,60 +190,62 @@ class CorrectedTrajectory(ABC):
         if taken.begins:
             self._begin_at(step)
             self._online.append(np.zeros(3))
-        due = self._append(step, taken)
+        self._append(step, taken)
         self._odom = step.tf_odom_xyyaw
-        if not optimize:
-            self._graph.abandon()
-        self._optimized = self._optimise(due and optimize)
+        self._due, self._optimize = True, optimize
+        if not self._answers_first:
+            self._work()
         update = self._result(taken.restarted, taken.gap)
         self._online.append(update.pose_xyyaw)
         return update
 
-    def _optimise(self, due: bool) -> bool:
-        """Go on with an optimisation, or begin one; returns whether the newest frame ended one."""
-        try:
-            if due:
-                self._graph.begin()
-            if self._graph.running:
-                self._graph.advance(self._iterations_per_step)
-        except Exception as error:  # numerics of a library, or a fault of ours: it may cost an optimisation, no more
-            self._graph.fail(error)
-        return self._graph.optimized
+    def _begin_result(self) -> None:
+        """Forget what the last result told, and do the work that is left of it."""
+        self._optimized, self._fault = False, ""
+        self._work()
+
+    def _work(self) -> None:
+        """Do the work that is due."""
+        if self._due:
+            self._due = False
+            self._optimized |= self._graph.work(self._optimize)
+            self._fault = self._graph.fault or self._fault
+
+    def correct(self) -> TrajectoryUpdate | None:
+        """Do the work that the newest step made due; None where it changed nothing."""
+        self._begin_result()
+        return self._result(restarted=False, gap=False) if self._optimized or self._fault else None
 
     @property
     def unfinished(self) -> bool:
         """Whether there is anything left to optimise, which later steps, or ``finish``, are to do."""
-        return self._graph.unfinished
+        return self._due or self._graph.unfinished
 
     @property
     def optimization_s(self) -> float:
-        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+        """Computing time of the last optimisation, and of the search for loops before it."""
         return self._graph.took_s
 
     def finish(self) -> TrajectoryUpdate | None:
         """Optimise what is left, when no more steps come; None where there is nothing, or where it failed."""
-        try:
-            done = self._log.steps > 0 and self._graph.finish()
-        except Exception as error:  # see _optimise
-            self._graph.fail(error)
-            done = False
-        if not done:
-            return None
-        self._optimized = True
-        return self._result(restarted=False, gap=False)
+        self._begin_result()
+        if self._log.steps > 0 and self._graph.finish():
+            self._optimized = True
+        self._fault = self._graph.fault or self._fault
+        return self._result(restarted=False, gap=False) if self._optimized else None
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""
         if self._log.steps == 0:
             return None
-        graph, log = self._graph, self._log
+        graph, log, closed = self._graph, self._log, self._graph.closed
         poses, moved = graph.frame_poses(), np.zeros(log.steps + 1)
         if self._optimized:
             before = graph.frame_poses(before=True)
             moved[:-1] = np.linalg.norm((poses - before)[:-1, :2], axis=1)
         arrays = (
             log.stamps_ns.values, poses, log.odometry.values, self._online.values, moved, log.odometry_std.values,
-            graph.loop_frames, graph.loop_weights, graph.loop_relative, graph.loop_std,
+            closed.pairs, closed.weight, closed.relative, closed.std,
         )  # fmt: skip
         return Trajectory(*map(_read_only, arrays))
 
@@ -320,9 +263,9 @@ class CorrectedTrajectory(ABC):
             restarted=restarted,
             gap=gap,
             largest_move_m=graph.largest_move_m if self._optimized else 0.0,
-            closed_loops=int((graph.loop_weights > 0.5).sum()),
+            closed_loops=int((graph.closed.weight > 0.5).sum()),
             window_fill=graph.window_fill,
-            fault=graph.fault,
+            fault=self._fault,
         )
 
 

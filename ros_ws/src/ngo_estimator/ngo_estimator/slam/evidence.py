@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.geometry.planar_arrays import compose
 from ngo_estimator.geometry.planar_covariance import propagate
+from ngo_estimator.geometry.se2 import compose
 from ngo_estimator.slam.sightings import Sightings
 
 _DEVIATIONS = 3.0

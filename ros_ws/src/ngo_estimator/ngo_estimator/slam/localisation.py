@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.geometry.planar_arrays import compose
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
+from ngo_estimator.geometry.se2 import compose
 from ngo_estimator.slam.evidence import (
     Hypotheses,
     HypothesisWindow,

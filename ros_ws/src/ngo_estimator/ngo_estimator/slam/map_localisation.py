@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.geometry.planar_arrays import compose, inverse
 from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.geometry.se2 import compose, inverse
 from ngo_estimator.slam.localisation import Localisation, Localiser
 from ngo_estimator.slam.step_log import StepLog
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate

@@ -4,9 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ngo_estimator.data.state_arrays import Arrays, taken
-from ngo_estimator.geometry.planar_arrays import compose, inverse
 from ngo_estimator.geometry.planar_motion import turned_covariance
+from ngo_estimator.geometry.se2 import compose, inverse
 
 
 @dataclass(frozen=True)
@@ -33,16 +32,6 @@ class MapOrigin:
         """A pose of the trajectory, ``start_from_base_xyyaw``, is ``map_from_base_xyyaw`` in ``map``."""
         map_from_start = compose(map_from_base_xyyaw, inverse(start_from_base_xyyaw))
         return cls(map_from_start, map_from_base_xyyaw, np.zeros((3, 3)) if covariance is None else covariance)
-
-    def state(self) -> Arrays:
-        """All of it, for ``from_state``."""
-        return dict(vars(self))
-
-    @classmethod
-    def from_state(cls, arrays: Arrays) -> "MapOrigin":
-        """The origin of a ``state()``; raises ``StateError``."""
-        motion, given = (taken(arrays, name, np.float64, 3) for name in ("map_from_start_xyyaw", "given_xyyaw"))
-        return cls(motion, given, taken(arrays, "covariance", np.float64, 3, 3))
 
     def poses(self, poses_xyyaw: np.ndarray) -> np.ndarray:
         """Poses ``(..., 3)`` of the trajectory, in ``map``."""

@@ -3,17 +3,16 @@
 Counted in blocks: node ``b`` is the pose after ``b`` blocks of frames, node 0 the first frame, the origin of ``map``.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
+from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import chained, compose, frames_between_nodes
+from ngo_estimator.geometry.planar_motion import chained, compose
 from ngo_estimator.graph.key_frames import KeyFrame
 from ngo_estimator.graph.meta_nodes import MetaNodes
 from ngo_estimator.graph.solved_graph import SolvedGraph
@@ -27,12 +26,8 @@ from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_varian
 from ngo_estimator.slam.block_intake import BlockIntake
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
 from ngo_estimator.slam.step_log import StepLog
-from ngo_estimator.slam.trajectory_update import fault_of
-from ngo_estimator.slam.update_schedule import RunningOptimisation, is_due, parts_now
-
-_RESUMED = 1
-"""Results of an optimisation that goes on from the last solution."""
 
 _SHRUNK = 1e-5
 """By less (m or rad) are poses those of the solution: a hundredth of what corrections are good to."""
@@ -41,7 +36,7 @@ _LEAST_INFORMATION = 1e-12
 """Of a loop, 1/m^2 or 1/rad^2: with less it might as well not be there."""
 
 
-class MetaGraph:
+class MetaGraph(PoseGraph):
     """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
 
     The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
@@ -58,6 +53,7 @@ class MetaGraph:
         anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
+        super().__init__()
         self._optimizer = optimizer
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
@@ -66,26 +62,16 @@ class MetaGraph:
         self._nodes = MetaNodes(key_frames)
         self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
         self._loops: OnlineLoops | None = None
-        self._origin_code: np.ndarray | None = None
+        self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
             assert pair_head is not None
-            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.odometry)
+            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.frames)
         overlaps = optimizer.config.search.overlaps > 0
         self._intake = BlockIntake(self._odometry, self._nodes, self._loops, overlaps, self._scale)
-        self.loop_frames = np.zeros((0, 2), np.int64)
-        """Frames that the loops of the last optimisation join, what was measured, its deviations, and the weights."""
-        self.loop_relative, self.loop_std, self.loop_weights = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        self._begun = False
-        self._running: RunningOptimisation | None = None
         self._network_every, self._anneal_every = network_every, anneal_every
         self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
-        self._corrections: NetworkCorrections | None = None
-        self._begun_s = 0.0
-        self.optimized, self.fault = False, ""
-        """Whether an optimisation ended, and what failed, since the newest frame came."""
-        self.took_s = 0.0
-        """Computing time of the last optimisation that was ended, over all steps that it was spread over."""
+        self._corrections = NetworkCorrections.none()
 
     @property
     def window_fill(self) -> float:
@@ -99,7 +85,8 @@ class MetaGraph:
 
     def begin_at(self, origin_code: np.ndarray | None) -> None:
         """Take the place code of the first frame, where it is known, before the first step."""
-        self._origin_code = origin_code
+        if origin_code is not None:
+            self._origin_code = origin_code
 
     def append(
         self,
@@ -109,14 +96,13 @@ class MetaGraph:
         code: np.ndarray,
         joins: bool = False,
         familiar: bool = True,
-    ) -> bool:
-        """Take a step ``(3,)`` with its variances, motion feature and place code; whether it completed a block.
+    ) -> None:
+        """Take a step ``(3,)`` with its variances, motion feature and place code; ``work`` does what it makes due.
 
         With ``joins`` the step is where another odometry goes on, in another place.
         A frame that is not ``familiar`` closes no loops, and networks leave the odometry around it as it is. Its
         variances are honest, so that ``covariance_scale`` is not for them. The first one recalls those before it.
         """
-        self.optimized, self.fault = False, ""
         if not familiar:
             code, variance = np.zeros_like(code), variance / self._scale
             if self._odometry.is_familiar:
@@ -126,55 +112,36 @@ class MetaGraph:
         self._odometry.append(relative, variance, motion, familiar, joins)
         if self._loops is not None:
             self._loops.append(code)
-        if self._odometry.steps % self._block:
-            return False
-        try:
-            self.finish()  # what comes now changes the nodes that it is about
-        except Exception as error:  # it may cost an optimisation, and nothing else
-            self.fail(error)
-        self._complete_block()
-        return True
+
+    @property
+    def _has_new_node(self) -> bool:
+        return self._odometry.steps >= (self._nodes.blocks + 1) * self._block
 
     @torch.inference_mode()
-    def _complete_block(self) -> None:
-        try:
-            self._register(self._nodes.blocks * self._block)
-        except Exception as error:  # numerics of a library, or a fault of ours: the steps stay as they came
-            self.fail(error, "the registration of steps")
+    def work(self, optimize: bool = True) -> bool:
+        """Take in the block that is complete, if there is one, and optimise; see ``PoseGraph.work``."""
+        return super().work(optimize)
+
+    def _take_in(self) -> bool:
+        self._guarded("the registration of steps", lambda: self._register(self._nodes.blocks * self._block))
         self._nodes.append(self._odometry.complete())
-        self._intake.begin()
+        self.fault = self._intake.take() or self.fault
+        self._make_room()
+        return True
 
     def _register(self, first: int) -> None:
         """Measure the newest block again, which begins with the step of number ``first``."""
         if self._loops is None or self._odometry.registrations == 0:
             return
         before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
-        self._odometry.register(self._loops.codes(first), before)
+        self._odometry.register(self._loops.codes(first), before if len(before) else None)
 
     @torch.inference_mode()
     def _recall(self) -> None:
         """Take the newest frames back, which were taken for familiar: their loops, and what was registered by them."""
-        self.abandon()  # it has their loops
         first = self._odometry.recall()
         if self._loops is not None:
             self._loops.recall(first)
-
-    @property
-    def work(self) -> int:
-        """The most parts of an update: registering and taking in a block, the network's preparation, and iterations."""
-        config = self._optimizer.config
-        return (self._odometry.registrations > 0) + self._intake.parts + config.network + config.iterations
-
-    def _do(self) -> None:
-        """Do the next part of taking in the newest block."""
-        self.fault = self._intake.do() or self.fault
-
-    @torch.inference_mode()
-    def _settle(self) -> None:
-        """Do all that is left of taking in the newest block."""
-        while self._intake.left:
-            self._do()
-        self._make_room()
 
     def _make_room(self) -> None:
         """Let the window slide, and some key frames go."""
@@ -196,18 +163,8 @@ class MetaGraph:
         nothing = np.zeros((self._block, 0), np.float32)
         return KeyFrame(node, relative, variance, nothing, nothing, np.zeros((self._block, 3)))
 
-    @property
-    def running(self) -> bool:
-        """Whether an optimisation has begun that is not done."""
-        return self._begun
-
-    def begin(self) -> None:
-        """Begin to optimise all nodes of the window and the key frames before it."""
-        self._begun, self._begun_s = True, 0.0
-
-    @torch.inference_mode()
-    def _prepared(self) -> RunningOptimisation:
-        self._make_room()
+    def _optimise(self) -> None:
+        """Optimise all nodes of the window and the key frames before it."""
         odometry, keys, first, blocks = self._odometry, self._nodes.keys, self._nodes.first, self._nodes.blocks
         relative = np.concatenate((keys.relative, odometry.relative.slice(first))).astype(np.float32)
         std = np.concatenate((np.sqrt(keys.variance), odometry.std.slice(first))).astype(np.float32)
@@ -228,8 +185,18 @@ class MetaGraph:
             if not self._annealing_is_due:
                 solution = Solution(torch.from_numpy(self._nodes.relative).unsqueeze(0), *self._loops.weighed(numbers))
         corrections = None if known is None else known.for_blocks(first, blocks)
-        iterations = self._optimizer.iterate(steps, loops, corrections, solution)
-        return RunningOptimisation(iterations, numbers, runs_network, solution is None)
+        *_, result = self._optimizer.iterate(steps, loops, corrections, solution)
+        end = self._scale * result.end_covariance()[0].numpy()
+        if not (
+            result.meta_relative[-1].isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()
+        ):
+            raise ArithmeticError("poses or their covariances came out as no numbers")
+        moved = self._apply(result, numbers, end)
+        if solution is None:
+            self._annealed = blocks
+        if runs_network and self._network_every > 1:
+            self._corrections = NetworkCorrections.of(first, result.corrections)
+        self._pose, self._covariance = self._odometry.carried(self._nodes.poses[-1], end + np.outer(moved, moved))
 
     def _verified(self, loops: Loops) -> Loops:
         """The same loops; none across a blind stretch where place codes alone tell them.
@@ -247,14 +214,7 @@ class MetaGraph:
     def _network_is_due(self) -> bool:
         """Whether what the network gave is too old."""
         known = self._corrections
-        return known is None or is_due(self._nodes.blocks - known.last, known.last - known.first, self._network_every)
-
-    @property
-    def _is_light(self) -> bool:
-        """Whether the iterations of this update run no network."""
-        if self._running is not None:
-            return not self._running.runs_network
-        return not (self._optimizer.config.network and self._network_is_due)
+        return not known.last or is_due(self._nodes.blocks - known.last, known.last - known.first, self._network_every)
 
     @property
     def _annealing_is_due(self) -> bool:
@@ -265,85 +225,19 @@ class MetaGraph:
             return True
         return is_due(self._nodes.blocks - self._annealed, self._annealed - first, self._anneal_every)
 
-    def _iterate(self) -> None:
-        """Prepare an optimisation, or run its next iteration; without the network the first one goes with it."""
-        if self._running is None:
-            self._running = self._prepared()
-        self._running.advance()
-
-    @property
-    def _parts_left(self) -> int:
-        """Parts of the update to come."""
-        if self._running is not None and self._running.result is not None:
-            return self._running.result.left
-        iterations = self._optimizer.config.iterations if self._annealing_is_due else _RESUMED
-        return self._intake.left + (self._running is None and not self._is_light) + iterations
-
-    @torch.inference_mode()
-    def advance(self, parts: int) -> bool:
-        """Do so many parts of the update, or more where it would not be done before the next block is complete.
-
-        Returns:
-            Whether it is done, and every node at its new pose.
-        """
-        if not self._begun:
-            raise RuntimeError("no optimisation has begun")
-        began = time.perf_counter()
-        steps_left = self._block - self._odometry.steps % self._block
-        if self._odometry.registrations and steps_left == self._block:
-            parts -= 1  # the step that completed the block has registered it
-        for _ in range(parts_now(parts, self._parts_left, steps_left, self._is_light)):
-            if self._intake.left:
-                self._do()
-            else:
-                self._iterate()
-        self._begun_s += time.perf_counter() - began
-        running = self._running
-        if running is None or running.result is None or not running.done:
-            return False
-        end = self._scale * running.result.end_covariance()[0].numpy()
-        poses = running.result.meta_relative[-1]
-        if not (poses.isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
-            raise ArithmeticError("poses or their covariances came out as no numbers")
-        self._running, self._begun, self.took_s = None, False, self._begun_s
-        moved = self._apply(running, running.result, end)
-        end = end + np.outer(moved, moved)
-        self._pose, self._covariance = self._odometry.carried(self._nodes.poses[-1], end)
-        self.optimized = True
-        return True
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether an optimisation has begun that is not done."""
-        return self.running
-
-    def finish(self) -> bool:
-        """Do what is left of an optimisation that has begun; returns whether there was one."""
-        self._settle()
-        if not self._begun:
-            return False
-        while not self.advance(self.work):
-            pass
-        return True
-
-    def _apply(self, running: RunningOptimisation, result: OptimizedMetaPoses, end: np.ndarray) -> np.ndarray:
+    def _apply(self, result: OptimizedMetaPoses, numbers: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Take the result; how far the last node is from it ``(3,)``, as unfamiliar frames make corrections unsure."""
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
-            self.loop_frames, self.loop_relative = self._loops.edges(running.numbers)
-            information = result.loop_information[0].double().numpy()
-            self.loop_std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
-            self.loop_weights = result.loop_weights[0].double().numpy()
-            self._loops.weigh(running.numbers, self.loop_weights, information)
+            weight, information = (of[0].double().numpy() for of in (result.loop_weights, result.loop_information))
+            std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
+            self.closed = ClosedLoops(*self._loops.edges(numbers), std, weight)
+            self._loops.weigh(numbers, weight, information)
         solution = chained(result.meta_relative[-1][0].double().numpy())
         poses = self._shrink(solution)
         self._nodes.move(poses[1:])
         keys, first = self._nodes.keys.nodes, self._nodes.first
         self._odometry.optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._intake.solved = SolvedGraph(keys, first, self._nodes.blocks, end, result.equations)
-        if running.anneals:
-            self._annealed = self._nodes.blocks
-        if running.runs_network and self._network_every > 1:
-            self._corrections = NetworkCorrections.of(first, result.corrections)
         moved: np.ndarray = poses[-1] - solution[-1]
         return moved
 
@@ -361,24 +255,13 @@ class MetaGraph:
         self._shrunk = bool(np.abs(shrunk - solution).max() > _SHRUNK)
         return shrunk
 
-    def abandon(self) -> None:
-        """Leave undone what has begun; the newest block is taken in all the same."""
-        self._running, self._begun = None, False
-        self._settle()
-
-    def fail(self, error: Exception, work: str = "an optimisation") -> None:
-        """Leave undone what has begun, and keep why: every node is where it was."""
-        self.abandon()
-        self.fault = fault_of(error, work)
-
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
         return self._pose, self._covariance
 
     def frame_poses(self, before: bool = False) -> np.ndarray:
         """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
-        odometry = self._odometry
-        return frames_between_nodes(self._nodes.all(before), odometry.odometry.values, self._block, odometry.shares())
+        return self._odometry.frames.poses(self._nodes.all(before))
 
     def places(self) -> PlaceMap:
         """The frames whose place codes are kept; raises ``ValueError`` where none are."""
@@ -386,68 +269,31 @@ class MetaGraph:
             raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
         return self._loops.places(self._nodes.first * self._block, self._nodes.keys, self.frame_poses())
 
-    def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``.
+    SAVED = (
+        "_odometry", "_nodes", "_loops", "_intake", "_pose", "_covariance", "_annealed", "_shrunk", "_corrections",
+        "_origin_code", "closed",
+    )  # fmt: skip
 
-        Of an optimisation in progress that is the number of its parts: nothing that its iterations began with has
-        changed.
-        """
-        code = self._origin_code
-        arrays = {
-            **self._odometry.state(),
-            **self._nodes.state(),
-            **self._intake.solved.state(),
-            "pose": self._pose,
-            "covariance": self._covariance,
-            "annealed": np.array(self._annealed),
-            "shrunk": np.array(self._shrunk),
-            **{name: getattr(self, name) for name in ("loop_frames", "loop_relative", "loop_std", "loop_weights")},
-            "origin_code": np.zeros(0, np.float32) if code is None else code,
-            "begun": np.array(self._begun),
-            "parts_left": np.array(self._intake.left),
-            "iterated": np.array(0 if self._running is None else self._running.parts),
-        }
-        # The window may have left them behind while nothing was optimised: then the network is due.
-        if self._corrections is not None and self._corrections.last > self._nodes.first:
-            arrays |= under("corrections", self._corrections.state())
-        return arrays if self._loops is None else arrays | under("loops", self._loops.state())
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
-        self._odometry.restore(arrays)
-        nothing = (self._block, 0)
-        shapes = (nothing, nothing) if self._loops is None else self._loops.key_frame_shapes
-        self._nodes.restore(arrays, *shapes)
-        frames, blocks, iterations = self._odometry.steps, self._nodes.blocks, self._optimizer.config.iterations
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        frames, blocks, joined = self._odometry.steps, self._nodes.blocks, self.closed.pairs
         require(blocks == self._odometry.blocks, f"{frames} steps and {blocks} meta-poses do not belong together")
-        self._intake.solved = SolvedGraph.from_state(arrays, blocks)
-        self._pose = taken(arrays, "pose", np.float64, 3)
-        self._covariance = taken(arrays, "covariance", np.float64, 3, 3)
-        self._annealed, self._shrunk = taken_integer(arrays, "annealed"), bool(taken(arrays, "shrunk", np.bool_))
-        self.loop_frames = taken(arrays, "loop_frames", np.int64, -1, 2)
-        known = (self.loop_frames >= 0).all() and (self.loop_frames <= frames).all()
-        require(bool(known), "loops join frames that are not there")
-        for name, shape in (("loop_relative", (3,)), ("loop_std", (3,)), ("loop_weights", ())):
-            setattr(self, name, taken(arrays, name, np.float64, len(self.loop_frames), *shape))
-        code = taken(arrays, "origin_code", np.float32, -1)
-        self._origin_code = code if len(code) else None
-        if self._loops is not None:
-            self._loops.restore(part(arrays, "loops"))
-        if corrections := part(arrays, "corrections"):
-            given = self._corrections = NetworkCorrections.from_state(corrections, iterations)
-            fits = given.first <= self._nodes.first < given.last <= blocks
-            require(fits, f"corrections of the blocks {given.first} to {given.last} are given")
-        self._restore_progress(arrays)
+        require(bool(((joined >= 0) & (joined <= frames)).all()), "loops join frames that are not there")
+        given, solved = self._corrections, self._intake.solved
+        shape = self._optimizer.config.iterations if given.last else 0, given.last - given.first
+        require(
+            0 <= given.first <= given.last <= blocks
+            and given.adjustment.shape[:2] == given.stiffness.shape[:2] == shape,
+            f"corrections of the blocks {given.first} to {given.last} are given",
+        )
+        require(0 <= solved.first <= solved.last <= blocks, "an optimisation is of nodes that are not there")
+        require_ascending(solved.keys, "keys", blocks + 1)
+        require(0 <= self._annealed <= blocks, f"loops were judged at meta-pose {self._annealed} of {blocks}")
 
-    def _restore_progress(self, arrays: Arrays) -> None:
-        """Take what was done of an update, and do its iterations again."""
-        left, iterated = (taken_integer(arrays, name) for name in ("parts_left", "iterated"))
-        require(left <= self._intake.parts, f"{left} parts of an update are left")
-        require(iterated <= self._optimizer.config.iterations, f"an optimisation has done {iterated} parts already")
-        self._begun = bool(taken(arrays, "begun", np.bool_))
-        require(self._begun or not iterated, "an optimisation has not begun, and iterated")
-        require(not (left and iterated), "an optimisation has iterated before its time")
-        with torch.inference_mode():
-            self.fault = self._intake.resume(left)
-            for _ in range(iterated):
-                self._iterate()
+
+def is_due(since: int, seen: int, every: int) -> bool:
+    """Whether to repeat work that saw ``seen`` blocks, ``since`` blocks ago, and is due for each ``every``-th block.
+
+    A short trajectory changes a lot with each block.
+    """
+    return since >= min(every, 1 + seen // 8)

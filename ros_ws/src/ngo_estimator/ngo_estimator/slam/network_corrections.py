@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ngo_estimator.data.state_arrays import Arrays, taken, taken_integer
 from ngo_estimator.ngo.meta_poses import Correction
 
 
@@ -17,6 +16,11 @@ class NetworkCorrections:
     first: int
     adjustment: np.ndarray
     stiffness: np.ndarray
+
+    @classmethod
+    def none(cls) -> "NetworkCorrections":
+        """Before the network ran."""
+        return cls(0, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0, 0), np.float32))
 
     @classmethod
     def of(cls, first: int, given: Sequence[Correction]) -> "NetworkCorrections":
@@ -37,14 +41,3 @@ class NetworkCorrections:
         rows = np.hstack((adjustment, new)), np.hstack((stiffness, new + stiffness[:, -1:]))
         pairs = zip(*(torch.from_numpy(array).unsqueeze(1) for array in rows), strict=True)
         return [Correction(*pair) for pair in pairs]
-
-    def state(self) -> Arrays:
-        """The same as arrays, for ``from_state``."""
-        return {"first": np.array(self.first), "adjustment": self.adjustment, "stiffness": self.stiffness}
-
-    @classmethod
-    def from_state(cls, arrays: Arrays, iterations: int) -> "NetworkCorrections":
-        """Take a ``state()`` of so many iterations; raises ``StateError``."""
-        adjustment = taken(arrays, "adjustment", np.float32, iterations, -1, 3)
-        stiffness = taken(arrays, "stiffness", np.float32, *adjustment.shape[:2], -1)
-        return cls(taken_integer(arrays, "first"), adjustment, stiffness)

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken_integer, under
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_motion import between, carried, compose
+from ngo_estimator.geometry.planar_motion import carried
+from ngo_estimator.graph.frames import Frames
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.pose_aggregation import block_variances, poses_in_blocks
@@ -38,9 +39,8 @@ class OdometryBlocks:
         registers = pair_head is not None and pair_head.config.registers_odometry
         self.registrations = optimizer.config.registrations if registers else 0
         """Of each step; 0: steps stay as they came."""
-        self.odometry = GrowingRows((3,), np.float64)
-        """Poses of all frames by odometry, the first at the origin."""
-        self.odometry.append(np.zeros(3))
+        self.frames = Frames()
+        """All of them, each last one of a block a node."""
         config = optimizer.config.aggregation
         recalled = -(-_TOLD_LATE // self._block) + 1
         steps_kept = (2 * self._context + 2 + recalled) * self._block
@@ -60,12 +60,11 @@ class OdometryBlocks:
         """Whether networks leave a block as it is."""
         self._blind = GrowingRows((3,), np.float64)
         self._recalled = 0  # block from which on frames turned out to be unfamiliar
-        self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on
 
     @property
     def steps(self) -> int:
         """Steps so far."""
-        return len(self.odometry) - 1
+        return len(self.frames) - 1
 
     @property
     def blocks(self) -> int:
@@ -86,9 +85,7 @@ class OdometryBlocks:
         self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, familiar: bool, joins: bool
     ) -> None:
         """Take a step ``(3,)``; with ``joins`` another odometry goes on from there."""
-        self.odometry.append(compose(self.odometry.values[-1], relative.astype(np.float64)))
-        if joins:
-            self._joins.append(self.steps)
+        self.frames.append(relative, joins)
         self._relative.append(relative)
         self._log_std.append(0.5 * np.log(variance))
         self._motion.append(motion)
@@ -103,7 +100,7 @@ class OdometryBlocks:
         first = self.blocks * self._block
         if self._pair_head is None or self.registrations == 0 or not self._familiar.slice(first).all():
             return
-        if self._joins.values[-1:].max(initial=0) > first:
+        if self.frames.last_join > first:
             return  # the frames were seen from two places
         before = None if code_before is None else torch.from_numpy(code_before).unsqueeze(0)
         rows = self._relative.slice(first), self._log_std.slice(first), codes
@@ -113,7 +110,7 @@ class OdometryBlocks:
         )
         self._relative.replace(first, relative[0].numpy())
         self._log_std.replace(first, log_std[0].numpy())
-        odometry = torch.from_numpy(self.odometry.values)
+        odometry = torch.from_numpy(self.frames.odometry)
         odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
 
     def complete(self) -> np.ndarray:
@@ -124,7 +121,9 @@ class OdometryBlocks:
         self.std.append(std[0])
         self.optimized_std.append(std[0])
         self.fixed.append(False)
-        return between(*self.odometry.values[[-1 - self._block, -1]])
+        since = self.frames.since_node
+        self.frames.add_node()
+        return since
 
     def _in_blocks(self, first: int, stop: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Poses within the blocks of steps from number ``first`` on, and the deviations ``(blocks, 3)`` of blocks."""
@@ -151,7 +150,7 @@ class OdometryBlocks:
         relative = se2.between(torch.from_numpy(odometry[:-1]), torch.from_numpy(odometry[1:]))
         self._relative.replace(began, relative.numpy())
         self._log_std.replace(began, np.log(std[: len(relative)].clip(*_STD)))
-        own = torch.from_numpy(self.odometry.values)
+        own = torch.from_numpy(self.frames.odometry)
         own[began + 1 :] = se2.compose(own[began], se2.r2g(relative))
         in_block, block_std = self._in_blocks(began, self.blocks * self._block)
         self.relative.replace(first, in_block[0, :, -1].numpy())
@@ -190,54 +189,23 @@ class OdometryBlocks:
         """A pose ``(3,)`` of the last block's end and its covariance ``(3, 3)``, carried to the newest frame."""
         whole = self.blocks * self._block
         relative, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
-        return carried(pose, covariance, self.odometry.values[whole:], relative, np.exp(2.0 * log_std))
+        return carried(pose, covariance, self.frames.odometry[whole:], relative, np.exp(2.0 * log_std))
 
-    def shares(self) -> np.ndarray:
-        """The share of a block's correction in that of each of its frames ``(1 or blocks, block)``: evenly spread."""
-        frames = np.arange(1, self._block + 1, dtype=np.float64)
-        even = frames[None] / self._block
-        joins = self._joins.values[self._joins.values <= self.blocks * self._block]
-        if len(joins) == 0:
-            return even
-        shares = np.repeat(even, self.blocks, axis=0)
-        for frame in joins.tolist():  # the motion that nobody saw is the one that is corrected
-            block = (frame - 1) // self._block
-            shares[block] = frames >= frame - block * self._block
-        return shares
+    _OF_STEPS = ("_relative", "_log_std", "_motion", "_familiar")
+    _OF_BLOCKS = ("relative", "std", "optimized_std", "fixed")
+    SAVED = (*_OF_STEPS, *_OF_BLOCKS, "frames", "_blind", "_recalled", "features")
 
-    def _rows(self) -> tuple[dict[str, SlidingRows], dict[str, SlidingRows]]:
-        """Rows of steps, and rows of blocks, by their names in a state."""
-        of_steps = {"relative": self._relative, "log_std": self._log_std, "motion": self._motion}
-        of_blocks = {"steps": self.relative, "std": self.std, "optimized_std": self.optimized_std, "fixed": self.fixed}
-        return of_steps | {"familiar": self._familiar}, of_blocks
-
-    def state(self) -> Arrays:
-        """All that is kept of steps and blocks, for ``restore``."""
-        arrays = {"odometry": self.odometry.values, "blind": self.blind, "joins": self._joins.values}
-        arrays["recalled"] = np.array(self._recalled)
-        of_steps, of_blocks = self._rows()
-        for name, rows in {**of_steps, **of_blocks, "features": self.features}.items():
-            arrays |= under(name, rows.state())
-        return arrays
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        for name, growing in (("odometry", self.odometry), ("blind", self._blind), ("joins", self._joins)):
-            growing.restore(arrays, name)
-        self._recalled = taken_integer(arrays, "recalled")
-        of_steps, of_blocks = self._rows()
-        for name, rows in {**of_steps, **of_blocks, "features": self.features}.items():
-            rows.restore(part(arrays, name))
-        steps, blocks, joins = self.steps, self.blocks, self._joins.values
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        steps, blocks = self.steps, self.blocks
         require(
             steps // self._block == blocks == len(self._blind)
-            and {len(rows) for rows in of_steps.values()} == {steps}
-            and {len(rows) for rows in of_blocks.values()} == {blocks},
+            and {len(getattr(self, name)) for name in self._OF_STEPS} == {steps}
+            and {len(getattr(self, name)) for name in self._OF_BLOCKS} == {blocks}
+            and np.array_equal(self.frames.nodes, self._block * np.arange(blocks + 1)),
             f"{steps} steps and {blocks} meta-poses do not belong together",
         )
-        require(
-            bool((joins > 0).all() and (joins <= steps).all()), "another odometry begins at a frame that is not there"
-        )
+        require(self._recalled >= 0, f"frames are recalled from meta-pose {self._recalled} on")
 
 
 def _near(found: np.ndarray, reach: int) -> np.ndarray:

@@ -28,7 +28,7 @@ _VARIANCES = (1e-12, 1e4)
 
 _NETWORK_EVERY, _ANNEAL_EVERY = 32, 8
 """Meta-poses from one run of attention and convolutions to the next, and from one judgement of all loops to the next,
-where work is spread over steps."""
+where steps are answered first."""
 
 
 class OnlineTrajectory(CorrectedTrajectory):
@@ -41,10 +41,9 @@ class OnlineTrajectory(CorrectedTrajectory):
     At most ``key_frames`` of the poses before the window are optimised with it, and a few more for a while. All others
     move with these. Loops are closed with key frames. So the cost of a step does not depend on the trajectory's length.
 
-    All of an update is done at the step that completes a meta-pose. With ``iterations_per_step`` it is spread over the
-    steps before the next one: features, three searches for loops, and iterations. Attention and convolutions are run
-    for each 32nd meta-pose then, as what they give hardly changes from one to the next. All loops are judged for each
-    eighth, and new ones alone between.
+    With ``iterations_per_step`` 0 all of an update is done before the step that completes a meta-pose is answered. Else
+    it is done after that (``correct``). Attention and convolutions are run for each 32nd meta-pose then, as what they
+    give hardly changes from one to the next. All loops are judged for each eighth, and new ones alone between.
     """
 
     _graph: MetaGraph
@@ -75,11 +74,11 @@ class OnlineTrajectory(CorrectedTrajectory):
         self._block = block
         self._window = window_frames // block * block
         if iterations_per_step < 0:
-            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
+            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (before the answer) or more")
         self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
         self._every = (_NETWORK_EVERY, _ANNEAL_EVERY) if iterations_per_step else (1, 1)
-        super().__init__(iterations_per_step or self._new_graph().work)
+        super().__init__(answers_first=iterations_per_step > 0)
 
     @classmethod
     def load(
@@ -129,7 +128,7 @@ class OnlineTrajectory(CorrectedTrajectory):
             "weights_sha256": digest.hexdigest(),
             "window_frames": self._window,
             "key_frames": self._key_frames,
-            "iterations_per_step": self._iterations_per_step,
+            "answers_first": self._answers_first,
         }
 
     def _new_graph(self) -> MetaGraph:
@@ -144,11 +143,11 @@ class OnlineTrajectory(CorrectedTrajectory):
         if self._pair_head is not None:
             self._graph.begin_at(step.from_place_code)
 
-    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
+    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
         code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
         variance = np.clip(np.diagonal(taken.covariance), *_VARIANCES)
         familiar = step.unlikeness <= UNFAMILIAR
-        return self._graph.append(taken.relative, variance, step.motion_feature, code, taken.joins, familiar)
+        self._graph.append(taken.relative, variance, step.motion_feature, code, taken.joins, familiar)
 
     def localisation(self, origin: MapOrigin) -> MapLocalisation:
         """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says.

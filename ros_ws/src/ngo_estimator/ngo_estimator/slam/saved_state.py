@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors
 from safetensors.numpy import load, save
 
 from ngo_common.files import PARTIAL, sync_names, write_whole
 from ngo_estimator.data.state_arrays import Arrays, StateError
 
-FORMAT = 6
+FORMAT = 7
 DESCRIPTION = "state.json"
 _KEYS = {"format", "identity", "arrays", "arrays_sha256", "sha256"}
 
@@ -30,7 +31,8 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
     Raises:
         StateError: the folder holds other files or a state of the other kind, or cannot be written.
     """
-    content = save(arrays)
+    # It writes the memory as it is.
+    content = save({name: np.require(array, requirements="C") for name, array in arrays.items()})
     digest = hashlib.sha256(content).hexdigest()
     name = f"arrays-{digest[:16]}.safetensors"
     description = {"format": FORMAT, "identity": dict(identity), "arrays": name, "arrays_sha256": digest}

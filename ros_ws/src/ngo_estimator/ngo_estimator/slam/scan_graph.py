@@ -1,12 +1,11 @@
 """The graph of key scans behind the online trajectory of a lidar: a chain of nodes, verified loops, warm starts."""
 
 import math
-import time
 
 import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_integer, under
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_motion import transformed
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
@@ -16,11 +15,11 @@ from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
-from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection, taken_rows
+from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
 from ngo_estimator.slam.scan_matcher import ScanMatcher
-from ngo_estimator.slam.trajectory_update import fault_of
 
 _MOST_ITERATIONS = 30
 """Until nothing moves any more, at the end of a recording."""
@@ -32,38 +31,23 @@ _KEYS_PER_SURPRISED = 400
 """The same where a loop surprises."""
 
 
-class ScanGraph:
+class ScanGraph(PoseGraph):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
     def __init__(self, config: ScanGraphConfig) -> None:
+        super().__init__()
         self.config = config
         self._chain = KeyScanChain(np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2)))
         self._scans = KeyScanStore()
         self._finder = ScanLoopFinder(config.loops)
         self._selection = ScanLoopSelection(config)
-        self._running: ScanPoseGraph | None = None
-        self._rows = np.zeros(0, np.int64)
-        self._left = 0
+        self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
-        self._loop_rows = np.zeros(0, np.int64)  # of the last optimisation, among all that were verified
-        self.loop_weights = np.zeros(0)
-        """Of the loops in the last optimisation ``(loops,)``, zero to one."""
-        self.took_s = 0.0
-        """Computing time of the last optimisation."""
-        self.optimized = False
-        """Whether an optimisation ended since the newest frame came."""
-        self.fault = ""
-        """What failed since the newest frame came, in words. Everything is then as it was before, but for the loops."""
 
     @property
     def keys(self) -> int:
         """Key scans so far."""
         return len(self._chain)
-
-    @property
-    def running(self) -> bool:
-        """Whether an optimisation has begun that is not done."""
-        return self._running is not None
 
     @property
     def largest_move_m(self) -> float:
@@ -77,37 +61,35 @@ class ScanGraph:
 
     def append(
         self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None, joins: bool = False
-    ) -> bool:
-        """Take a step ``(3,)`` with its covariance ``(3, 3)``; returns whether it is time to optimise.
+    ) -> None:
+        """Take a step ``(3,)`` with its covariance ``(3, 3)``; ``work`` does what it makes due.
 
         With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place.
         """
-        self.optimized, self.fault = False, ""
         self._chain.append(relative, covariance, joins)
-        if key is None:
-            return False
-        if self._running is not None:  # what comes now adds a node to those that it is about
-            try:
-                self.advance(self._left)
-            except Exception as error:  # it may cost an optimisation, and nothing else
-                self.fail(error)
-        self._chain.append_node(key, joins)
-        self._scans.append(key.scan)
-        try:
-            return self._look_for_loops()
-        except Exception as error:  # numerics of a library, or a fault of ours: it may cost loops, and nothing else
-            self.fail(error, "the search for loops")
-            return False
+        if key is not None:
+            self._chain.append_node(key, joins)
+            self._scans.append(key.scan)
+            self._is_key = True
 
-    def fail(self, error: Exception, work: str = "an optimisation") -> None:
-        """Leave undone what has begun, and keep why: every node is where it was."""
-        self.fault = fault_of(error, work)
-        self._running, self._waiting = None, 0
+    @property
+    def _has_new_node(self) -> bool:
+        return self._is_key
 
-    def _look_for_loops(self) -> bool:
-        """Ask for loops of the newest key; returns whether an optimisation is due."""
+    def _take_in(self) -> bool:
+        self._is_key = False
+        if not self._guarded("the search for loops", self._look_for_loops):
+            self._waiting = 0
+        return self._waiting > self._wait
+
+    @property
+    def _wait(self) -> int:
+        """Key scans for which a loop waits."""
         # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
-        wait = max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
+        return max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
+
+    def _look_for_loops(self) -> None:
+        """Ask for loops of the newest key."""
         if (self.keys - 1) % self.config.loops.every == 0:
             poses, used = self._chain.nodes, self.used_loops.pairs
             windows = distance_windows(self.config.windows, graph_distances(poses, used, self.keys - 1))
@@ -117,9 +99,8 @@ class ScanGraph:
             believed = self._selection.believed(fresh, found, chain)
             if len(believed):
                 surprises = self._selection.use(believed, found, chain)
-                self._waiting = max(self._waiting, wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
+                self._waiting = max(self._waiting, self._wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
         self._waiting += self._waiting > 0
-        return self._waiting > wait
 
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
@@ -146,52 +127,27 @@ class ScanGraph:
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._chain.steps, measured
 
-    def begin(self) -> None:
-        """Begin to optimise all nodes."""
-        began = time.perf_counter()
-        self._rows = self._selection.rows.copy()
-        steps, measured = self.measurements()
-        gates = np.ones(len(self._rows))
-        self._running = ScanPoseGraph(steps, measured, gates, self._chain.nodes, self.config.kernel)
-        self._left = self.config.iterations
+    def _optimise(self, iterations: int = 0) -> None:
         self._waiting = 0
-        self.took_s = time.perf_counter() - began
-
-    def advance(self, iterations: int) -> bool:
-        """Run so many iterations of what has begun; returns whether it is done, and every node at its new pose.
-
-        An error leaves every node where it was.
-        """
-        running = self._running
-        if running is None:
-            raise RuntimeError("no optimisation has begun")
-        began = time.perf_counter()
-        for _ in range(min(iterations, self._left)):
-            running.iterate()
-            self._left = 0 if running.converged else self._left - 1
-        self.took_s += time.perf_counter() - began
-        if self._left:
-            return False
+        loops, (steps, measured) = self.used_loops, self.measurements()
+        graph = ScanPoseGraph(steps, measured, np.ones(len(loops)), self._chain.nodes, self.config.kernel)
+        for _ in range(iterations or self.config.iterations):
+            graph.iterate()
+            if graph.converged:
+                break
         end = self._chain.end
         if self.keys > 1:
-            end = running.covariance(self._chain.published_steps, self.keys - 1)
-        if not (np.isfinite(running.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+            end = graph.covariance(self._chain.published_steps, self.keys - 1)
+        if not (np.isfinite(graph.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
-        self._running = None
-        self._chain.move(running.poses, end)
-        self._loop_rows, self.loop_weights = self._rows, running.weights
-        self.optimized = True
-        return True
-
-    def abandon(self) -> None:
-        """Leave undone what has begun."""
-        if self._running is not None:
-            self._running, self._waiting = None, self.config.keys_between
+        self._chain.move(graph.poses, end)
+        variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(graph.weights, 1e-12)[:, None]
+        self.closed = ClosedLoops(self._chain.frames[loops.pairs], loops.relative, np.sqrt(variance), graph.weights)
 
     @property
     def unfinished(self) -> bool:
-        """Whether an optimisation has begun, or a loop waits for one."""
-        return self.running or self._waiting > 0
+        """Whether a loop waits for an optimisation."""
+        return self._waiting > 0
 
     @property
     def window_fill(self) -> float:
@@ -201,12 +157,7 @@ class ScanGraph:
     def finish(self) -> bool:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
         self.fault = ""
-        if self._running is None:
-            if len(self._selection) == 0:
-                return False
-            self.begin()
-        self._left = _MOST_ITERATIONS
-        return self._running is not None and self.advance(self._left)
+        return len(self._selection) > 0 and self._guarded("an optimisation", lambda: self._optimise(_MOST_ITERATIONS))
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
@@ -227,52 +178,14 @@ class ScanGraph:
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
-    def state(self) -> Arrays:
-        """All that later steps depend on, for ``restore``.
+    SAVED = ("_chain", "_scans", "_finder", "_selection", "_waiting", "closed")
 
-        Of an optimisation in progress that is the number of its iterations: nothing that it began with has changed.
-        """
-        return {
-            **self._chain.state(),
-            **self._selection.state(),
-            **under("scans", self._scans.state()),
-            **under("finder", self._finder.state()),
-            "waiting": np.array(self._waiting),
-            "loop_rows": self._loop_rows,
-            "loop_weights": self.loop_weights,
-            "iterations": np.array(-1 if self._running is None else self.config.iterations - self._left),
-        }
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()`` into a graph without any frame; raises ``StateError``."""
-        self._chain.restore(arrays)
-        self._scans.restore(part(arrays, "scans"))
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
         require(len(self._scans) == self.keys, f"there are not {self.keys} key scans")
-        self._finder.restore(part(arrays, "finder"))
         found = len(self._finder.loops)
-        self._selection.restore(arrays, found)
-        self._loop_rows = taken_rows(arrays, "loop_rows", found)
-        self.loop_weights = taken(arrays, "loop_weights", np.float64, len(self._loop_rows))
-        done, waiting = taken_integer(arrays, "iterations", -1), taken_integer(arrays, "waiting")
-        require(done < self.config.iterations, f"an optimisation has run {done} iterations already")
-        if done >= 0:
-            self.begin()
-            self.advance(done)
-        self._waiting = waiting
-
-    @property
-    def loop_frames(self) -> np.ndarray:
-        """Frames ``(loops, 2)`` that the loops of the last optimisation join."""
-        frames: np.ndarray = self._chain.frames[self._finder.loops.pairs[self._loop_rows]]
-        return frames
-
-    @property
-    def loop_relative(self) -> np.ndarray:
-        """What these loops measured ``(loops, 3)``."""
-        return self._finder.loops.relative[self._loop_rows]
-
-    @property
-    def loop_std(self) -> np.ndarray:
-        """Deviations ``(loops, 3)`` of what they measured, in which their weights are accounted for."""
-        variance = np.diagonal(self._finder.loops.covariance, axis1=1, axis2=2)[self._loop_rows]
-        return np.sqrt(variance / np.maximum(self.loop_weights, 1e-12)[:, None])
+        for rows in (self._selection.rows, self._selection.doubted):
+            require(bool(((rows >= 0) & (rows < found)).all()), f"loops are named that are not among the {found}")
+        joined = self.closed.pairs
+        require(bool((joined >= 0).all()), "loops join frames that are not there")
+        require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")

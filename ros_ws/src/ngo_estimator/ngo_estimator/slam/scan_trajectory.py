@@ -29,9 +29,9 @@ class ScanTrajectory(CorrectedTrajectory):
 
     def __init__(self, config: ScanGraphConfig | None = None, iterations_per_step: int = 0) -> None:
         if iterations_per_step < 0:
-            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (all at once) or more")
+            raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (before the answer) or more")
         self._config = config or ScanGraphConfig()
-        super().__init__(iterations_per_step or self._config.iterations)
+        super().__init__(answers_first=iterations_per_step > 0)
 
     @classmethod
     def load(cls, weights: Path, world: str | None = None, iterations_per_step: int = 0) -> "ScanTrajectory":
@@ -50,7 +50,7 @@ class ScanTrajectory(CorrectedTrajectory):
     @property
     def identity(self) -> dict[str, Any]:
         """The settings: there are no networks."""
-        return {"graph": asdict(self._config), "iterations_per_step": self._iterations_per_step}
+        return {"graph": asdict(self._config)}
 
     def _new_graph(self) -> ScanGraph:
         return ScanGraph(self._config)
@@ -62,8 +62,8 @@ class ScanTrajectory(CorrectedTrajectory):
     def _begin_at(self, step: RelativeStep) -> None:
         self._graph.begin_at(step)
 
-    def _append(self, step: RelativeStep, taken: TakenStep) -> bool:
-        return self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins)
+    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
+        self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins)
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether the trajectory can go on with another odometry from this step's frame, which needs a key scan."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.data.state_arrays import Arrays, part, under
+from ngo_estimator.data.state_arrays import Arrays, part, restore, state_of, under
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.joining import Joining
 from ngo_estimator.slam.map_localisation import MapLocalisation
@@ -25,8 +25,11 @@ class Session:
 
     def state(self) -> Arrays:
         """Copies of all of it; raises ``StateError`` before the first step."""
-        of_map = {**under("origin", self.origin.state()), **under("smoothing", self.smoothing.state())}
-        return {**self.core.state(), **{name: np.array(array) for name, array in of_map.items()}}
+        return {
+            **self.core.state(),
+            **under("origin", state_of(self.origin)),
+            **under("smoothing", state_of(self.smoothing)),
+        }
 
     def write(self, folder: Path, arrays: Arrays) -> None:
         """Write a ``state()``, all at once or not at all; raises ``StateError``."""
@@ -42,7 +45,7 @@ class Session:
         return Session(
             self.world,
             self.core.restored(arrays),
-            MapOrigin.from_state(part(arrays, "origin")),
+            restore(MapOrigin(np.zeros(3)), part(arrays, "origin")),
             self.smoothing.restored(part(arrays, "smoothing")),
         )
 

@@ -13,8 +13,8 @@ from ngo_estimator.data.relative_step import (
     RelativeStep,
 )
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_integer
-from ngo_estimator.geometry.planar_arrays import between, compose, inverse
+from ngo_estimator.data.state_arrays import require
+from ngo_estimator.geometry.se2 import between, compose, inverse
 
 
 @dataclass(frozen=True)
@@ -135,23 +135,10 @@ class StepLog:
         """A pose ``(3,)`` of the present odometry, as ``odometry`` has it."""
         return compose(self._moved, odom_xyyaw) if self._moved.any() else odom_xyyaw
 
-    def state(self) -> Arrays:
-        """All of it, for ``restore``."""
-        return {
-            "stamps_ns": self.stamps_ns.values,
-            "odometry": self.odometry.values,
-            "odometry_std": self.odometry_std.values,
-            "origin_stamp_ns": np.array(self._origin_stamp_ns, np.int64),
-            "moved": self._moved,
-        }
+    SAVED = ("stamps_ns", "odometry", "odometry_std", "_origin_stamp_ns", "_moved")
 
-    def restore(self, arrays: Arrays) -> None:
-        """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        self.stamps_ns.restore(arrays, "stamps_ns")
-        self.odometry.restore(arrays, "odometry")
-        self.odometry_std.restore(arrays, "odometry_std")
-        self._origin_stamp_ns = taken_integer(arrays, "origin_stamp_ns", -(2**63))
-        self._moved = taken(arrays, "moved", np.float64, 3)
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
         frames = len(self.stamps_ns)
         require(
             len(self.odometry) == frames and len(self.odometry_std) == max(0, frames - 1) and frames != 1,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, taken, taken_integer
-from ngo_estimator.geometry.planar_arrays import compose, inverse
+from ngo_estimator.geometry.se2 import compose, inverse
 
 
 class SmoothedCorrection:
@@ -31,7 +31,7 @@ class SmoothedCorrection:
         if self._last is None:
             return {}
         stamp_ns, map_from_odom = self._last
-        return {"stamp_ns": np.array(stamp_ns, np.int64), "map_from_odom_xyyaw": map_from_odom}
+        return {"stamp_ns": np.array(stamp_ns, np.int64), "map_from_odom_xyyaw": map_from_odom.copy()}
 
     def restored(self, arrays: Arrays) -> "SmoothedCorrection":
         """Another one with this time constant, and the last value of a ``state()``; raises ``StateError``."""

@@ -1,0 +1,76 @@
+"""All frames of a trajectory by odometry, and those of them that are nodes of the pose graph.
+
+A meta-pose is a node by count, a key scan one by motion: here both are frames with a number.
+"""
+
+import numpy as np
+
+from ngo_estimator.data.row_buffers import GrowingRows
+from ngo_estimator.data.state_arrays import require
+from ngo_estimator.geometry.planar_motion import between, compose, frames_between_nodes
+
+
+class Frames:
+    """Frames in their order; the first is at the origin, and the first node."""
+
+    SAVED = ("_odometry", "_nodes", "_joins")
+
+    def __init__(self) -> None:
+        self._odometry = GrowingRows((3,), np.float64)
+        self._odometry.append(np.zeros(3))
+        self._nodes = GrowingRows((), np.int64)
+        self._nodes.append(0)
+        self._joins = GrowingRows((), np.int64)  # frames from which on another odometry goes on
+
+    def __len__(self) -> int:
+        return len(self._odometry)
+
+    @property
+    def odometry(self) -> np.ndarray:
+        """Poses of all frames by odometry ``(frames, 3)``, without a copy."""
+        return self._odometry.values
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """The frames that are nodes ``(nodes,)``, without a copy."""
+        return self._nodes.values
+
+    @property
+    def last_join(self) -> int:
+        """The newest frame from which on another odometry goes on; 0 where there is none."""
+        return int(self._joins.values[-1]) if len(self._joins) else 0
+
+    @property
+    def since_node(self) -> np.ndarray:
+        """Pose ``(3,)`` of the newest frame, seen from the last node."""
+        since: np.ndarray = between(self.odometry[self.nodes[-1]], self.odometry[-1])
+        return since
+
+    def append(self, relative: np.ndarray, joins: bool) -> None:
+        """Add a frame, seen from the newest one ``(3,)``; with ``joins`` another odometry goes on from there."""
+        self._odometry.append(compose(self.odometry[-1], relative.astype(np.float64)))
+        if joins:
+            self._joins.append(len(self) - 1)
+
+    def add_node(self) -> None:
+        """Make the newest frame a node."""
+        self._nodes.append(len(self) - 1)
+
+    def poses(self, nodes: np.ndarray) -> np.ndarray:
+        """Poses of all frames ``(frames, 3)`` where the nodes are at ``nodes`` ``(nodes, 3)``.
+
+        What an optimisation moved two nodes against each other is spread evenly over the frames between. Where another
+        odometry goes on, the motion that nobody saw is the one that is corrected.
+        """
+        return frames_between_nodes(nodes, self.odometry, self.nodes, self._joins.values)
+
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        frames, nodes, joins = len(self), self.nodes, self._joins.values
+        require(
+            len(nodes) > 0 and nodes[0] == 0 and bool((np.diff(nodes) > 0).all()) and bool(nodes[-1] < frames),
+            "nodes are frames that are not there",
+        )
+        require(
+            bool((joins > 0).all() and (joins < frames).all()), "another odometry begins at a frame that is not there"
+        )

@@ -1,0 +1,100 @@
+"""What every pose graph behind a corrected trajectory does: follow frames, and do the work that a node makes due."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngo_estimator.loops.loop_record import LoopRecord, rows
+from ngo_estimator.slam.trajectory_update import fault_of
+
+
+@dataclass(frozen=True)
+class ClosedLoops(LoopRecord):
+    """The loops of the last optimisation, between frames.
+
+    ``std`` ``(n, 3)`` are deviations of ``relative``, in which the ``weight`` ``(n,)``, zero to one, is accounted for.
+    """
+
+    std: np.ndarray = rows(np.float64, 3)
+    weight: np.ndarray = rows(np.float64)
+
+
+class PoseGraph(ABC):
+    """The owner of all poses in ``map``, of the newest covariance, and of the loops.
+
+    Frames follow the last node by odometry. A node makes work due: the search for its loops, and an optimisation.
+    """
+
+    def __init__(self) -> None:
+        self.closed = ClosedLoops.none()
+        self.fault = ""
+        """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
+        self.took_s = 0.0
+        """Computing time of the last work that ended with an optimisation."""
+
+    def work(self, optimize: bool = True) -> bool:
+        """Do what the newest frame made due; returns whether it optimised.
+
+        A fault costs what failed alone: loops, or an optimisation. Every node is then where it was.
+        """
+        self.fault = ""
+        if not self._has_new_node:
+            return False
+        began = time.perf_counter()
+        optimized = self._take_in() and optimize and self._guarded("an optimisation", self._optimise)
+        if optimized:
+            self.took_s = time.perf_counter() - began
+        return optimized
+
+    def _guarded(self, work: str, do: Callable[[], None]) -> bool:
+        """Do it; returns whether it did not fail."""
+        try:
+            do()
+        except Exception as error:  # numerics of a library, or a fault of ours: the trajectory goes on by odometry
+            self.fault = fault_of(error, work)
+            return False
+        return True
+
+    @property
+    @abstractmethod
+    def _has_new_node(self) -> bool:
+        """Whether the newest frame completed a node that was not taken in."""
+
+    @abstractmethod
+    def _take_in(self) -> bool:
+        """Take in the new node, and look for its loops; returns whether it is time to optimise."""
+
+    @abstractmethod
+    def _optimise(self) -> None:
+        """Optimise all nodes, or leave all as they are and raise."""
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether there is anything left to optimise when ``work`` is done."""
+        return False
+
+    def finish(self) -> bool:
+        """Optimise what is left when no more frames come; returns whether there was anything, and it worked."""
+        self.fault = ""
+        return False
+
+    @property
+    @abstractmethod
+    def window_fill(self) -> float:
+        """Share of the window that is in use."""
+
+    @property
+    @abstractmethod
+    def largest_move_m(self) -> float:
+        """How far the last optimisation moved a node at most."""
+
+    @abstractmethod
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
+
+    @abstractmethod
+    def frame_poses(self, before: bool = False) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""

@@ -1,0 +1,74 @@
+"""Pages are made of their JSON alone: those in ``docs/`` are what today's templates make of the stored numbers."""
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from training.common.records import ROOT, WEIGHTS
+from training.data.worlds import world_named
+from training.report import doom_page, faults_page, lidar_page, map_page, page, relocalisation_page, results_page
+from training.report.page import Column, joined, number, short, signed, table, with_interval
+
+Page = Callable[[dict[str, Any], dict[str, str]], str]
+PAGES: dict[str, Page] = {
+    "maze2d": lambda result, images: results_page.page(result, images, world_named("maze2d")),
+    "maze3d": lambda result, images: results_page.page(result, images, world_named("maze3d")),
+    "scan": lidar_page.page,
+    "doom": lambda result, _: doom_page.page(result, WEIGHTS / "doom"),
+    "faults": lambda result, _: faults_page.page(result),
+    "map": lambda result, _: map_page.page(result),
+    "relocalisation": lambda result, _: relocalisation_page.page(result),
+}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_in_the_docs_is_what_its_json_says(name: str) -> None:
+    result = json.loads((ROOT / "training" / "results" / f"{name}.json").read_text())
+    text = (ROOT / "docs" / f"results_{name}.md").read_text()
+    images = {file: caption for caption, file in re.findall(r"!\[([^\]]*)\]\(images/([^)]+)\)", text)}
+    assert PAGES[name](result, images) == text
+
+
+NUMBERS = {"mean": 0.02, "ci95": [0.01, 1.5]}
+
+
+def test_a_table_has_a_line_a_row_and_an_empty_cell_for_no_number() -> None:
+    shown = (Column("share", "Share, %", short, 100.0), Column("m", "Error, m", number))
+    rows = {
+        "ours": {"share": NUMBERS, "m": {"mean": 12.345, "ci95": None}},
+        "other": {"m": {"mean": None, "ci95": None}},
+    }
+    assert table(rows, shown, "Row").splitlines() == [
+        "| Row | Share, % | Error, m |",
+        "| --- | --- | --- |",
+        "| ours | 2 [1, 150] | 12.3 |",
+        "| other |  |  |",
+    ]
+
+
+def test_signs_and_words() -> None:
+    assert with_interval(NUMBERS, signed(1)) == "+0.0 [+0.0, +1.5]"
+    assert joined([0]) == "0"
+    assert joined([0, 1, 2]) == "0, 1 and 2"
+    assert page.page(["# A", "", "b"]) == "# A\n\nb\n"
+    assert page.figures({}) == []
+    assert page.figures({"a.png": "What it shows."})[1].startswith("![What it shows.](images/a.png)")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (123.4, "123"),
+        (12.34, "12.3"),
+        (1.234, "1.23"),
+        (0.1234, "0.123"),
+        (0.01234, "0.0123"),
+        (-0.5, "-0.500"),
+        (0.0, "0.000"),
+    ],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text

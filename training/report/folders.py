@@ -1,0 +1,30 @@
+"""The folders that every command of a table takes, and what it writes there."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from training.common import records
+from training.common.records import write_at_once
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folders:
+    """Where a table finds what it needs, and where it writes."""
+
+    weights: Path = records.WEIGHTS  # Folder with WORLD/*.safetensors.
+    out: Path = records.ROOT / "training" / "results"  # Folder that gets the JSON, and holds WORLD.gtsam.json.
+    docs: Path = records.ROOT / "docs"  # Folder that gets the page, and its figures in images/.
+    runs: Path = records.ROOT / "runs"  # Folder of drives and of what was measured.
+
+    @property
+    def images(self) -> Path:
+        """Folder of the figures."""
+        return self.docs / "images"
+
+    def publish(self, name: str, result: dict[str, Any], page: str) -> dict[str, Any]:
+        """Write ``NAME.json`` and ``results_NAME.md``; returns the content of the JSON."""
+        write_at_once(self.out / f"{name}.json", json.dumps(result, indent=2) + "\n")
+        write_at_once(self.docs / f"results_{name}.md", page)
+        return result
