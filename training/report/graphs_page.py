@@ -38,14 +38,14 @@ def page(result: dict[str, Any]) -> str:
             )
         )
         if len(cells) > 1:
-            parts.append(f"\n{_over_cells(cells, rows)}\n")
+            parts.append(f"{_over_cells(cells, rows)}\n")
         parts.append("Time in seconds, precision and recall of the loops that are believed:\n")
         keys = ("seconds", "precision", "recall")
         lines = [
             (name, row, *(interval(cell[row][key]) for key in keys)) for name, cell in cells.items() for row in cell
         ]
-        parts.append(markdown(("cell", "row", *keys), lines))
-    return "\n".join(parts) + "\n"
+        parts.append(markdown(("cell", "row", *keys), lines) + "\n")
+    return "\n".join(parts).rstrip() + "\n"
 
 
 def _short(row: dict[str, Any] | None) -> str:

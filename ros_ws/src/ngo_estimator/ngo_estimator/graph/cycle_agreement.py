@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from ngo_estimator.geometry.se2 import compose
+from ngo_estimator.geometry.se2 import compose, r2g
 from ngo_estimator.graph.relative_poses import RelativePoses
 
 _NOTHING_KNOWN = 1e12
@@ -56,10 +56,8 @@ class ChainUncertainty:
 
 def chain_poses(relative: np.ndarray, first: np.ndarray | None = None) -> np.ndarray:
     """Poses ``(n + 1, 3)`` of a chain of relative poses ``(n, 3)``; the first is the origin if not given."""
-    first = np.zeros(3) if first is None else first
-    yaw = np.cumsum(np.concatenate((first[2:], relative[:, 2])))
-    steps = compose(np.column_stack((np.zeros((len(relative), 2)), yaw[:-1])), relative)
-    return np.column_stack((np.cumsum(np.concatenate((first[None, :2], steps[:, :2])), axis=0), yaw))
+    poses: np.ndarray = np.concatenate((np.zeros((1, 3)), r2g(relative)))
+    return poses if first is None else compose(first, poses)
 
 
 def covariances(edges: RelativePoses) -> np.ndarray:
