@@ -61,7 +61,7 @@ def test_what_a_match_leaves_open_teaches_no_deviation() -> None:
 
 def test_calibration_finds_scale_and_yaw_of_the_scanner() -> None:
     yaw = math.radians(3.0)
-    mixture = MotionMixture(MixtureConfig())
+    mixture = MotionMixture(MixtureConfig(certain_m=1.0))
     noise = np.random.default_rng(0)
     for _ in range(500):
         counted = np.array((noise.uniform(0.05, 0.25), 0.0, noise.uniform(-0.1, 0.1)))
