@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.relative_poses import RelativePoses
-from ngo_estimator.graph.scan_pose_graph import ScanPoseGraph
+from ngo_estimator.graph.robust import Robust
 from training.baselines.lidar_peers import GraphPeerConfig
 
 _GROUP = 5
-_MOST_ITERATIONS = 100  # GTSAM's own limit
 
 Solver = Callable[[RelativePoses, RelativePoses, np.ndarray, GraphPeerConfig], np.ndarray]
 
@@ -52,10 +52,5 @@ def with_wrong_loops(loops: RelativePoses, nodes: int, percent: float, rng: np.r
 
 
 def solve_ours(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
-    """Poses ``(nodes, 3)`` by our own graph with a kernel of ``config.cauchy`` deviations, from ``start``."""
-    graph = ScanPoseGraph(steps, loops, np.ones(len(loops.nodes)), start, config.cauchy)
-    for _ in range(_MOST_ITERATIONS):
-        graph.iterate()
-        if graph.converged:
-            break
-    return graph.poses
+    """Poses ``(nodes, 3)`` by our own robust corrector, from ``start``; it takes nothing of ``config``."""
+    return Robust().correct(GraphProblem(start, steps, loops, np.ones(len(loops)))).poses

@@ -66,6 +66,22 @@ def test_a_loop_shares_its_error_by_the_variances() -> None:
     assert solution.cost == pytest.approx(4 * (0.05 / STD) ** 2)
 
 
+def test_a_fix_across_a_corridor_moves_nothing_along_it() -> None:
+    """The loop is sure across (y) and turned by 90 deg against the map: its own axes must be turned along."""
+    steps = np.array([(0.0, 0.0, math.pi / 2.0), (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    chain = RelativePoses.of_deviations(
+        np.array([(k, k + 1) for k in range(4)]), steps, np.tile((0.1, 0.1, 1e-4), (4, 1))
+    )
+    # Seen from node 1, ahead is the map's y. It is 0.3 m to the left of where the chain has it, and 2 m short.
+    loop_1_4 = RelativePoses.of_deviations(
+        np.array([(1, 4)]), np.array([(1.0, 0.3, 0.0)]), np.array([(math.inf, 1e-3, math.inf)])
+    )
+    found = Robust().correct(GraphProblem(chain_poses(steps), chain, loop_1_4, np.ones(1)))
+    np.testing.assert_allclose(found.poses[4], [-0.3, 3.0, math.pi / 2.0], atol=2e-3)
+    covariance = found.covariance([4])
+    assert covariance[1, 1] > 0.02 and covariance[0, 0] < 2e-2  # the map's y is the corridor's length
+
+
 def test_without_loops_nothing_moves() -> None:
     problem = straight(3, loop(3.0, (STD, STD, STD))[:0])
     solution = Robust().correct(problem)

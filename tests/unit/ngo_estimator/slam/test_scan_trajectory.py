@@ -15,8 +15,8 @@ from ngo_estimator.data.relative_step import DuplicateStep, LateStep, RejectedSt
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.graph.normal_equations import NormalEquations
+from ngo_estimator.graph.robust import Robust
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
-from ngo_estimator.slam import scan_graph
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from tests.unit.ngo_estimator.lidar_steps import HOUSE, STEP_COVARIANCE, STEP_NS, drifted, lidar_steps, loop_way
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, fan, scan_at
@@ -331,7 +331,7 @@ def test_a_fault_of_numerics_costs_an_optimisation_alone(monkeypatch: pytest.Mon
                 if where == "loops":
                     broken.setattr(ScanLoopFinder, "find", fails)
                 elif where == "begin":
-                    broken.setattr(scan_graph, "ScanPoseGraph", fails)
+                    broken.setattr(Robust, "correct", fails)
                 elif where == "no numbers":
                     broken.setattr(NormalEquations, "covariance", lambda *_: np.full((3, 3), np.nan))
                 else:

@@ -20,6 +20,9 @@ from ngo_estimator.graph.surest_first import believe
 _MISSTATED = 2.0
 """Variances that are off by less than this factor, either way, are taken as stated."""
 
+_LEAST_SCALE = 1e-3
+"""Edges without any error, as of a computed graph, would tell a scale of zero."""
+
 _NEAR = 1.0
 """Where graduated non-convexity begins at poses that are nearly right."""
 
@@ -113,6 +116,7 @@ def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int
 
 
 def _noticed(scale: float) -> float:
+    scale = max(scale, _LEAST_SCALE)
     return 1.0 if 1.0 / _MISSTATED < scale < _MISSTATED else scale
 
 

@@ -8,9 +8,10 @@ from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.graph.relative_poses import RelativePoses
-from ngo_estimator.graph.scan_pose_graph import ScanPoseGraph
+from ngo_estimator.graph.robust import Robust
 from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
@@ -20,9 +21,6 @@ from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
 from ngo_estimator.slam.scan_matcher import ScanMatcher
-
-_MOST_ITERATIONS = 30
-"""Until nothing moves any more, at the end of a recording."""
 
 _KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key scan."""
@@ -42,6 +40,10 @@ class ScanGraph(PoseGraph):
         self._finder = ScanLoopFinder(config.loops)
         self._selection = ScanLoopSelection(config)
         self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
+        self._corrector: Corrector = Robust()
+        # Of the last optimisation: what loops weigh, how many there were at the last one from nothing, and the scale of
+        # variances that was found.
+        self._weights, self._loops_from_nothing, self._scale = np.zeros(0), 0, np.ones(1)
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
 
     @property
@@ -127,22 +129,41 @@ class ScanGraph(PoseGraph):
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._chain.steps, measured
 
-    def _optimise(self, iterations: int = 0) -> None:
+    def _optimise(self) -> None:
         self._waiting = 0
         loops, (steps, measured) = self.used_loops, self.measurements()
-        graph = ScanPoseGraph(steps, measured, np.ones(len(loops)), self._chain.nodes, self.config.kernel)
-        for _ in range(iterations or self.config.iterations):
-            graph.iterate()
-            if graph.converged:
-                break
-        end = self._chain.end
-        if self.keys > 1:
-            end = graph.covariance(self._chain.published_steps, self.keys - 1)
-        if not (np.isfinite(graph.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+        problem = GraphProblem(self._chain.nodes, steps, measured, np.ones(len(loops)))
+        solution = self._corrector.correct(problem, self._warm_start(problem))
+        end = self._end_covariance(solution) if self.keys > 1 else self._chain.end
+        if not (np.isfinite(solution.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
-        self._chain.move(graph.poses, end)
-        variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(graph.weights, 1e-12)[:, None]
-        self.closed = ClosedLoops(self._chain.frames[loops.pairs], loops.relative, np.sqrt(variance), graph.weights)
+        self._weights, self._scale = solution.loop_weights, np.array((solution.scale,))
+        self._loops_from_nothing = solution.loops_from_nothing
+        self._chain.move(solution.poses, end)
+        weights = solution.loop_weights
+        variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
+        self.closed = ClosedLoops(self._chain.frames[loops.pairs], loops.relative, np.sqrt(variance), weights)
+
+    def _warm_start(self, problem: GraphProblem) -> CorrectedGraph | None:
+        """The last solution, whose nodes the newer ones follow; None where there is none."""
+        if len(self._weights) == 0:
+            return None
+        sound = np.ones(len(problem.steps))
+        scale, before = float(self._scale[0]), self._loops_from_nothing
+        return CorrectedGraph(problem, problem.poses, self._weights, sound, 0.0, scale, loops_from_nothing=before)
+
+    def _end_covariance(self, solution: CorrectedGraph) -> np.ndarray:
+        """Covariance ``(3, 3)`` of the last node, with the steps as they are published.
+
+        Neighbouring scans err together, so that small residuals do not say that covariances are stated too large. An
+        edge that fits badly says less.
+        """
+        steps, loops = self._chain.published_steps, solution.problem.loops
+        parts = (
+            (steps, _soft_weights(solution.problem.steps, solution.poses, self.config.kernel)),
+            (loops, solution.loop_weights * _soft_weights(loops, solution.poses, self.config.kernel)),
+        )
+        return normal_equations(solution.poses, *parts).covariance([self.keys - 1])
 
     @property
     def unfinished(self) -> bool:
@@ -157,7 +178,7 @@ class ScanGraph(PoseGraph):
     def finish(self) -> bool:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
         self.fault = ""
-        return len(self._selection) > 0 and self._guarded("an optimisation", lambda: self._optimise(_MOST_ITERATIONS))
+        return len(self._selection) > 0 and self._guarded("an optimisation", self._optimise)
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
@@ -178,7 +199,9 @@ class ScanGraph(PoseGraph):
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
-    SAVED = ("_chain", "_scans", "_finder", "_selection", "_waiting", "closed")
+    SAVED = (
+        "_chain", "_scans", "_finder", "_selection", "_waiting", "closed", "_weights", "_loops_from_nothing", "_scale",
+    )  # fmt: skip
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
@@ -188,4 +211,15 @@ class ScanGraph(PoseGraph):
             require(bool(((rows >= 0) & (rows < found)).all()), f"loops are named that are not among the {found}")
         joined = self.closed.pairs
         require(bool((joined >= 0).all()), "loops join frames that are not there")
+        require(
+            len(self._weights) <= len(self._selection) and self._loops_from_nothing >= 0 and self._scale[0] > 0.0,
+            "an optimisation is of loops that are not there",
+        )
         require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
+
+
+def _soft_weights(edges: RelativePoses, poses: np.ndarray, kernel: float) -> np.ndarray:
+    """Weights ``(n,)`` of edges by a Cauchy kernel of this width, in deviations."""
+    squared = (edges.residuals(poses) ** 2).sum(1)
+    weights: np.ndarray = 1.0 / (1.0 + squared / kernel**2)
+    return weights
