@@ -28,7 +28,7 @@ FARTHEST = 40.0
 """Deviations of the odometry between two poses, over x, y and yaw, beyond which a loop contradicts it.
 
 Errors of steps are not independent: true loops of validation mazes are up to 25 deviations off in 2D (one drive of nine
-has 40) and 16 in 3D, wrong ones 60 to 130 in the median (docs/explanation/findings.md).
+has 40) and 16 in 3D, wrong ones 60 to 130 in the median (docs/notebook.md).
 """
 
 LEAST_STD = 0.01

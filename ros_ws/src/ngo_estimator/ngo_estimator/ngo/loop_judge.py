@@ -3,7 +3,7 @@
 In mazes the pair head and the ranges tell places well, on maps that nobody trained on poorly: of the
 loops that the pair head is sure of there, one in twenty joins one place. The odometry between the two poses and other
 loops nearby tell much more, and how much each of them is worth depends on the others
-(docs/explanation/findings.md). The judge is small, and learns from true poses (``training.train_loop_judge``).
+(docs/notebook.md). The judge is small, and learns from true poses (``training.train_loop_judge``).
 """
 
 from __future__ import annotations
