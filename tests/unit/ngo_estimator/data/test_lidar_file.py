@@ -27,7 +27,7 @@ def test_what_is_not_there_has_its_default(tmp_path: Path) -> None:
     config = read_lidar_file(given, "graph", ScanGraphConfig)
     assert (config.keys_between, config.kernel, config.loops.every) == (3, 2.0, 4)
     assert isinstance(config.kernel, float)
-    assert config.iterations == ScanGraphConfig().iterations and config.loops.search == ScanGraphConfig().loops.search
+    assert config.most_scans == ScanGraphConfig().most_scans and config.loops.search == ScanGraphConfig().loops.search
     assert read_lidar_file(given, "odometry", LidarOdometryConfig, "scan") == LidarOdometryConfig()
 
 
@@ -46,8 +46,8 @@ def test_the_shipped_file_is_read() -> None:
         ({**WHOLE, "graph": {"kernel": "3"}}, "float"),
         ({**WHOLE, "graph": {"kernel": True}}, "float"),
         ({**WHOLE, "graph": {"kernel": 10**400}}, "finite"),
-        ({**WHOLE, "graph": {"iterations": 2.5}}, "int"),
-        ({**WHOLE, "graph": {"iterations": None}}, "int"),
+        ({**WHOLE, "graph": {"keys_between": 2.5}}, "int"),
+        ({**WHOLE, "graph": {"keys_between": None}}, "int"),
         ({**WHOLE, "graph": []}, "object"),
         ({**WHOLE, "graph": {"loops": 3}}, "object"),
         ({**WHOLE, "more": 1}, "keys"),
