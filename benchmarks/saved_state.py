@@ -30,7 +30,7 @@ from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import compose
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.slam.saved_state import read_state, write_state

@@ -21,7 +21,7 @@ from torch.optim.lr_scheduler import OneCycleLR
 from tqdm import tqdm
 
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.networks.step_deviation import StepDeviation
 from ngo_estimator.networks.step_scaling import STEP_DEVIATION, StepDeviationConfig
 from training.common import records

@@ -19,7 +19,7 @@ from ngo_estimator.frontend.lidar import front_ends
 from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd, lidar_front_end
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig, LidarStep
 from ngo_estimator.geometry.planar_motion import chained
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.slam import scan_trajectory
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory

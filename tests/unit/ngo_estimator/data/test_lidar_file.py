@@ -8,7 +8,7 @@ import pytest
 
 from ngo_estimator.data.lidar_file import LIDAR_FILE, LidarFileError, is_lidar, read_lidar_file
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 
 WHOLE = {"format": 1, "estimator": "lidar", "world": "scan", "odometry": {}, "graph": {}}

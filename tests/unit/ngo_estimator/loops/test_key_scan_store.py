@@ -7,8 +7,7 @@ import pytest
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.loops.key_scan_store import KeyScanStore
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig, ScanLoopConfig
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from tests.unit.ngo_estimator.lidar_steps import HOUSE, drifted, lidar_steps, loop_way
 from tests.unit.ngo_estimator.ray_casting import ROOM, fan, scan_at

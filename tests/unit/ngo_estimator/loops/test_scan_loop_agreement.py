@@ -3,8 +3,8 @@
 import numpy as np
 
 from ngo_estimator.loops.scan_loop_agreement import with_agreement
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 
 # Along a straight line and back over the same places.
 POSES = np.array([(float(min(k, 19 - k)), 0.0, 0.0 if k < 10 else np.pi) for k in range(20)])

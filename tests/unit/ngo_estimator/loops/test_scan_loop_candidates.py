@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from ngo_estimator.loops.scan_loop_candidates import WindowConfig, distance_windows, graph_distances
+from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
+from ngo_estimator.loops.scan_settings import WindowConfig
 
 
 def test_the_graphs_distance_goes_over_loops() -> None:

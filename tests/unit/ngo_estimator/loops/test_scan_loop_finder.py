@@ -11,14 +11,10 @@ import pytest
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.scan_points import key_scan
-from ngo_estimator.loops.scan_loop_candidates import (
-    WindowConfig,
-    distance_windows,
-    graph_distances,
-)
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+from ngo_estimator.loops.scan_settings import ScanLoopConfig, WindowConfig
 from tests.unit.ngo_estimator.loops.buildings import (
     HALLWAY,
     MOUNTING,

@@ -6,9 +6,9 @@ import pytest
 from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 
 COVARIANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.state_arrays import StateError, restore, state_of
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 
 
 def some_loops(*pairs: tuple[int, int]) -> ScanLoops:
@@ -33,8 +33,3 @@ def test_a_state_with_loops_of_other_keys_is_refused() -> None:
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="shape"):
         ScanLoops(np.zeros((2, 2)), np.zeros((1, 3)), np.zeros((2, 3, 3)), np.zeros((2, 6)), np.zeros(2, bool))
-
-
-def test_shares_above_one_are_refused() -> None:
-    with pytest.raises(ValueError, match="shares"):
-        ScanLoopConfig(least_response=1.5)

@@ -18,7 +18,7 @@ from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.data.state_arrays import Arrays, StateError
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.graph import key_frames
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam import saved_state
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory

@@ -8,7 +8,7 @@ import pytest
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.scan_graph import ScanGraph
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, TWICE, between, scan_at
 

@@ -11,7 +11,7 @@ import numpy as np
 from ngo_estimator.geometry.branch_and_bound import search
 from ngo_estimator.geometry.scan_matching import icp
 from ngo_estimator.loops.key_scan_views import within
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import Submap
 from ngo_estimator.loops.walls_seen_through import PlacedScans, seen_through
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from ngo_estimator.geometry.se2 import between, compose, wrap
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 
 _DISAGREEMENT, _AGREEING = EVIDENCE.index("disagreement"), EVIDENCE.index("agreeing")
 

@@ -9,37 +9,7 @@ import numpy as np
 from ngo_estimator.geometry.planar_motion import between
 from ngo_estimator.graph.shortest_ways import shortest_ways
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
-
-
-@dataclass(frozen=True)
-class WindowConfig:
-    """How far a pose may be from where the graph has it.
-
-    ``least_m`` and ``share`` of the graph's distance, at most ``most_m``; in heading ``least_deg`` and ``deg_per_m``,
-    at most ``most_deg``. ``deviations`` of a covariance are searched where covariances are given, within the same
-    limits.
-    """
-
-    least_m: float = 0.3
-    share: float = 0.04
-    most_m: float = 8.0
-    least_deg: float = 8.0
-    deg_per_m: float = 0.25
-    most_deg: float = 45.0
-    deviations: float = 3.0
-
-    def __post_init__(self) -> None:
-        if not (0.0 < self.least_m <= self.most_m < math.inf and 0.0 < self.least_deg <= self.most_deg <= 180.0):
-            raise ValueError(
-                f"least_m, most_m, least_deg, most_deg are {self.least_m}, {self.most_m}, {self.least_deg}, "
-                f"{self.most_deg}; expected positive limits, least no larger than most, degrees at most 180"
-            )
-        if not (self.share >= 0.0 and self.deg_per_m >= 0.0 and self.deviations > 0.0):
-            raise ValueError(
-                f"share, deg_per_m, deviations are {self.share}, {self.deg_per_m}, {self.deviations}; expected two "
-                "numbers from 0 on, and a positive one"
-            )
+from ngo_estimator.loops.scan_settings import ScanLoopConfig, WindowConfig
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_fit import fit
 from ngo_estimator.loops.scan_loop_agreement import with_agreement
 from ngo_estimator.loops.scan_loop_candidates import LoopCandidate, loop_candidates
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
 from ngo_estimator.loops.scan_loops import ScanLoops
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
 
 

@@ -9,8 +9,8 @@ from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
 from ngo_estimator.graph.ways_through_graph import way_covariances
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loops import ScanLoops
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 
 
 class ScanLoopSelection:

@@ -12,7 +12,7 @@ from ngo_estimator.geometry.branch_and_bound import PooledGrid, pooled_grid
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.line_map import LineMap, line_map_of_points
 from ngo_estimator.loops.key_scan_views import within
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.walls_seen_through import PROFILE_BINS, PlacedScans, placed
 
 SUBMAP_VARIANCE = np.diag((0.01**2, 0.01**2, math.radians(0.15) ** 2))

@@ -13,11 +13,11 @@ from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.loops.key_scan_store import KeyScanStore
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
 from ngo_estimator.slam.scan_matcher import ScanMatcher

@@ -15,7 +15,7 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed, turned_covariance
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_fit import fit, search_points
-from ngo_estimator.loops.scan_loop_config import ScanLoopConfig
+from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
 from ngo_estimator.loops.walls_seen_through import PlacedScans, range_profile
 from ngo_estimator.slam.sightings import Sightings

@@ -9,7 +9,7 @@ import numpy as np
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.geometry.planar_covariance import bounded
-from ngo_estimator.loops.scan_graph_config import ScanGraphConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_localisation import MapLocalisation
