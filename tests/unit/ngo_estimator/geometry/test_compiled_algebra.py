@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import fused_covariance, inverted, propagated, squared_deviations
-from ngo_estimator.graph.shortest_ways import shortest_ways
+from ngo_estimator.graph.shortest_paths import shortest_paths
 
 RANDOM = np.random.default_rng(0)
 
@@ -38,7 +38,7 @@ def test_a_turn_counts_the_shorter_way_round() -> None:
 
 
 @pytest.mark.parametrize("loops", [0, 1, 30, 300])
-def test_ways_are_those_of_dijkstra(loops: int) -> None:
+def test_shortest_paths_are_those_of_dijkstra(loops: int) -> None:
     count = 400
     chain = np.stack((np.arange(count - 1), np.arange(1, count)), axis=1)
     across = np.sort(RANDOM.integers(0, count, (loops, 2)), axis=1)
@@ -50,4 +50,4 @@ def test_ways_are_those_of_dijkstra(loops: int) -> None:
     graph = coo_array((shortest[rows, columns], (rows, columns)), shape=(count, count)).tocsr()
     for key in (0, 137, count - 1):
         expected = dijkstra(graph, directed=False, indices=key)
-        np.testing.assert_allclose(shortest_ways(edges, lengths, count, key), expected, rtol=1e-12)
+        np.testing.assert_allclose(shortest_paths(edges, lengths, count, key), expected, rtol=1e-12)

@@ -14,7 +14,7 @@ from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import compose, propagated
 from ngo_estimator.graph.frames import Frames
 from ngo_estimator.graph.relative_poses import RelativePoses
-from ngo_estimator.graph.scan_loop_thinning import largest_variances
+from ngo_estimator.graph.sparsification import largest_variances
 
 
 class KeyScanChain:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.geometry.planar_motion import between
-from ngo_estimator.graph.shortest_ways import shortest_ways
+from ngo_estimator.graph.shortest_paths import shortest_paths
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_settings import ScanLoopConfig, WindowConfig
 
@@ -24,15 +24,15 @@ class LoopCandidate:
 
 
 def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarray:
-    """Length ``(keys,)`` of the shortest way through the graph from a key to each other (m).
+    """Length ``(keys,)`` of the shortest path through the graph from a key to each other (m).
 
-    The ways lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys.
+    The paths lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys.
     """
     chain = np.arange(len(poses) - 1)
     nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), loops))
     lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
     # A millimetre more: a loop between keys in one place has a length, too.
-    distances: np.ndarray = shortest_ways(nodes, lengths + 1e-3, len(poses), key)
+    distances: np.ndarray = shortest_paths(nodes, lengths + 1e-3, len(poses), key)
     return distances
 
 

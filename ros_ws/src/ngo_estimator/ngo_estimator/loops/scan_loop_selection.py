@@ -6,9 +6,9 @@ import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.path_covariance import path_covariances
 from ngo_estimator.graph.relative_poses import RelativePoses
-from ngo_estimator.graph.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
-from ngo_estimator.graph.ways_through_graph import way_covariances
+from ngo_estimator.graph.sparsification import WALLS_M, largest_variances, needed_loops
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 
@@ -43,7 +43,7 @@ class ScanLoopSelection:
             return rows
         config, windows = self._config, self._config.windows
         loops, known = found[rows], found[self.rows]
-        covariance = way_covariances(
+        covariance = path_covariances(
             chain.nodes,
             np.concatenate((chain.edges, known.pairs)),
             np.concatenate((chain.step_covariance, known.covariance)),

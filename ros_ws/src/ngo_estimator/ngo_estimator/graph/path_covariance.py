@@ -1,16 +1,16 @@
-"""How well a graph of key scans knows one of them against another: the covariance along the surest way between them.
+"""How well a graph of key scans knows one of them against another: the covariance along the surest path between them.
 
-One way tells less than all of them together, so that the covariance is no smaller than the graph's.
+One path knows less than all of them together, so that the covariance is no smaller than the graph's.
 """
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ngo_estimator.graph.scan_loop_thinning import largest_variances
+from ngo_estimator.graph.sparsification import largest_variances
 
 
-def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def path_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Covariances ``(n, 3, 3)`` of the second key of each pair ``(n, 2)`` against the first, along the map's axes.
 
     Args:
@@ -19,7 +19,7 @@ def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray
             axes of its first key.
     """
     count, variance = len(poses), largest_variances(covariance)
-    # Of several edges between two keys the way leads over the surest.
+    # Of several edges between two keys the path leads over the surest.
     codes = edges.min(1) * count + edges.max(1)
     order = np.lexsort((variance, codes))
     known, first = np.unique(codes[order], return_index=True)
@@ -32,15 +32,15 @@ def way_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray
         while keys[-1] != end:
             keys.append(int(towards[keys[-1]]))
         steps = np.stack((keys[:-1], keys[1:]), axis=1)
-        way = order[first[np.searchsorted(known, steps.min(1) * count + steps.max(1))]]
-        start, pivot = poses[edges[way, 0]], poses[edges[way, 1]]
+        path = order[first[np.searchsorted(known, steps.min(1) * count + steps.max(1))]]
+        start, pivot = poses[edges[path, 0]], poses[edges[path, 1]]
         # An edge's error moves and turns all that lies behind it, about its second key.
-        moved = np.zeros((len(way), 3, 3))
+        moved = np.zeros((len(path), 3, 3))
         moved[:, 0, 0] = moved[:, 1, 1] = np.cos(start[:, 2])
         moved[:, 1, 0], moved[:, 2, 2] = np.sin(start[:, 2]), 1.0
         moved[:, 0, 1] = -moved[:, 1, 0]
         moved[:, 0, 2], moved[:, 1, 2] = pivot[:, 1] - poses[end, 1], poses[end, 0] - pivot[:, 0]
-        result[n] = (moved @ covariance[way] @ moved.mT).sum(0)
+        result[n] = (moved @ covariance[path] @ moved.mT).sum(0)
     return result
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ngo_estimator.graph.scan_loop_thinning import WALLS_M, largest_variances, needed_loops
+from ngo_estimator.graph.sparsification import WALLS_M, largest_variances, needed_loops
 
 CHAIN = np.array([(k, k + 1) for k in range(20)])
 
@@ -20,11 +20,11 @@ def needed(pairs: list[tuple[int, int]], surprising: bool = False, redundant: fl
 
 
 @pytest.mark.parametrize(("later", "expected"), [(5, False), (6, True)])
-def test_a_loop_is_needed_where_the_way_round_is_less_sure(later: int, expected: bool) -> None:
+def test_a_loop_is_needed_where_the_path_round_is_less_sure(later: int, expected: bool) -> None:
     assert needed([(0, later)]) == [expected]
 
 
-def test_a_loop_beside_one_that_is_kept_tells_nothing_new() -> None:
+def test_a_loop_beside_one_that_is_kept_adds_nothing_new() -> None:
     # From 19 to 1 it is one step, a loop and one step; from 15 to 4 five, a loop and four; from 0 to 10 as far.
     assert needed([(0, 20), (1, 19), (4, 15), (0, 10)]) == [True, False, True, True]
 

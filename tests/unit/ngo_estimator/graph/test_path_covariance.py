@@ -1,10 +1,10 @@
-"""Covariances along ways through a graph are those of what the edges' errors do to the poses."""
+"""Covariances along paths through a graph are those of what the edges' errors do to the poses."""
 
 import numpy as np
 
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import between, compose
-from ngo_estimator.graph.ways_through_graph import way_covariances
+from ngo_estimator.graph.path_covariance import path_covariances
 
 RANDOM = np.random.default_rng(5)
 STEPS = RANDOM.normal(size=(8, 3)) * (0.5, 0.2, 0.6) + (0.5, 0.0, 0.0)
@@ -28,11 +28,11 @@ def test_along_a_chain_it_is_the_covariance_of_its_steps() -> None:
     expected = np.zeros((3, 3))
     for k in range(2, len(STEPS)):
         expected = propagate(expected, poses[k + 1], STEPS[k], covariance[k])
-    found = way_covariances(poses, CHAIN, covariance, np.array([(2, len(STEPS))]))
+    found = path_covariances(poses, CHAIN, covariance, np.array([(2, len(STEPS))]))
     np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
-def test_a_way_may_lead_backwards_and_over_a_loop() -> None:
+def test_a_path_may_lead_backwards_and_over_a_loop() -> None:
     """From key 3 back to 1, over a loop to 8, back to 6: all but two of the steps count as unknown."""
     poses, edges = chained(), np.concatenate((CHAIN, [(1, 8)]))
     covariance = spread(len(edges))
@@ -48,5 +48,5 @@ def test_a_way_may_lead_backwards_and_over_a_loop() -> None:
             other = compose(after, between(before, poses[6]))
             moved[:, axis] = (other - poses[6]) / 1e-6
         expected += moved @ covariance[edge] @ moved.T
-    found = way_covariances(poses, edges, covariance, np.array([(3, 6)]))
+    found = path_covariances(poses, edges, covariance, np.array([(3, 6)]))
     np.testing.assert_allclose(found[0], expected, rtol=1e-4, atol=1e-9)

@@ -1,12 +1,12 @@
-"""Which loops a graph needs: one between keys that it knows against each other already tells it nothing new.
+"""Sparsification: which loops a graph needs. One between keys that it knows against each other adds nothing new.
 
-What is kept is a spanner of the graph: where a loop is left out, a way over others is nearly as sure.
+What is kept is a spanner of the graph: where a loop is left out, a path over others is nearly as sure.
 The cost of an optimisation then follows what the robot saw, and not how often it saw it.
 """
 
 import numpy as np
 
-from ngo_estimator.graph.shortest_ways import shortest_ways
+from ngo_estimator.graph.shortest_paths import shortest_paths
 
 WALLS_M = 4.0
 """Distance of the walls: an error of heading counts by what it moves there."""
@@ -25,7 +25,7 @@ def needed_loops(
 ) -> np.ndarray:  # fmt: skip
     """Which of some new loops ``(n,)`` a graph needs, in their order.
 
-    A loop is needed where no way through the graph joins its keys with at most ``redundant`` times its variance, or
+    A loop is needed where no path through the graph joins its keys with at most ``redundant`` times its variance, or
     where it is ``surprising`` ``(n,)``.
 
     Args:
@@ -37,6 +37,6 @@ def needed_loops(
     count = int(joined.max(initial=0)) + 1
     for k, (earlier, later) in enumerate(pairs):
         limit = redundant * own_variance[k]
-        known = shortest_ways(joined[kept], variance[kept], count, later)[earlier] <= limit
+        known = shortest_paths(joined[kept], variance[kept], count, later)[earlier] <= limit
         kept[len(edges) + k] = surprising[k] or not known
     return kept[len(edges) :]
