@@ -1,8 +1,7 @@
 """Pose selection: a bounded choice of poses from before the window, which keeps old places recognisable.
 
-Poses that leave the window come here; when there
-are too many, those go whose place is told and covered by others. What stays forms a chain from the origin to the
-window, so that a correction reaches everything between.
+Poses that leave the window come here. When there are too many, those go whose place others show and cover. What stays
+forms a chain from the origin to the window, so that a correction reaches everything between.
 """
 
 from dataclasses import dataclass

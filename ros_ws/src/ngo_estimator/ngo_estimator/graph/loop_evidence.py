@@ -20,8 +20,8 @@ _MOST_SUPPORT = 7.0
 """What agreeing partners can say for a loop, log odds: in a group that is wrong together all agree."""
 
 _SCALES = np.exp(np.linspace(math.log(1e-3), math.log(1e3), 61))
-_ROUNDS = 12  # of expectation and maximisation, for the share of right loops
-_FEW = 30  # loops from which on a scale and a share are estimated
+_ROUNDS = 12  # of expectation and maximisation, for the inlier ratio
+_FEW = 30  # loops from which on a scale and an inlier ratio are estimated
 _LARGEST = 50.0  # log odds of one cycle, either way
 
 
@@ -45,8 +45,8 @@ def likelihood_ratio(
     return ratio
 
 
-def scale_and_share(chain: ChainUncertainty, loops: RelativePoses, area: float) -> tuple[float, float]:
-    """How many times as large as stated variances are, and the share of right loops, by cycles with the chain alone.
+def scale_and_inlier_ratio(chain: ChainUncertainty, loops: RelativePoses, area: float) -> tuple[float, float]:
+    """How many times as large as stated variances are, and the inlier ratio of loops, by cycles with the chain alone.
 
     The likeliest mixture of right and wrong loops. Both are 1 and a half where there are few loops.
     """
@@ -56,31 +56,33 @@ def scale_and_share(chain: ChainUncertainty, loops: RelativePoses, area: float) 
     best = (-math.inf, 1.0, 0.5)
     for scale in _SCALES.tolist():
         ratio = np.clip(likelihood_ratio(squared, logs, loops.degrees, area, scale), -_LARGEST, _LARGEST)
-        share = 0.5
+        inlier_ratio = 0.5
         for _ in range(_ROUNDS):
-            share = float(np.clip((1.0 / (1.0 + np.exp(-ratio) * (1.0 - share) / share)).mean(), 0.05, 0.95))
-        best = max(best, (float(np.log(share * np.exp(ratio) + 1.0 - share).sum()), scale, share))
+            inlier_ratio = float(
+                np.clip((1.0 / (1.0 + np.exp(-ratio) * (1.0 - inlier_ratio) / inlier_ratio)).mean(), 0.05, 0.95)
+            )
+        best = max(best, (float(np.log(inlier_ratio * np.exp(ratio) + 1.0 - inlier_ratio).sum()), scale, inlier_ratio))
     return best[1], best[2]
 
 
-def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, share: float) -> np.ndarray:
-    """Log odds ``(n,)`` of loops by their cycles with the chain and with each other; ``share`` of them are right."""
+def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float) -> np.ndarray:
+    """Log odds ``(n,)`` of loops by their cycles with the chain and with each other, from their inlier ratio on."""
     odds = likelihood_ratio(*chain.off_chain(loops), loops.degrees, area)
-    odds += math.log(share / (1.0 - share))
+    odds += math.log(inlier_ratio / (1.0 - inlier_ratio))
     whole = np.flatnonzero(loops.degrees == 3)
     if len(whole) > 1:
-        odds[whole] += np.minimum(_support(chain, loops[whole], area, share), _MOST_SUPPORT)
+        odds[whole] += np.minimum(_support(chain, loops[whole], area, inlier_ratio), _MOST_SUPPORT)
     return odds
 
 
-def _support(chain: ChainUncertainty, loops: RelativePoses, area: float, share: float) -> np.ndarray:
-    """What their partners say of loops ``(n,)``, log odds: each of these is right as often as ``share`` says."""
+def _support(chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float) -> np.ndarray:
+    """What their partners say of loops ``(n,)``, log odds: each of these is right as often as the inlier ratio says."""
     ends, count = loops.nodes.astype(np.float64), min(_PARTNERS + 1, len(loops))
     partner = KDTree(ends).query(ends, k=count, p=1)[1]
     pairs = np.stack((np.repeat(np.arange(len(loops)), count), partner.ravel()), axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     ratio = likelihood_ratio(*chain.off_pairs(loops, pairs), np.full(len(pairs), 3), area)
-    each = np.log(share * np.exp(np.minimum(ratio, _LARGEST)) + 1.0 - share)
+    each = np.log(inlier_ratio * np.exp(np.minimum(ratio, _LARGEST)) + 1.0 - inlier_ratio)
     return np.bincount(pairs[:, 0], each, len(loops))
 
 

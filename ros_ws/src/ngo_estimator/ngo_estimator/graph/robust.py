@@ -1,8 +1,8 @@
 """The robust corrector: no network, and right with most loops wrong.
 
-Two ways lead to a solution, and one cost judges between them: graduated non-convexity over all loops that the cycles do
-not rule out, and belief in the surest loops first. Covariances that are not as stated are scaled, which the cycles tell
-before anything is solved, and the residuals of what is believed tell afterwards.
+Two methods give a solution, and one cost judges between them: graduated non-convexity over all loops that the cycles do
+not rule out, and belief in the surest loops first. Covariances that are not as stated are scaled. The cycles measure
+the scale before anything is solved, and the residuals of what is believed measure it afterwards.
 """
 
 from dataclasses import replace
@@ -12,7 +12,7 @@ import numpy as np
 from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, normal_equations, truncated_cost
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.graduated import graduate
-from ngo_estimator.graph.loop_evidence import cycle_odds, map_area, scale_and_share
+from ngo_estimator.graph.loop_evidence import cycle_odds, map_area, scale_and_inlier_ratio
 from ngo_estimator.graph.normal_equations import GraphStructure
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.surest_first import believe
@@ -21,7 +21,7 @@ _MISSTATED = 2.0
 """Variances that are off by less than this factor, either way, are taken as stated."""
 
 _LEAST_SCALE = 1e-3
-"""Edges without any error, as of a computed graph, would tell a scale of zero."""
+"""Edges without any error, as of a computed graph, would give a scale of zero."""
 
 _NEAR = 1.0
 """Where graduated non-convexity begins at poses that are nearly right."""
@@ -36,7 +36,7 @@ _FEWER = 0.7
 """How many loops are tried where those before are too many."""
 
 _LEAST_REDUNDANCY = 30.0
-"""Degrees of freedom from which on residuals tell a scale."""
+"""Degrees of freedom from which on residuals measure a scale."""
 
 
 class Robust:
@@ -63,22 +63,25 @@ class Robust:
 
 def _from_nothing(problem: GraphProblem) -> CorrectedGraph:
     """The better of two solutions that begin at the chain."""
-    area, scale, share = map_area(problem.poses), 1.0, 0.5
+    area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
     chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
     whole = bool((problem.loops.degrees == 3).all())
     if whole:
-        scale, share = scale_and_share(ChainUncertainty(problem.steps), problem.loops, area)
+        scale, inlier_ratio = scale_and_inlier_ratio(ChainUncertainty(problem.steps), problem.loops, area)
         scale = _noticed(scale)
         scaled = _scaled(problem, scale, scale)
-    odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, share)
+    odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
     rows = np.argsort(-odds, kind="stable")
     if whole:  # places say too little of each other to rule one out
         rows = rows[: np.count_nonzero(odds > 0.0)]
     likely = _affordable(replace(scaled, poses=chain), rows)
-    ways = [graduate(likely, chain)[0], believe(likely, chain, np.zeros(len(likely.loops), bool), area, share)[0]]
-    best = min(ways, key=lambda poses: truncated_cost(scaled, poses))
+    solutions = [
+        graduate(likely, chain)[0],
+        believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio)[0],
+    ]
+    best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops))
-    # Cycles with the chain share its errors, so that they tell a scale roughly; what is left over tells it well.
+    # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
     if whole and scale not in (1.0, solution.loop_scale):
         solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops))
     return solution

@@ -1,6 +1,6 @@
 """Believes loops one handful after another, the surest first, each judged by what the graph knows by then.
 
-What is predicted well tells a right loop from a wrong one; every loop that is believed makes the rest predicted better.
+Good predictions separate right loops from wrong ones, and every loop that is believed makes the others' better.
 Loops that agree with each other and are wrong together have to pass the same test, each time in a better known graph.
 """
 
@@ -33,16 +33,16 @@ _AT_REST = 1e-2
 
 
 def believe(
-    problem: GraphProblem, poses: np.ndarray, believed: np.ndarray, area: float, share: float = 0.5
+    problem: GraphProblem, poses: np.ndarray, believed: np.ndarray, area: float, inlier_ratio: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)`` and which loops are believed ``(loops,)``, beginning with those that are.
 
     Args:
         area: see ``map_area``.
-        share: of right loops, before anything is known of them.
+        inlier_ratio: of the loops, before anything is known of them.
     """
     poses, believed, limits = poses.copy(), believed.copy(), thresholds(problem.loops)
-    prior = math.log(share / (1.0 - share)) + np.log(np.maximum(problem.trust, 1e-9))
+    prior = math.log(inlier_ratio / (1.0 - inlier_ratio)) + np.log(np.maximum(problem.trust, 1e-9))
     rows, structure = np.arange(len(problem.loops)), None
     alive = np.ones(len(rows), bool)
     for _ in range(_MOST_ROUNDS):

@@ -235,8 +235,8 @@ def each_from_elsewhere(
 ) -> tuple[Tensor, Tensor]:
     """The ``count`` best of each row ``(..., n)``, and their indices, both ``(..., count)``.
 
-    Neighbours of a candidate would tell the same again. Each candidate is more than ``apart`` away from the better
-    ones; where there is none left, the value is ``none``. ``places`` ``(n,)`` are the numbers that tell how far
+    Neighbours of a candidate would say the same again. Each candidate is more than ``apart`` away from the better
+    ones; where there is none left, the value is ``none``. ``places`` ``(n,)`` are the numbers that say how far
     candidates are apart, by default their indices.
     """
     places = torch.arange(values.shape[-1], device=values.device) if places is None else places

@@ -160,8 +160,8 @@ class OnlineLoops:
         if candidates is None:
             return PlaceLoops.none()
         frames = candidates.frames
-        told = candidates.measured, candidates.log_scale
-        measurement = registered(self._pair_head, candidates.views, *told, self._search.registrations)
+        measured = candidates.measured, candidates.log_scale
+        measurement = registered(self._pair_head, candidates.views, *measured, self._search.registrations)
         of_frame = torch.from_numpy(np.stack([frame.pose for frame in frames])).float()
         found = PlaceLoops.found(
             np.array([frame.node for frame in frames]),

@@ -1,6 +1,6 @@
 """Loops between frames that see the same walls, where the poses say so: looked for once poses have been corrected.
 
-A place is told by how it looks, from much the same pose. Two frames that face each other along a
+A place is recognised by how it looks, from much the same pose. Two frames that face each other along a
 corridor look nothing alike, and yet share its walls; with poses good enough to know that, their ranges are registered,
 as scan matching back ends do (Hess et al. 2016).
 """

@@ -1,4 +1,4 @@
-"""Frames that look like every place tell none: a white wall, a dead camera, weights that know nothing of this world."""
+"""Frames that look like every place show none: a white wall, a dead camera, weights that know nothing of this world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ ALIKE = 0.9
 """Similarity from which on two frames look the same."""
 
 FEWEST_PLACES, LARGEST_SHARE = 10, 0.3
-"""A frame that looks like at least so many places, and like more than this share of all, tells nothing.
+"""A frame that looks like at least so many places, and like more than this share of all, shows no place.
 
 In validation mazes a frame looks like 8 places at most, and like a fifth of all.
 """
@@ -25,7 +25,7 @@ def places_by_odometry(positions: Tensor, size_m: float) -> Tensor:
 
 
 def looks_like_everything(similarity: Tensor, places: Tensor, visited: Tensor) -> Tensor:
-    """Whether a frame looks like so many places that it tells none ``(...)``.
+    """Whether a frame looks like so many places that it shows none ``(...)``.
 
     Args:
         similarity: to other frames ``(batch, n, frames)``, or ``(frames,)``.

@@ -27,7 +27,7 @@ class PlaceLoops(LoopRecord):
 
     ``frame`` ``(n,)`` is the earlier frame, as the number of steps before it. ``log_scale`` ``(n, 2)``, ``spread``
     ``(n, 2)``, ``logit`` ``(n,)`` and ``similarity`` ``(n,)`` are as of ``Loops``. ``most_drift`` ``(n, 3)`` is
-    infinite if the odometry tells enough. ``overlap`` ``(n,)`` says whether the loop was found by poses, not by its
+    infinite if the odometry says enough. ``overlap`` ``(n,)`` says whether the loop was found by poses, not by its
     place. ``weight`` ``(n,)`` is the optimizer's last weight, ``UNWEIGHED`` before it had one, and ``information``
     ``(n, 3)`` what it gave the loop.
     """

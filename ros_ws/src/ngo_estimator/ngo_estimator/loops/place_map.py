@@ -1,4 +1,4 @@
-"""The frames of a map whose places are told by codes."""
+"""The frames of a map whose places are recognised by codes."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class ScanLoopSelection:
     def believed(self, fresh: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> np.ndarray:
         """Those of the newly accepted loops that the graph may use, and of others that have waited.
 
-        A search tells a place from others within its window. A robot that may be farther away may be in another place
+        A search distinguishes places within its window alone. A robot that may be farther away may be in another place
         that looks alike, which was not searched: then more loops must agree. A loop waits for as long as more may.
         """
         rows = np.concatenate((self.doubted, fresh))

@@ -9,9 +9,9 @@ from ngo_estimator.loops.loop_record import LoopRecord, rows
 EVIDENCE = ("response", "second_peak", "on_lines", "seen_through", "disagreement", "agreeing")
 """Columns of a loop's evidence.
 
-The mean likelihood of the points (0 to 1), the second peak's share of it, the share of points on lines, the share of
-sightings through walls, the distance from the graph's pose in deviations (a third of the window), and the number of
-neighbouring loops that agree.
+The mean likelihood of the points (0 to 1), the ratio of the second peak to it, the inlier ratio (points on lines), the
+share of sightings through walls, the distance from the graph's pose in deviations (a third of the window), and the
+number of neighbouring loops that agree.
 """
 
 

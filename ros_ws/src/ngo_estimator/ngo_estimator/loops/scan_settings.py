@@ -46,7 +46,7 @@ class ScanLoopConfig:
     least_on_lines: float = 0.6
     """Inlier ratio at least: of the points those on lines of the submap, 0 to 1."""
     most_seen_through: float = 0.15
-    """Ratio at most of the sightings that lead through walls, 0 to 1."""
+    """Share at most of the sightings that lead through walls, 0 to 1."""
     most_disagreement: float = 3.0
     """Distance at most from the graph's pose (deviations)."""
     least_agreeing: int = 1

@@ -13,7 +13,7 @@ _AGREEING = 5.0
 """Ranges agree that differ by so many of their deviations, and half of the drift."""
 
 _EVERY = 3
-"""One of so many rays tells whether frames share what they see."""
+"""One of so many rays shows whether frames share what they see."""
 
 
 @njit(cache=True, error_model="numpy")

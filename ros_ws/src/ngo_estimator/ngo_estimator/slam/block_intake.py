@@ -33,7 +33,7 @@ class BlockIntake:
         self._odometry, self._nodes, self._loops = odometry, nodes, loops
         self._overlaps, self._scale = overlaps, scale
         self.solved = SolvedGraph.none()
-        """The last optimisation, set by its owner: it limits the drift of loops, and tells whether poses are fresh."""
+        """The last optimisation, set by its owner: it limits the drift of loops, and says whether poses are fresh."""
 
     def take(self) -> str:
         """Take in the newest block; returns a fault in words, or nothing. A fault costs loops or features alone."""

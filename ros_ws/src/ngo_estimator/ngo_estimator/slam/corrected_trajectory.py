@@ -21,7 +21,7 @@ AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
 
 
 class CorrectedTrajectory(ABC):
-    """Takes steps into a log and a graph, and tells what each changed.
+    """Takes steps into a log and a graph, and reports what each changed.
 
     A step is answered by the odometry behind the last corrected pose. ``correct`` does the work that it makes due: the
     search for loops, and an optimisation. A live node calls it when it has published the answer, in the time until the
@@ -200,7 +200,7 @@ class CorrectedTrajectory(ABC):
         return update
 
     def _begin_result(self) -> None:
-        """Forget what the last result told, and do the work that is left of it."""
+        """Forget what the last result reported, and do the work that is left of it."""
         self._optimized, self._fault = False, ""
         self._work()
 

@@ -90,7 +90,7 @@ class Localisation:
 
 
 class Localiser:
-    """Takes steps, and tells where in the map the robot is once that is beyond doubt."""
+    """Takes steps, and reports where in the map the robot is once that is beyond doubt."""
 
     def __init__(self, matcher: MapMatcher, config: LocalisationConfig | None = None) -> None:
         self.config = config or LocalisationConfig()

@@ -15,7 +15,7 @@ from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 
 @dataclass(frozen=True)
 class LocalisedStep:
-    """What a step told.
+    """What a step showed.
 
     ``found`` is what is known of the pose after it, ``map_from_odom_xyyaw`` (3,) goes with a pose that is known, None
     otherwise. ``restarted``: the odometry began anew, ``gap``: steps before this one were lost. ``joined`` is what it

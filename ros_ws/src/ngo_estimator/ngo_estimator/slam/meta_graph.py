@@ -199,7 +199,7 @@ class MetaGraph(PoseGraph):
         self._pose, self._covariance = self._odometry.carried(self._nodes.poses[-1], end + np.outer(moved, moved))
 
     def _verified(self, loops: Loops) -> Loops:
-        """The same loops; none across a blind stretch where place codes alone tell them.
+        """The same loops; none across a blind stretch where place codes alone show them.
 
         Nothing limits the motion within it, so that each place that looks alike would do.
         """

@@ -16,8 +16,8 @@ from ngo_estimator.ngo.pose_aggregation import block_variances, poses_in_blocks
 from ngo_estimator.ngo.registered_odometry import registered_steps
 from ngo_estimator.slam.step_log import StepLog
 
-_TOLD_LATE = 16
-"""Frames before the first unfamiliar one that were taken for familiar and may not have been: a mean over them tells."""
+_NOTICED_LATE = 16
+"""Frames before the first unfamiliar one that were taken for familiar and may not have been: their mean decides."""
 
 _STD = (1e-6, 1e2)
 """What a step's deviation is limited to (m or rad)."""
@@ -42,7 +42,7 @@ class OdometryBlocks:
         self.frames = Frames()
         """All of them, each last one of a block a node."""
         config = optimizer.config.aggregation
-        recalled = -(-_TOLD_LATE // self._block) + 1
+        recalled = -(-_NOTICED_LATE // self._block) + 1
         steps_kept = (2 * self._context + 2 + recalled) * self._block
         self._relative = SlidingRows((3,), np.float32, steps_kept)
         self._log_std = SlidingRows((3,), np.float32, steps_kept)
@@ -134,7 +134,7 @@ class OdometryBlocks:
 
     def recall(self) -> int:
         """Take the newest frames back, which were taken for familiar; returns the number of their first step."""
-        first = max(0, len(self._familiar) - _TOLD_LATE)
+        first = max(0, len(self._familiar) - _NOTICED_LATE)
         self._familiar.slice(first)[:] = False
         self._recalled = min(first // self._block, self.blocks)
         if self.registrations and self._recalled < self.blocks:

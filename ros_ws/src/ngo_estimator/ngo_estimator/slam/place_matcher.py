@@ -29,7 +29,7 @@ from ngo_estimator.ngo.loop_gates import RobustLoopGate
 from ngo_estimator.slam.sightings import Sightings
 
 _KEPT = 16  # frames: views reach back that far and less
-_LOOKED_AT = 256  # most similar frames of the map, among which places are told apart
+_LOOKED_AT = 256  # most similar frames of the map, among which places are distinguished
 _NEAR = 64  # frames around the expected pose whose ranges are compared
 _APART_RAD = 0.5  # two frames that are turned so much from each other are two candidates
 _FLOOR_M, _FLOOR_RAD = 1e-3, 1e-4  # of a sighting's deviations: the map is no better

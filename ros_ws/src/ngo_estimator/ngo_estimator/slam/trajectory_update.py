@@ -1,4 +1,4 @@
-"""What a trajectory that is corrected online tells: after each step, and as a whole."""
+"""What a trajectory that is corrected online reports: after each step, and as a whole."""
 
 from dataclasses import dataclass
 
