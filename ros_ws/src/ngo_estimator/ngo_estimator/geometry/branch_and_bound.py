@@ -51,24 +51,26 @@ class SearchMatch:
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How finely poses are searched.
-
-    ``resolution_m`` is the size of a cell and the step of positions, ``heading_step_deg`` the step of headings.
-    ``deviation_m`` is the deviation of a point from the wall it belongs to. Blocks have up to ``2 ** depth`` cells a
-    side. Poses farther than ``separation_m`` or ``separation_deg`` from the best are well separated. Responses below
-    ``least_response`` and second peaks below ``least_second`` of the first are not told apart. After ``most_blocks``
-    blocks the search is cut short.
-    """
+    """How finely poses are searched."""
 
     resolution_m: float = 0.08
+    """Size of a cell, and step of positions (m)."""
     heading_step_deg: float = 2.0
+    """Step of headings (degrees)."""
     deviation_m: float = 0.1
+    """Deviation of a point from the wall it belongs to (m)."""
     depth: int = 6
+    """Blocks have up to ``2 ** depth`` cells a side."""
     separation_m: float = 0.8
+    """Poses farther than this from the best are well separated (m)."""
     separation_deg: float = 15.0
+    """Poses turned by more than this from the best are, too (degrees)."""
     least_response: float = 0.4
+    """Responses below this are not distinguished, 0 to 1."""
     least_second: float = 0.7
+    """Second peaks below this part of the first are not distinguished, 0 to 1."""
     most_blocks: int = 100_000
+    """Blocks after which the search is cut short."""
 
     def __post_init__(self) -> None:
         lengths = (self.resolution_m, self.heading_step_deg, self.deviation_m, self.separation_m, self.separation_deg)

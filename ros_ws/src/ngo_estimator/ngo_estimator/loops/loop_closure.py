@@ -24,29 +24,28 @@ from ngo_estimator.networks.place_encoder import PairHead
 
 @dataclass(frozen=True)
 class LoopSearch:
-    """Which pairs of frames become loop candidates.
-
-    ``per_pose`` candidates for each meta-pose, at least ``min_separation`` meta-poses older and more than
-    ``min_apart`` meta-poses from each other, and of the whole trajectory the ``most`` with the highest belief. Each
-    is measured between ``views`` pairs of frames around it, and then registered in ``registrations`` steps, where the
-    place codes hold ranges; so are the steps of the odometry, where these are good enough (``registered_odometry``).
-    With ranges, ``overlaps`` more are looked for where poses say that frames see the same (``overlaps.find_overlaps``).
-    With ``drift_m`` and ``drift_rad``, candidates are the most similar of those frames alone that may show the same
-    place by the odometry, which drifts so much in the first of the steps between (``may_show_one_place``).
-    With ``least_belief``, a judge has learned how likely a loop is to join one place, by the odometry between its
-    poses and by others nearby: one that is less likely is left out (``loop_judge``).
-    """
+    """Which pairs of frames become loop candidates."""
 
     per_pose: int = 4
+    """Candidates at most for each meta-pose."""
     most: int = 512
+    """Candidates at most of a whole trajectory: those with the highest belief."""
     min_separation: int = 6
+    """Meta-poses at least between a meta-pose and its candidates."""
     min_apart: int = 1
+    """Candidates of one meta-pose are more than so many meta-poses from each other."""
     views: int = 5
+    """Pairs of frames around a candidate between which it is measured."""
     registrations: int = 0
+    """Steps of a registration by ranges, for candidates and for odometry that is good enough; 0 for none."""
     overlaps: int = 0
+    """Candidates more, where poses say that frames see the same (``overlaps.find_overlaps``); 0 for none."""
     least_belief: float = 0.0
+    """Loops that a judge holds for less likely are left out (``loop_judge``); 0 for no judge."""
     drift_m: float = 0.0
+    """Drift of the odometry in the first step between (m): it limits candidates; 0 for candidates from anywhere."""
     drift_rad: float = 0.0
+    """The same of the heading (rad); see ``may_show_one_place``."""
 
     def __post_init__(self) -> None:
         if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:

@@ -48,30 +48,30 @@ _ODOMETRY_NOISE = (2.0, 2.0, 1.0)
 
 @dataclass(frozen=True)
 class NeuralGraphOptimizerConfig:
-    """Configuration of the optimizer; ``paper_form`` gives the paper's.
-
-    The optimizer runs ``iterations`` iterations of attend and optimise, which share their weights. ``attention`` is
-    ``softmax``, or ``sum`` for the paper's C / sum(C). ``dilations`` holds one number for each convolution. With
-    ``residual`` each convolution is added to its input and normalised over its channels.
-    With ``loops`` the convolutions see the residuals of the loop candidates under the current poses, and each iteration
-    ends with a Gauss-Newton step that reduces these. ``search`` says how candidates are found.
-    Without ``network`` there are only Gauss-Newton steps, and one learned factor for the deviations of the odometry.
-    A ``smoother`` smooths the odometry before meta-poses are made of it.
-    ``correction_std`` (m, m, rad) is the unit of the adjustments: the typical error of a relative meta-pose.
-    ``covariance_scale`` multiplies the covariance of a pose. It is fitted to the errors on validation data.
-    """
+    """Configuration of the optimizer; ``paper_form`` gives the paper's."""
 
     aggregation: PoseAggregationConfig
+    """How steps become meta-poses and their features."""
     iterations: int = 5
+    """Iterations of attend and optimise, which have their weights in common."""
     attention: str = "softmax"
+    """Form of the attention: ``softmax``, or ``sum`` for the paper's C / sum(C)."""
     dilations: tuple[int, ...] = (1, 1, 2, 4, 8, 4, 2, 1, 1)
+    """Dilation of each convolution."""
     residual: bool = True
+    """Whether each convolution is added to its input and normalised over its channels."""
     loops: bool = True
+    """Whether convolutions see the residuals of loop candidates, and each iteration ends with a Gauss-Newton step."""
     network: bool = True
+    """Whether there is a network; without, Gauss-Newton steps alone, and one learned factor for the odometry."""
     smoother: SmootherConfig | None = None
+    """Smooths the odometry before meta-poses are made of it; None for none."""
     search: LoopSearch = field(default_factory=LoopSearch)
+    """How loop candidates are found."""
     correction_std: tuple[float, float, float] = (0.05, 0.05, 0.02)
+    """Unit of the adjustments, the typical error of a relative meta-pose (m, m, rad)."""
     covariance_scale: float = 1.0
+    """Factor of a pose's covariance, fitted to the errors on validation data."""
 
     def __post_init__(self) -> None:
         if self.attention not in ("softmax", "sum"):

@@ -36,23 +36,24 @@ _STRONG = 0.8
 
 @dataclass(frozen=True)
 class LocalisationConfig:
-    """When a pose is claimed, and when it is lost again. Lengths are given in places, the matcher's ``place_m``.
-
-    The map is looked at after every ``look_places`` or ``look_deg`` of motion, and the last ``window`` looks count. A
-    claim needs the support of ``least_support`` looks, and of ``least_share`` of the window, over ``least_way_places``
-    of way, and another pose at most ``most_rival`` of that support. A pose is lost where another one could be claimed,
-    where ``least_support`` of strong belief gathers in the window and nothing agrees, or where the deviation of the
-    position passes ``lost_places``.
-    """
+    """When a pose is claimed, and when it is lost again. A place has the length of the matcher's ``place_m``."""
 
     look_places: float = 0.4
+    """Motion after which the map is looked at (places)."""
     look_deg: float = 10.0
+    """Turn after which it is looked at (degrees)."""
     window: int = 24
+    """Last looks that count."""
     least_support: float = 7.0
+    """Looks that must support a claim; so much strong belief against a pose, and nothing for it, loses it."""
     least_share: float = 0.7
+    """Share of the window that must support a claim, 0 to 1."""
     least_way_places: float = 3.0
+    """Path over which the support must be spread (places)."""
     most_rival: float = 0.35
+    """Support of another pose at most, as a share of the claim's, 0 to below 1."""
     lost_places: float = 2.0
+    """Deviation of the position past which a pose is lost (places)."""
 
     def __post_init__(self) -> None:
         positive = (self.look_places, self.look_deg, self.least_support, self.lost_places)
