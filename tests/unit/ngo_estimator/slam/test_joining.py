@@ -186,7 +186,7 @@ def test_a_told_pose_joins_at_the_next_key_scan() -> None:
         core.update(step)
     joining, steps = Joining(core, ORIGIN), second.again()
     own = between(first.truth[0], second.truth[0])
-    joining.tell(ORIGIN.poses(own), np.diag((0.05, 0.05, 0.02)) ** 2)
+    joining.set_pose(ORIGIN.poses(own), np.diag((0.05, 0.05, 0.02)) ** 2)
     updates = list(joined(joining, core, steps[:20]))
     at = next(k for k, step in enumerate(steps) if step.key is not None)
     assert [update is not None for update in updates] == [k >= at for k in range(20)]

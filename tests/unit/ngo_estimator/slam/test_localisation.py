@@ -149,10 +149,10 @@ def test_without_sightings_the_odometry_carries_the_pose_until_it_says_nothing_a
 def test_a_pose_that_is_told_holds_at_once_and_a_wrong_one_is_found_out() -> None:
     at = Map()
     localiser = Localiser(at)
-    localiser.tell(np.zeros(3), np.diag((0.2, 0.2, 0.05)))
+    localiser.set_pose(np.zeros(3), np.diag((0.2, 0.2, 0.05)))
     (found,) = drive(localiser, at, 1)
     assert found.pose_xyyaw is not None and off(found, at)[0] < 0.1
-    localiser.tell(np.array((15.0, 0.0, 0.0)), np.diag((0.2, 0.2, 0.05)))
+    localiser.set_pose(np.array((15.0, 0.0, 0.0)), np.diag((0.2, 0.2, 0.05)))
     later = list(drive(localiser, at, 60))
     assert off(later[0], at)[0] > 10.0 and any(one.lost for one in later) and off(later[-1], at)[0] < 0.05
 
@@ -160,7 +160,7 @@ def test_a_pose_that_is_told_holds_at_once_and_a_wrong_one_is_found_out() -> Non
 def test_a_told_pose_settles_an_ambiguity() -> None:
     at = Map(((0.0, 0.0, 0.0), (8.0, 1.0, 0.0)))
     localiser = Localiser(at)
-    localiser.tell(at.pose, np.diag((0.2, 0.2, 0.05)))
+    localiser.set_pose(at.pose, np.diag((0.2, 0.2, 0.05)))
     found = list(drive(localiser, at, 60))
     assert all(one.pose_xyyaw is not None for one in found) and off(found[-1], at)[0] < 0.05
 

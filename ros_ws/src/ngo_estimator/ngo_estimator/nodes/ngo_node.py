@@ -316,7 +316,7 @@ class NgoNode(ManagedNode):
         x, y, yaw = given[0].tolist()
         there = f"the robot is at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad"
         if self._search is not None:
-            self._search.tell(*given)
+            self._search.set_pose(*given)
             self._out.smoothing.reset()
             self.get_logger().info(f"{there}, as it was told")
             return

@@ -27,9 +27,9 @@ class PoseSearch:
         self._search.reset()
         self._newest = None
 
-    def tell(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
+    def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
         """Take the pose ``(3,)`` in ``map``, and its covariance ``(3, 3)``, from somebody who knows them."""
-        self._search.tell(pose_xyyaw, covariance)
+        self._search.set_pose(pose_xyyaw, covariance)
 
     def details(self) -> dict[str, str]:
         """Values for diagnostics."""

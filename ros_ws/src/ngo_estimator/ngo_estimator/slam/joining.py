@@ -29,9 +29,9 @@ class Joining:
         """Forget where the robot may be."""
         self._localisation.reset()
 
-    def tell(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
+    def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
         """Take the pose ``(3,)`` in ``map``, and its covariance ``(3, 3)``, from somebody who knows them."""
-        self._localisation.tell(pose_xyyaw, covariance)
+        self._localisation.set_pose(pose_xyyaw, covariance)
 
     def update(self, step: RelativeStep) -> LocalisedStep:
         """Take the next step; where it says where the robot is, the trajectory goes on from there.

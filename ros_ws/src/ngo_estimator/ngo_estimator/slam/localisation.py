@@ -109,7 +109,7 @@ class Localiser:
         self._track: tuple[np.ndarray, np.ndarray] | None = None
         self._modes: tuple[Mode, ...] = ()
 
-    def tell(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
+    def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
         """Take the newest frame's pose ``(3,)`` and covariance ``(3, 3)`` from somebody who knows them."""
         self._track = pose_xyyaw.astype(np.float64), covariance.astype(np.float64)
         self._window.clear()

@@ -44,9 +44,9 @@ class MapLocalisation:
         self._log.reset()
         self._localiser.reset()
 
-    def tell(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
+    def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
         """Take the pose ``(3,)`` in the map, and its covariance ``(3, 3)``, from somebody who knows them."""
-        self._localiser.tell(pose_xyyaw, bounded(covariance))
+        self._localiser.set_pose(pose_xyyaw, bounded(covariance))
 
     def update(self, step: RelativeStep) -> LocalisedStep:
         """Take the next step; raises ``RejectedStep`` for one that cannot be used. Everything is then as before."""
