@@ -26,8 +26,8 @@ def test_registration_and_the_search_for_loops_are_compiled() -> None:
 
 
 ODOMETRY = """
-from ngo_estimator.nodes.lidar_input import LidarOdometry, warm_up_odometry
-LidarOdometry.load(WEIGHTS, "scan")
+from ngo_estimator.nodes.lidar_input import load_front_end, warm_up_odometry
+load_front_end(WEIGHTS, "scan")
 warm_up_odometry()
 """
 TRAJECTORY = """
