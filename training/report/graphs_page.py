@@ -14,7 +14,8 @@ error below 0.5 m counts as solved. Means are over graphs, with intervals of 95 
 times, so that a busy machine does not change them. A peer that computes for longer than its limit answers with the
 odometry. A cell's name is the kind of its wrong loops and their percentage. `_place`: loops know
 no relative pose, only "the same place". All peers get the stated covariances; those of Manhattan are far too large.
-A loop counts as believed where the poses fit it within its stated threshold.
+Rows and cells that are missing were not measured. A loop counts as believed where the poses fit it within its stated
+threshold.
 
 | kind | wrong loops |
 |---|---|
@@ -36,6 +37,7 @@ def page(result: dict[str, Any]) -> str:
             markdown(
                 ("cell", *rows), [(name, *(_short(cell.get(row)) for row in rows)) for name, cell in cells.items()]
             )
+            + "\n"
         )
         if len(cells) > 1:
             parts.append(f"{_over_cells(cells, rows)}\n")
