@@ -41,9 +41,8 @@ class ScanGraph(PoseGraph):
         self._selection = ScanLoopSelection(config)
         self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
         self._corrector: Corrector = Robust()
-        # Of the last optimisation: what loops weigh, how many there were at the last one from nothing, and the scale of
-        # variances that was found.
-        self._weights, self._loops_from_nothing, self._scale = np.zeros(0), 0, np.ones(1)
+        # Loops when the graph was last solved without a warm start, and the scale of variances that was found.
+        self._loops_from_nothing, self._scale = 0, np.ones(1)
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
 
     @property
@@ -137,8 +136,7 @@ class ScanGraph(PoseGraph):
         end = self._end_covariance(solution) if self.keys > 1 else self._chain.end
         if not (np.isfinite(solution.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
             raise ArithmeticError("poses or their covariances came out as no numbers")
-        self._weights, self._scale = solution.loop_weights, np.array((solution.scale,))
-        self._loops_from_nothing = solution.loops_from_nothing
+        self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
         self._chain.move(solution.poses, end)
         weights = solution.loop_weights
         variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
@@ -146,11 +144,11 @@ class ScanGraph(PoseGraph):
 
     def _warm_start(self, problem: GraphProblem) -> CorrectedGraph | None:
         """The last solution, whose nodes the newer ones follow; None where there is none."""
-        if len(self._weights) == 0:
+        if len(self.closed) == 0:
             return None
         sound = np.ones(len(problem.steps))
         scale, before = float(self._scale[0]), self._loops_from_nothing
-        return CorrectedGraph(problem, problem.poses, self._weights, sound, 0.0, scale, loops_from_nothing=before)
+        return CorrectedGraph(problem, problem.poses, self.closed.weight, sound, 0.0, scale, loops_from_nothing=before)
 
     def _end_covariance(self, solution: CorrectedGraph) -> np.ndarray:
         """Covariance ``(3, 3)`` of the last node, with the steps as they are published.
@@ -200,7 +198,7 @@ class ScanGraph(PoseGraph):
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     SAVED = (
-        "_chain", "_scans", "_finder", "_selection", "_waiting", "closed", "_weights", "_loops_from_nothing", "_scale",
+        "_chain", "_scans", "_finder", "_selection", "_waiting", "closed", "_loops_from_nothing", "_scale",
     )  # fmt: skip
 
     def check_state(self) -> None:
@@ -212,7 +210,7 @@ class ScanGraph(PoseGraph):
         joined = self.closed.pairs
         require(bool((joined >= 0).all()), "loops join frames that are not there")
         require(
-            len(self._weights) <= len(self._selection) and self._loops_from_nothing >= 0 and self._scale[0] > 0.0,
+            len(self.closed) <= len(self._selection) and self._loops_from_nothing >= 0 and self._scale[0] > 0.0,
             "an optimisation is of loops that are not there",
         )
         require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
