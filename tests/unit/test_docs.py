@@ -122,7 +122,9 @@ def test_commands_are_right(page: Path) -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     wrong = []
     for command in [*commands(text), *re.findall(r"`((?:python|make|ros2) [^`]+)`", text)]:
-        script = re.match(r"python -m (\w[\w.]+)|python ([\w/]+)\.py|ros2 run ngo_estimator (run_recording)", command)
+        script = re.match(
+            r"python -m (\w[\w.]+)|python ([\w/]+)\.py|ros2 run ngo_estimator (run_recording|optimize_graph)", command
+        )
         if script:
             module = script[1] or (script[2] or "").replace("/", ".") or f"ngo_estimator.nodes.{script[3]}"
             if task := re.match(r"python -m training\.train ([a-z_]+)", command):

@@ -14,6 +14,8 @@ from ngo_estimator.geometry.se2 import between, compose
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.cycle_agreement import chain_poses
 from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.trajectory.chained_graph import chained
+from ngo_estimator.trajectory.g2o import read_g2o
 from training.baselines.lidar_peers import solve_with
 
 KINDS = ("random", "local", "grouped", "lookalike", "offset")
@@ -178,28 +180,10 @@ def _propagated(poses: np.ndarray, nodes: np.ndarray, variances: np.ndarray) -> 
     return np.add.reduceat((moved * variances[frames, None, :]) @ moved.mT, nodes[:-1] - nodes[0])
 
 
-def read_g2o(path: Path) -> tuple[RelativePoses, RelativePoses]:
-    """Steps and loops of a planar g2o file, whose nodes are numbered along its chain."""
-    edges = []
-    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as lines:
-        for words in map(str.split, lines):
-            if words and words[0] == "EDGE_SE2":
-                edges.append([float(word) for word in words[1:]])
-    rows = np.array(edges)
-    nodes, upper = rows[:, :2].astype(np.int64), np.triu_indices(3)
-    information = np.zeros((len(rows), 3, 3))
-    information[:, upper[0], upper[1]] = information[:, upper[1], upper[0]] = rows[:, 5:11]
-    measured = RelativePoses.of_covariances(nodes, rows[:, 2:5], np.linalg.inv(information))
-    steps = np.flatnonzero(nodes[:, 1] == nodes[:, 0] + 1)
-    steps = steps[np.unique(nodes[steps, 0], return_index=True)[1]]
-    loops = np.setdiff1d(np.arange(len(rows)), steps)
-    return measured[steps], measured[loops]
-
-
 def manhattan(folder: Path, kind: str, percent: float, seed: int) -> JudgedProblem:
     """Manhattan3500 with wrong loops, ``percent`` of all; the truth is its solution with its own loops."""
-    steps, right = read_g2o(folder / "manhattan3500.g2o.gz")
-    start = chain_poses(steps.relative)
+    own = chained(read_g2o(folder / "manhattan3500.g2o.gz")).problem
+    steps, right, start = own.steps, own.loops, chain_poses(own.steps.relative)
     true = solve_with(None, steps, right, start)
     rng = np.random.default_rng((seed, KINDS.index(kind), round(percent)))
     loops = with_wrong(right, true, kind, percent, rng)

@@ -43,6 +43,7 @@ setup(
             "local_node = ngo_estimator.nodes.local_node:main",
             "ngo_map = ngo_estimator.nodes.ngo_map:main",
             "ngo_node = ngo_estimator.nodes.ngo_node:main",
+            "optimize_graph = ngo_estimator.nodes.optimize_graph:main",
             "run_recording = ngo_estimator.nodes.run_recording:main",
             "view_node = ngo_estimator.nodes.view_node:main",
         ],

@@ -12,7 +12,7 @@ from ngo_estimator.graph.robust import Robust
 from training import results_graphs
 from training.baselines import graph_peers
 from training.baselines.lidar_peers import solve_with
-from training.scoring.graph_problems import KINDS, JudgedProblem, read_g2o, synthetic
+from training.scoring.graph_problems import KINDS, JudgedProblem, synthetic
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -66,20 +66,6 @@ def test_a_peer_that_takes_too_long_or_fails_has_no_answer(easy: JudgedProblem) 
 
     assert graph_peers.within(never_ends, easy.problem, 1) is None
     assert graph_peers.within(fails, easy.problem, 60) is None
-
-
-def test_a_g2o_file_gives_steps_and_loops(tmp_path: Path) -> None:
-    path = tmp_path / "square.g2o"
-    path.write_text(
-        "VERTEX_SE2 0 0 0 0\n"
-        "EDGE_SE2 1 2 1 0 0.5 4 0 0 4 0 16\n"
-        "EDGE_SE2 0 1 1 0 0 4 0 0 4 0 16\n"
-        "EDGE_SE2 0 2 2 0 0.5 1 0 0 1 0 1\n"
-    )
-    steps, loops = read_g2o(path)
-    assert steps.nodes.tolist() == [[0, 1], [1, 2]] and steps.relative[1].tolist() == [1.0, 0.0, 0.5]
-    np.testing.assert_allclose(steps.root[0].T @ steps.root[0], np.diag((4.0, 4.0, 16.0)))
-    assert loops.nodes.tolist() == [[0, 2]]
 
 
 def test_the_table_has_every_row_and_keeps_other_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

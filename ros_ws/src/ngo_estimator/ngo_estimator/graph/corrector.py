@@ -4,7 +4,7 @@ Every sensor states its graph as a ``GraphProblem``; what solves it is a ``Corre
 cost, ``truncated_cost``, so that the better of two solutions can be kept whoever made it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -19,6 +19,13 @@ INLIER_PROBABILITY = 0.99
 
 STEP_LIMIT = 100.0
 """Squared residual above which a step is an outlier: odometry fails far less often than loops do."""
+
+Told = Callable[[str], None]
+"""Is told how far a solution has come, in a few words."""
+
+
+def silent(_: str) -> None:
+    """Tell nobody."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ loop or does not. How many stages there are follows from the graph's own largest
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import STEP_LIMIT, GraphProblem, normal_equations, thresholds
+from ngo_estimator.graph.corrector import STEP_LIMIT, GraphProblem, Told, normal_equations, silent, thresholds
 from ngo_estimator.graph.normal_equations import GraphStructure
 
 _GROWTH = 1.4
@@ -27,7 +27,11 @@ _SPARSER = 0.7
 
 
 def graduate(
-    problem: GraphProblem, poses: np.ndarray, control: float | None = None, steps_break: bool = False
+    problem: GraphProblem,
+    poses: np.ndarray,
+    control: float | None = None,
+    steps_break: bool = False,
+    told: Told = silent,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)``, and weights of loops ``(loops,)`` and of steps ``(nodes - 1,)``, from poses on.
 
@@ -41,7 +45,7 @@ def graduate(
         control = 1.0 / max(2.0 * float(squared.max(initial=0.0)) - 1.0, 1e-3)
     step_weights = np.ones(len(problem.steps))
     rows, loops, structure = np.zeros(0, np.int64), problem.loops[:0], None
-    for _ in range(_MOST_STAGES):
+    for stage in range(_MOST_STAGES):
         weights = problem.trust * _weights(squared, control)
         believed = np.flatnonzero(weights > 0.0)
         if structure is None or len(believed) < _SPARSER * len(rows) or not np.isin(believed, rows).all():
@@ -54,6 +58,7 @@ def graduate(
         if steps_break:
             off = (problem.steps.residuals(poses) ** 2).sum(1) / STEP_LIMIT
             step_weights = np.maximum(_weights(off, control), _LEAST_WEIGHT)
+        told(f"graduated non-convexity, stage {stage + 1}: {(squared <= 1.0).sum()} of {len(squared)} loops fit")
         decided = _weights(squared, control)
         if np.abs(step).max() < _LEAST_STEP and ((decided < 0.01) | (decided > 0.99)).all():
             break

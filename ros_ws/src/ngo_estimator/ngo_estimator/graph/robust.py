@@ -9,7 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, normal_equations, truncated_cost
+from ngo_estimator.graph.corrector import (
+    CorrectedGraph,
+    GraphProblem,
+    Told,
+    normal_equations,
+    silent,
+    truncated_cost,
+)
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.graduated import graduate
 from ngo_estimator.graph.loop_evidence import cycle_odds, map_area, scale_and_inlier_ratio
@@ -40,7 +47,14 @@ _LEAST_REDUNDANCY = 30.0
 
 
 class Robust:
-    """A ``Corrector`` by graduated non-convexity and by belief in the surest loops first."""
+    """A ``Corrector`` by graduated non-convexity and by belief in the surest loops first.
+
+    Args:
+        told: is told in a few words what has been done, as often as poses move.
+    """
+
+    def __init__(self, told: Told = silent) -> None:
+        self._told = told
 
     def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
         """Solve a problem; see ``Corrector``.
@@ -52,16 +66,16 @@ class Robust:
         if loops == 0:
             return CorrectedGraph(problem, problem.poses, np.zeros(0), np.ones(len(problem.steps)), 0.0)
         if start is None or len(start.loop_weights) == 0:
-            return _from_nothing(problem)
-        warm = _warm(problem, start)
+            return _from_nothing(problem, self._told)
+        warm = _warm(problem, start, self._told)
         if loops < _GROWN * start.loops_from_nothing:
             return warm
-        anew = _from_nothing(problem)
+        anew = _from_nothing(problem, self._told)
         better = truncated_cost(problem, warm.poses, anew.scale, anew.scale) < anew.cost
         return replace(warm, loops_from_nothing=loops) if better else anew
 
 
-def _from_nothing(problem: GraphProblem) -> CorrectedGraph:
+def _from_nothing(problem: GraphProblem, told: Told) -> CorrectedGraph:
     """The better of two solutions that begin at the chain."""
     area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
     chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
@@ -76,8 +90,8 @@ def _from_nothing(problem: GraphProblem) -> CorrectedGraph:
         rows = rows[: np.count_nonzero(odds > 0.0)]
     likely = _affordable(replace(scaled, poses=chain), rows)
     solutions = [
-        graduate(likely, chain)[0],
-        believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio)[0],
+        graduate(likely, chain, told=told)[0],
+        believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio, told)[0],
     ]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops))
@@ -87,14 +101,14 @@ def _from_nothing(problem: GraphProblem) -> CorrectedGraph:
     return solution
 
 
-def _warm(problem: GraphProblem, start: CorrectedGraph) -> CorrectedGraph:
+def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told) -> CorrectedGraph:
     """The solution that the last one leads to."""
     nodes, old = len(start.poses), len(start.loop_weights)
     since = chain_poses(problem.steps.relative[nodes - 1 :], start.poses[-1])
     poses = np.concatenate((start.poses, since[1:]))
     believed = np.zeros(len(problem.loops), bool)
     believed[:old] = start.loop_weights > 0.0
-    poses, _ = believe(_scaled(problem, start.scale, start.scale), poses, believed, map_area(poses))
+    poses, _ = believe(_scaled(problem, start.scale, start.scale), poses, believed, map_area(poses), told=told)
     return _polished(problem, poses, start.scale, start.loops_from_nothing)
 
 

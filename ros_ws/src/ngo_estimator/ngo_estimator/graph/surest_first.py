@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import GraphProblem, normal_equations, thresholds
+from ngo_estimator.graph.corrector import GraphProblem, Told, normal_equations, silent, thresholds
 from ngo_estimator.graph.loop_evidence import predicted_odds
 from ngo_estimator.graph.normal_equations import GraphStructure
 
@@ -33,7 +33,12 @@ _AT_REST = 1e-2
 
 
 def believe(
-    problem: GraphProblem, poses: np.ndarray, believed: np.ndarray, area: float, inlier_ratio: float = 0.5
+    problem: GraphProblem,
+    poses: np.ndarray,
+    believed: np.ndarray,
+    area: float,
+    inlier_ratio: float = 0.5,
+    told: Told = silent,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)`` and which loops are believed ``(loops,)``, beginning with those that are.
 
@@ -45,7 +50,7 @@ def believe(
     prior = math.log(inlier_ratio / (1.0 - inlier_ratio)) + np.log(np.maximum(problem.trust, 1e-9))
     rows, structure = np.arange(len(problem.loops)), None
     alive = np.ones(len(rows), bool)
-    for _ in range(_MOST_ROUNDS):
+    for round_ in range(_MOST_ROUNDS):
         if structure is None or alive.sum() < _SPARSER * len(rows):
             rows = np.flatnonzero(alive)
             likely = GraphProblem(poses, problem.steps, problem.loops[rows], problem.trust[rows])
@@ -61,6 +66,7 @@ def believe(
         new = np.flatnonzero(odds > _LEAST_ODDS)
         if len(new) == 0 and not left.any() and np.abs(step).max() < _AT_REST:
             break
+        told(f"the surest loops first, round {round_ + 1}: {believed.sum()} of {len(believed)} loops are believed")
         most = max(_AT_LEAST, int(_SHARE * len(new)))
         believed[rows[left]] = False
         believed[rows[new[np.argsort(-odds[new], kind="stable")[:most]]]] = True

@@ -1,0 +1,137 @@
+"""g2o files: what is written is read back to the last bit, others read it too, and a fault names its line."""
+
+import gzip
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ngo_estimator.trajectory.g2o import UNSTAMPED, PlanarGraph, g2o_lines, read_g2o, write_g2o
+
+SQUARE = (
+    "VERTEX_SE2 0 0 0 0\n"
+    "VERTEX_SE2 1 1 0 1.5\n"
+    "VERTEX_SE2 2 1 1 3\n"
+    "FIX 0\n"
+    "EDGE_SE2 0 1 1 0 1.5 4 1 0 4 0 16\n"
+    "EDGE_SE2 1 2 1 0 1.5 4 0 0 4 0 16\n"
+    "EDGE_SE2 0 2 1 1 3 1 0 0 1 0 0 # loop 0.25\n"
+)
+NUMBERS = st.floats(-1e12, 1e12, allow_nan=False)
+
+
+@st.composite
+def graphs(draw: st.DrawFn) -> PlanarGraph:
+    """Any graph, of vertices in any order."""
+    count = draw(st.integers(2, 6))
+    ids = np.array(draw(st.lists(st.integers(0, 2**62), min_size=count, max_size=count, unique=True)))
+    edges = draw(st.lists(st.permutations(range(count)).map(lambda order: order[:2]), min_size=1, max_size=8))
+    rows = len(edges)
+
+    def numbers(n: int, values: st.SearchStrategy[float], k: int = 3) -> np.ndarray:
+        return np.array(draw(st.lists(values, min_size=n * k, max_size=n * k))).reshape(n, k)
+
+    off = numbers(rows, st.floats(-0.3, 0.3))
+    information = np.zeros((rows, 3, 3))
+    information[:, [0, 0, 1], [1, 2, 2]] = off
+    size = 10.0 ** numbers(rows, st.floats(-6.0, 9.0))
+    information = (information + information.mT + np.eye(3)) * size[:, :, None] * size[:, None, :]
+    upper = np.triu(information)
+    information = upper + np.triu(information, 1).mT
+    believed = numbers(rows, st.floats(0.0, 1.0) | st.just(float("nan")), 1)[:, 0]
+    stamps = st.integers(0, 2**62) | st.just(UNSTAMPED)
+    return PlanarGraph(
+        ids, numbers(count, NUMBERS), np.array(draw(st.lists(stamps, min_size=count, max_size=count))),
+        ids[np.array(edges)], numbers(rows, NUMBERS), information,
+        np.array(draw(st.lists(st.booleans(), min_size=rows, max_size=rows))), believed,
+        tuple(ids[: draw(st.integers(0, 1))].tolist()),
+    )  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(graphs())
+def test_what_is_written_is_read_back_to_the_last_bit(
+    tmp_path_factory: pytest.TempPathFactory, graph: PlanarGraph
+) -> None:
+    path = tmp_path_factory.mktemp("g2o") / "graph.g2o"
+    write_g2o(path, graph)
+    again = read_g2o(path)
+    for name in ("ids", "poses", "stamps_ns", "edges", "relative", "information", "is_loop", "belief"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(graph, name), err_msg=name)
+    assert again.fixed == graph.fixed and again.remarks == ()
+    assert list(g2o_lines(again)) == path.read_text().splitlines()
+
+
+def test_a_file_is_read_as_it_says(tmp_path: Path) -> None:
+    (path := tmp_path / "square.g2o").write_text("# by hand\n\n" + SQUARE + "ROBOTLASER1 0 1 2\n")
+    graph = read_g2o(path)
+    assert graph.ids.tolist() == [0, 1, 2] and graph.fixed == (0,)
+    assert graph.information[0].tolist() == [[4.0, 1.0, 0.0], [1.0, 4.0, 0.0], [0.0, 0.0, 16.0]]
+    assert graph.is_loop.tolist() == [False, False, True] and graph.belief[2] == 0.25
+    assert (graph.stamps_ns == UNSTAMPED).all() and graph.remarks == ("1 lines of ROBOTLASER1 were not read",)
+    packed = tmp_path / "square.g2o.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert list(g2o_lines(read_g2o(packed))) == list(g2o_lines(graph))
+
+
+def test_gtsam_reads_a_marked_file(tmp_path: Path) -> None:
+    stamped = SQUARE.replace("0 0 0\n", "0 0 0 # stamp 1.5\n", 1)
+    (path := tmp_path / "square.g2o").write_text(stamped.replace("1 0 0 #", "1 0 1 #"))  # it knows no missing heading
+    write_g2o(tmp_path / "again.g2o", read_g2o(path))
+    assert "VERTEX_SE2 0 0.0 0.0 0.0 # stamp 1.500000000" in (tmp_path / "again.g2o").read_text()
+    graph, values = gtsam.readG2o(str(tmp_path / "again.g2o"), False)
+    assert (values.size(), graph.size()) == (3, 3)
+    assert graph.at(0).measured().equals(gtsam.Pose2(1.0, 0.0, 1.5), 0.0)
+    np.testing.assert_allclose(graph.at(0).noiseModel().information(), [[4, 1, 0], [1, 4, 0], [0, 0, 16]], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1", "line 8 is a VERTEX_SE3:QUAT; expected a planar graph"),
+        ("VERTEX_XY 3 0 0", "line 8 is a VERTEX_XY; expected a planar graph"),
+        ("EDGE_SE2_XY 0 3 0 0 1 0 1", "line 8 is a EDGE_SE2_XY; expected a planar graph"),
+        ("VERTEX_SE2 2 1 1 3", "line 8 has the vertex 2 again; expected each once"),
+        ("VERTEX_SE2 3 1 1", "line 8 has 4 words; expected VERTEX_SE2 id x y yaw"),
+        ("VERTEX_SE2 3 1 one 3", "line 8 is 'VERTEX_SE2 3 1 one 3'; expected VERTEX_SE2 id x y yaw"),
+        ("VERTEX_SE2 3.5 1 1 3", "line 8 is 'VERTEX_SE2 3.5 1 1 3'; expected VERTEX_SE2 id x y yaw"),
+        ("VERTEX_SE2 3 1 nan 3", "line 8 has a value that is not finite"),
+        ("VERTEX_SE2 3 1 1 3 # stamp soon", "line 8 ends in '# stamp soon'; expected '# stamp' and seconds"),
+        ("EDGE_SE2 1 1 0 0 0 1 0 0 1 0 1", "line 8 joins the vertex 1 with itself"),
+        ("EDGE_SE2 0 2 0 0 0 1 2 0 1 0 1", "line 8 has the information 1 2 0 1 0 1; expected a positive definite"),
+        ("EDGE_SE2 0 2 0 0 0 1 1 0 1 0 1", "line 8 has the information 1 1 0 1 0 1; expected a positive definite"),
+        ("EDGE_SE2 0 2 0 0 0 1 0 0 -1 0 1", "line 8 has the information 1 0 0 -1 0 1; expected a positive definite"),
+        ("EDGE_SE2 0 2 0 0 0 1 0 1 1 0 0", "line 8 has the information 1 0 1 1 0 0; expected a positive definite"),
+        ("EDGE_SE2 0 2 0 0 0 0 0 0 0 0 0", "line 8 has the information 0 0 0 0 0 0; expected a positive definite"),
+        ("EDGE_SE2 0 2 0 0 0 1 0 0 1 0 1 # loop 1.5", "line 8 ends in '# loop 1.5'; expected '# loop' or '# step'"),
+        ("FIX", "line 8 is 'FIX'; expected FIX and the id of a vertex"),
+        ("FIX 7", "line 8 fixes the vertex 7, which is not there"),
+    ],
+)  # fmt: skip
+def test_a_fault_names_its_line_and_what_was_expected(tmp_path: Path, line: str, said: str) -> None:
+    (path := tmp_path / "bad.g2o").write_text(SQUARE + line + "\n")
+    with pytest.raises(ValueError) as error:
+        read_g2o(path)
+    assert str(error.value).startswith(f"{path}, {said}") and "\n" not in str(error.value)
+
+
+def test_what_is_no_graph_is_one_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "bad.g2o"
+    for content, said in ((b"", "there is no EDGE_SE2"), (b"VERTEX_SE2 0 0 0 0\n", "there is no EDGE_SE2"),
+                          (b"\xff\xfe\x00", "is no text")):  # fmt: skip
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=said):
+            read_g2o(path)
+    (tmp_path / "bad.g2o.gz").write_bytes(gzip.compress(SQUARE.encode())[:-12])
+    with pytest.raises(ValueError, match="cannot be unpacked"):
+        read_g2o(tmp_path / "bad.g2o.gz")
+    with pytest.raises(ValueError, match=r"expected a name that ends in \.g2o"):
+        write_g2o(tmp_path / "graph.txt", _square(tmp_path))
+
+
+def _square(folder: Path) -> PlanarGraph:
+    (path := folder / "square.g2o").write_text(SQUARE)
+    return read_g2o(path)
