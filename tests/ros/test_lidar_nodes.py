@@ -23,8 +23,8 @@ from ngo_estimator.nodes.messages import to_ns, to_time, transform_message
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.association import ros_pose
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.poses import TransformTree
 from ngo_recordings.scan_stream import scan_of
+from ngo_recordings.transform_buffer import TransformBuffer
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 from .processes import NodeProcess, Probe
@@ -72,23 +72,26 @@ def scan_message(true: np.ndarray, stamp_ns: int, upside_down: bool, noise: np.r
     return message
 
 
-def mounting_message(upside_down: bool, base_frame: str = "base_link") -> TFMessage:
-    """Two static transforms from the robot to its scanner, the second with the roll of one that hangs."""
+def mounting_message(upside_down: bool) -> TFMessage:
+    """Static transforms from the robot's foot to its scanner, the last with the roll of one that hangs."""
     x, y, yaw = MOUNTING.tolist()
     half = 0.5 * yaw
     turned = Quaternion(z=math.sin(half), w=math.cos(half))
     mast = TransformStamped(child_frame_id="mast")
-    mast.header.frame_id = base_frame
+    mast.header.frame_id = "base_link"
     mast.transform.translation, mast.transform.rotation = Vector3(x=x, y=y, z=0.2), turned
     laser = TransformStamped(child_frame_id="laser")
     laser.header.frame_id = "mast"
     laser.transform.rotation = Quaternion(x=1.0, w=0.0) if upside_down else Quaternion(w=1.0)
-    return TFMessage(transforms=[mast, laser])
+    foot = TransformStamped(child_frame_id="base_link")
+    foot.header.frame_id = "base_footprint"
+    foot.transform.translation, foot.transform.rotation = Vector3(z=0.1), Quaternion(w=1.0)
+    return TFMessage(transforms=[mast, laser, foot])
 
 
 def mounting_of(message: TFMessage) -> Mounting:
     """The mounting to the last digit: registration amplifies the rounding of a quaternion."""
-    tree = TransformTree(0)
+    tree = TransformBuffer()
     for each in message.transforms:
         pose = ros_pose(each.transform.translation, each.transform.rotation)
         assert pose is not None
@@ -144,10 +147,10 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
     tf = probe.node.create_publisher(TFMessage, "/tf", 1000)
     settings = {**RELIABLE, "robot_odometry": robot_odometry, "robot_odometry_topic": "wheels"}
     ngo_settings: dict[str, Any] = {"world": "scan"}
-    base_frame, odom_frame = "base_link", "odom"
-    if robot_odometry == "tf":  # a robot's own names, as a configuration of slam_toolbox has them
-        base_frame, odom_frame = "base_footprint", "wheels"
-        settings |= {"odom_frame": odom_frame, "base_frame": base_frame}
+    odom_frame = "odom"
+    if robot_odometry == "tf":  # a robot's own names, and a chain of which the last part is static
+        odom_frame = "wheels"
+        settings |= {"odom_frame": odom_frame}
         ngo_settings |= {"odom_frame": odom_frame, "map_frame": "world", "tf_ahead_s": AHEAD_S}
     noise, poses = np.random.default_rng(0), drive()
     core, online = LidarOdometry(), ScanTrajectory(iterations_per_step=1)
@@ -166,7 +169,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
             odometry.pose.pose.orientation.w = math.cos(0.5 * wheel[2])
             wheels.publish(odometry)
         if robot_odometry == "tf":
-            tf.publish(transform_message(stamp_ns, odom_frame, base_frame, wheel))
+            tf.publish(transform_message(stamp_ns, odom_frame, "base_footprint", wheel))
         if robot_odometry != "none":
             core.add_wheels(stamp_ns, wheel)
         scans.publish(message)
@@ -198,7 +201,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
         probe.meet("local_node", "ngo_node")
         for step in range(UNMOUNTED + 1):
             play(step, WARM_UP_NS)
-        static.publish(mounting_message(upside_down, base_frame))
+        static.publish(mounting_message(upside_down))
         step = UNMOUNTED
 
         def both_answer() -> bool:
@@ -261,7 +264,9 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
     assert close(map_from_base, xyyaw(last.pose.pose), 0.01, 0.2)
 
 
-def test_a_scanner_without_a_mounting_is_told(probe: Probe) -> None:
+def test_a_scanner_without_a_mounting_is_told_and_one_that_comes_late_counts(probe: Probe) -> None:
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    static = probe.node.create_publisher(TFMessage, "/tf_static", latched)
     relative_poses = probe.collect(RelativePose, "relative_pose")
     scans = probe.node.create_publisher(LaserScan, "scan", 1000)
     noise = np.random.default_rng(0)
@@ -273,3 +278,11 @@ def test_a_scanner_without_a_mounting_is_told(probe: Probe) -> None:
             scans.publish(scan_message(drive()[step], BEGIN_NS + step * STEP_NS, False, noise))
         local.wait_for_log("/tf_static does not say where 'laser' sits on 'base_link'")
         probe.spin_until(lambda: len(relative_poses) == 29, "a motion for every scan")
+        static.publish(mounting_message(False))
+        local.wait_for_log(
+            "scanner: laser in base_link at x 0.120 m, y -0.050 m, yaw 30.0 deg(.|\n)*starts anew with it"
+        )
+        for step in range(30, 32):
+            scans.publish(scan_message(drive()[step], BEGIN_NS + step * STEP_NS, False, noise))
+        probe.spin_until(lambda: len(relative_poses) == 30, "a motion from the first scan with the mounting")
+    assert to_ns(relative_poses[-1].origin_stamp) == BEGIN_NS + 30 * STEP_NS

@@ -236,6 +236,49 @@ def test_without_transforms_the_mounting_is_not_known_unless_frames_are_the_same
     assert mounted(tmp_path / "c.mcap", ("/tf_static", 1, cyclic)) is None
 
 
+@pytest.mark.parametrize("own_topics", [False, True])
+@pytest.mark.parametrize("robot", ["robot1", "robot2"])
+def test_each_robot_of_a_recording_has_its_own_wheels_and_mounting(
+    tmp_path: Path, robot: str, own_topics: bool
+) -> None:
+    """Frames with a prefix on one /tf; or topics of transforms in each robot's namespace, whose frames are the same."""
+    entries: list[m.Entry] = []
+    for k, name in enumerate(("robot1", "robot2")):
+        prefix, tf = ("", f"/{name}/tf") if own_topics else (f"{name}/", "/tf")
+        mounting = static(f"{prefix}base_link", f"{prefix}laser", 0.1 + k, 0, 0)
+        entries.append((f"{tf}_static", stamp(0), m.transforms(mounting)))
+        for step in range(5):
+            made = odometry(stamp(step), 0.1 * step, 0, 0, f"{prefix}odom")
+            made.child_frame_id = f"{prefix}base_link"
+            entries.append((f"/{name}/odom", stamp(step), made))
+            entries.append((f"/{name}/scan", stamp(step), scan(stamp(step), f"{prefix}laser")))
+            sent = m.transform(stamp(step), f"{prefix}odom", f"{prefix}base_link", m.pose(0.1 * step, 0, 0))
+            entries.append((tf, stamp(step), m.transforms(sent)))
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        topics = choose_topics(recording, TopicArguments(image=f"/{robot}/scan"))
+        found = find_mounting(recording, topics)
+        assert topics.wheels == WheelSource(f"/{robot}/odom") and found is not None
+        assert found.base_from_scan_xyyaw[0] == pytest.approx(0.1 if robot == "robot1" else 1.1)
+        by_tf = RecordingTopics(topics.image, wheels=WheelSource(tf=(f"{found.base_frame[:-9]}odom", found.base_frame)))
+        assert len([each for each in scan_stream(recording, by_tf) if isinstance(each, WheelPose)]) == 5
+
+
+def test_of_several_scans_and_odometries_one_is_taken_and_the_others_are_named(tmp_path: Path) -> None:
+    entries = drive(10)
+    for name in ("/scan_filtered", "/front/scan"):
+        entries += [(name, stamp(k + 0.5), scan(stamp(k + 0.5))) for k in range(20)]
+    for name in ("/wheel/odom", "/odometry/filtered"):
+        entries += [(name, stamp(k), odometry(stamp(k), 0, 0, 0)) for k in range(20)]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
+        topics = choose_topics(recording)
+        assert (topics.image, topics.wheels) == ("/scan", WheelSource("/wheel/odom"))
+        scans, wheels = describe_lidar(recording, topics).notes
+    assert scans.startswith("scans of /scan are used; others are /front/scan (10.0 Hz), /scan_filtered (10.0 Hz)")
+    assert wheels.startswith(
+        "/wheel/odom is used of /wheel/odom (10.0 Hz), /odom (10.0 Hz), /odometry/filtered (10.0 Hz)"
+    )
+
+
 def chosen(path: Path, odometries: dict[str, str], given: TopicArguments | None = None) -> RecordingTopics:
     entries = [(name, stamp(0), odometry(stamp(0), 0, 0, 0, frame)) for name, frame in odometries.items()]
     with open_recording([m.write_mcap(path, [*entries, ("/scan", stamp(0), scan(stamp(0)))])]) as recording:

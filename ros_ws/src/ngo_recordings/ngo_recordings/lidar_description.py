@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ngo_recordings.images import SCAN_TYPE
 from ngo_recordings.mounting import Mounting, find_mounting
 from ngo_recordings.recording import Recording
 from ngo_recordings.scan_stream import ScanAngles, scan_angles
-from ngo_recordings.topics import RecordingTopics, WheelSource
+from ngo_recordings.topics import RecordingTopics, WheelSource, wheel_candidates
 
 _LOOK = 200
 
@@ -41,6 +42,14 @@ class LidarDescription:
     stamps: str
     notes: tuple[str, ...]
 
+    def looking_at(self, yaw_rad: float) -> LidarDescription:
+        """The description with a scanner whose angle 0 points there (counter-clockwise from straight ahead)."""
+        known = self.mounting or Mounting("the robot", "the scanner", np.zeros(3), False, 0.0, 0.0, "")
+        turned = np.array([*known.base_from_scan_xyyaw[:2], yaw_rad])
+        source = f"its place from {known.source}, " if known.source else ""
+        source += "its direction as it was given"
+        return replace(self, mounting=replace(known, base_from_scan_xyyaw=turned, source=source))
+
     def lines(self) -> list[str]:
         """The description for a person, one fact a line."""
         step = math.degrees(self.angles.angle_increment)
@@ -58,6 +67,44 @@ class LidarDescription:
         ]
 
 
+def _first_scans(recording: Recording, topic: str) -> tuple[list[Any], ScanAngles, int]:
+    """The first usable scans, the angles of the first one, and how many beside them are damaged."""
+    usable, angles, damaged, last_error = [], None, 0, RecordingError(f"topic {topic} has no message")
+    for message in islice(recording.messages([topic]), _LOOK):
+        try:
+            found = scan_angles(message.value, topic)
+            header_stamp_ns(message.value)
+        except RecordingError as error:
+            damaged, last_error = damaged + 1, error
+            continue
+        usable.append(message.value)
+        angles = angles or found
+    if angles is None:
+        raise last_error
+    return usable, angles, damaged
+
+
+def _others(recording: Recording, topics: RecordingTopics) -> list[str]:
+    """A sentence on other scans, and one on other odometries, each with its rate."""
+    scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
+    wheels = wheel_candidates(recording, topics.image, topics.ground_truth)
+    notes = []
+    if len(scans) > 1:
+        others = ", ".join(_with_rate(recording, name) for name in scans if name != topics.image)
+        notes.append(f"scans of {topics.image} are used; others are {others}: --image names another one")
+    if len(wheels) > 1:
+        taken = "no odometry" if topics.wheels is None else str(topics.wheels)
+        there = ", ".join(_with_rate(recording, name) for name in wheels)
+        notes.append(f"{taken} is used of {there}: --wheels names another one")
+    return notes
+
+
+def _with_rate(recording: Recording, name: str) -> str:
+    info = recording.topics[name]
+    span_s = (info.last_ns - info.first_ns) * 1e-9
+    return f"{name} ({(info.count - 1) / span_s:.1f} Hz)" if span_s > 0.0 else f"{name} ({info.count} messages)"
+
+
 def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescription:
     """Scans, mounting, wheels and stamps of a recording; reads its first 200 scans and what the mounting takes.
 
@@ -67,11 +114,13 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
     info = recording.topics[topics.image]
     if info.type_name != SCAN_TYPE:
         raise RecordingError(f"topic {topics.image} is {info.type_name}; expected {SCAN_TYPE}")
-    first = [message.value for message in islice(recording.messages([topics.image]), _LOOK)]
-    angles = scan_angles(first[0], topics.image)
+    first, angles, damaged = _first_scans(recording, topics.image)
     stamps = np.array([header_stamp_ns(value) for value in first], np.int64)
     steps = np.diff(stamps)
     notes = [*recording.notes, *([] if angles.note is None else [angles.note])]
+    if damaged:
+        notes.append(f"{damaged} of the first {_LOOK} scans of {topics.image} are damaged and left out")
+    notes += _others(recording, topics)
     if recording.stamps_made:
         kind = "made from the order of messages"
     elif len(stamps) > 1 and not steps.any():

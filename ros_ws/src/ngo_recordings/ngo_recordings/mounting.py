@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from ngo_recordings.association import ros_pose
-from ngo_recordings.poses import Pose, TransformTree
+from ngo_recordings.poses import Pose
 from ngo_recordings.recording import Recording
-from ngo_recordings.topics import TF_TYPE, RecordingTopics
+from ngo_recordings.topics import RecordingTopics, transform_topics
+from ngo_recordings.transform_buffer import TransformBuffer, is_named
 
 # Between these and the robot a transform moves: it says nothing of the robot itself.
 _OUTSIDE = ("odom", "map", "world", "earth")
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 # How much of /tf is looked through for a scanner that /tf_static does not know.
-_LOOK_NS = 60_000_000_000
+_LOOK_NS = 600_000_000_000
+
+
+_NEAR_M, _NEAR_RAD = 0.01, math.radians(0.5)
+"""Mountings that differ by less are the same."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,12 @@ class Mounting:
     height_m: float
     source: str
 
+    def near(self, other: Mounting) -> bool:
+        """Whether another mounting is the same but for rounding and vibration."""
+        off = self.base_from_scan_xyyaw - other.base_from_scan_xyyaw
+        turn = abs(math.remainder(float(off[2]), math.tau))
+        return self.upside_down == other.upside_down and math.hypot(off[0], off[1]) < _NEAR_M and turn < _NEAR_RAD
+
     def __str__(self) -> str:
         x, y, yaw = self.base_from_scan_xyyaw.tolist()
         tilt = f", tilted by {math.degrees(self.tilt_rad):.1f} deg" if self.tilt_rad > math.radians(1.0) else ""
@@ -51,19 +61,20 @@ def find_mounting(recording: Recording, topics: RecordingTopics) -> Mounting | N
     """Where the scanner of topics.image sits on the robot; None where no transform says it.
 
     Chains of transforms are composed. Those of /tf_static count; where they do not join the two frames, the first
-    transforms of /tf (60 s of it) are taken, without those that move the robot itself. The robot's frame is the child
-    of the wheel odometry, else base_link, base_footprint or base.
+    transforms of /tf (10 min of it) are taken, without those that move the robot itself. The robot's frame is the child
+    of the wheel odometry, else base_link, base_footprint or base, with the robot's prefix where it has one. Topics of
+    transforms in another robot's namespace are left out.
 
     Raises:
         RecordingError: a message that cannot be read.
     """
     scan_frame = _scan_frame(recording, topics)
     bases = [frame for frame in (_wheel_frame(recording, topics), *_BASE_FRAMES) if frame]
-    tree = TransformTree(0)
-    names = [name for name, info in recording.topics.items() if info.type_name == TF_TYPE and info.count]
+    tree = TransformBuffer()
+    names = transform_topics(recording, topics.image)
     static = [name for name in names if name.endswith("static")]
     for _, each in _transforms(recording, static):
-        _add(tree, each)
+        tree.take((each,), static=True)
     if (found := _lookup(tree, bases, scan_frame, ", ".join(static))) is not None:
         return found
     moving = [name for name in names if name not in static]
@@ -74,10 +85,10 @@ def find_mounting(recording: Recording, topics: RecordingTopics) -> Mounting | N
         if log_time_ns > start_ns + _LOOK_NS:
             break
         parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-        if parent in _OUTSIDE or child in known:
+        if child in known or any(is_named(parent, name, scan_frame) for name in _OUTSIDE):
             continue
         known.add(child)
-        _add(tree, each)
+        tree.take((each,), static=True)
         if (found := _lookup(tree, bases, scan_frame, ", ".join(moving))) is not None:
             return found
     # A scanner whose frame is the robot's own needs no transform.
@@ -86,8 +97,8 @@ def find_mounting(recording: Recording, topics: RecordingTopics) -> Mounting | N
     return None
 
 
-def mounting_in(tree: TransformTree, base: str, scan_frame: str, source: str = "/tf_static") -> Mounting | None:
-    """Where `scan_frame` sits on `base`, by the static transforms of a tree; None where they do not join the two."""
+def mounting_in(tree: TransformBuffer, base: str, scan_frame: str, source: str = "/tf_static") -> Mounting | None:
+    """Where `scan_frame` sits on `base`, by what is known last; None where no transforms join the two."""
     return _lookup(tree, [base], scan_frame, source)
 
 
@@ -111,16 +122,10 @@ def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, A
             yield message.log_time_ns, each
 
 
-def _add(tree: TransformTree, each: Any) -> None:
-    pose = ros_pose(each.transform.translation, each.transform.rotation)
-    if pose is not None:
-        tree.add(each.header.frame_id.strip("/"), each.child_frame_id.strip("/"), 0, pose, static=True)
-
-
-def _lookup(tree: TransformTree, bases: list[str], scan_frame: str, source: str) -> Mounting | None:
-    frames = tree.frames()
-    for base in bases:
-        if base in frames and scan_frame in frames and (pose := tree.lookup(base, scan_frame, 0)) is not None:
+def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str, source: str) -> Mounting | None:
+    for name in bases:
+        base = tree.like(name, scan_frame)
+        if base is not None and (pose := tree.newest_lookup(base, scan_frame)) is not None:
             return _mounting(base, scan_frame, pose, source)
     return None
 

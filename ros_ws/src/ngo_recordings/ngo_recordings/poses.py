@@ -134,7 +134,7 @@ class TransformTree:
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Pose | None:
         """Pose of frame source in frame target; None where no chain of transforms joins them at this stamp."""
-        up_from_target, up_from_source = self._ancestors(target), self._ancestors(source)
+        up_from_target, up_from_source = self.above(target), self.above(source)
         common = next((frame for frame in up_from_source if frame in up_from_target), None)
         if common is None:
             return None
@@ -151,7 +151,7 @@ class TransformTree:
 
     def newest_ns(self, target: str, source: str) -> dict[str, int] | None:
         """Newest stamps of what moves in the chain, by child frame; None where there is no chain."""
-        up_from_target, up_from_source = self._ancestors(target), self._ancestors(source)
+        up_from_target, up_from_source = self.above(target), self.above(source)
         shared = set(up_from_target) & set(up_from_source)
         if not shared:
             return None
@@ -169,20 +169,32 @@ class TransformTree:
             if child in (None, name):
                 track.forget_before(stamp_ns)
 
-    def clear(self) -> None:
-        """Drop what moves; static transforms stay."""
-        self._moving.clear()
+    def clear(self, child: str | None = None) -> None:
+        """Drop what moves, of one child frame or of all; static transforms stay."""
+        if child is None:
+            self._moving.clear()
+        else:
+            self._moving.pop(child, None)
 
-    def _ancestors(self, frame: str) -> list[str]:
-        """The frame itself, its parent, and so on."""
-        found = [frame]
-        while (parent := self._parent(found[-1])) is not None and parent not in found:
-            found.append(parent)
-        return found
+    def joined(self, one: str, other: str) -> bool:
+        """Whether a chain of transforms joins two frames."""
+        return not set(self.above(one)).isdisjoint(self.above(other))
 
-    def _parent(self, frame: str) -> str | None:
+    def root(self, frame: str) -> str:
+        """The uppermost frame above a frame, which may be itself."""
+        return self.above(frame)[-1]
+
+    def parent(self, frame: str) -> str | None:
+        """The frame above a frame; None where there is none."""
         edge = self._moving.get(frame) or self._static.get(frame)
         return edge[0] if edge else None
+
+    def above(self, frame: str) -> list[str]:
+        """The frame itself, its parent, and so on."""
+        found = [frame]
+        while (parent := self.parent(found[-1])) is not None and parent not in found:
+            found.append(parent)
+        return found
 
     def _up(self, ancestors: list[str], to: str, stamp_ns: int) -> Pose | None:
         """Pose of the first of the ancestors in another of them."""

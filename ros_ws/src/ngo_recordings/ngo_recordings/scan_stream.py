@@ -11,20 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from ngo_recordings.association import RESTART_NS, header_stamp_ns, ros_pose
+from ngo_recordings.association import RESTART_NS, header_stamp_ns
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.images import SCAN_TYPE
-from ngo_recordings.poses import TransformTree
 from ngo_recordings.recording import Message, Recording
-from ngo_recordings.topics import TF_TYPE, RecordingTopics, WheelSource
+from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
+from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
 BAD_SCAN = "damaged scan"
 BAD_WHEELS = "wheel pose that is no number"
 
 # How late a message may be recorded after one with a later stamp, and still come in order.
 _WAIT_NS = 1_000_000_000
-# Between two moving transforms of a chain.
-_TF_GAP_NS = 500_000_000
 _FULL_TURN = 2.0 * math.pi
 # Rad; scanners have 50 times this, and a message with a finer one could cost its reader without bound.
 _LEAST_INCREMENT = 1e-5
@@ -38,7 +36,9 @@ class LidarScan:
 
     angle_min, angle_increment: of the rays in the message's order, counter-clockwise about the frame's z; the increment
     is negative where rays run clockwise. ranges ``(rays,)``: float32, m, as recorded, so holes, NaN and values out of
-    range_min and range_max (m) are there. time_increment: from ray to ray, s, 0 where unknown.
+    range_min and range_max (m) are there. time_increment: from ray to ray, s, 0 where unknown. offsets_s ``(rays,)``:
+    when each ray was measured, after the stamp, where that is not even; None: as time_increment says. topic: where it
+    came from.
     """
 
     stamp_ns: int
@@ -49,6 +49,28 @@ class LidarScan:
     range_max: float
     time_increment: float
     frame_id: str
+    offsets_s: np.ndarray | None = None
+    topic: str = ""
+
+    @property
+    def angles(self) -> np.ndarray:
+        """Angles of the rays ``(rays,)``, rad."""
+        angles: np.ndarray = self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
+        return angles
+
+    @property
+    def ray_offsets_s(self) -> np.ndarray:
+        """When each ray was measured, after the stamp, ``(rays,)``, s."""
+        if self.offsets_s is not None:
+            return self.offsets_s
+        return self.time_increment * np.arange(len(self.ranges), dtype=np.float64)
+
+    @property
+    def sweep_s(self) -> float:
+        """From the first ray to the last, s; 0 where it is not known."""
+        if self.offsets_s is not None:
+            return float(self.offsets_s.max() - self.offsets_s.min())
+        return abs(self.time_increment) * len(self.ranges)
 
 
 @dataclass(frozen=True)
@@ -139,7 +161,7 @@ def scan_stream(
         raise RecordingError(f"topic {topics.image} is {type_name}; expected {SCAN_TYPE}")
     if angle_increment is not None and not _spans(angle_increment, 1):
         raise RecordingError(f"the increment is {angle_increment:g} rad; expected at least {_LEAST_INCREMENT:g} rad")
-    wheels = None if topics.wheels is None else _Wheels(recording, topics.wheels)
+    wheels = None if topics.wheels is None else _Wheels(recording, topics.wheels, topics.image)
     names = {topics.image, *(wheels.names if wheels is not None else ())}
     lost: Counter[str] = Counter() if skipped is None else skipped
     waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose]] = []
@@ -178,15 +200,9 @@ def scan_stream(
 class _Wheels:
     """Wheel poses of messages."""
 
-    def __init__(self, recording: Recording, source: WheelSource) -> None:
-        self._tf = source.tf
-        self._tree = TransformTree(_TF_GAP_NS)
-        self._last_ns = -1
-        self.names = (
-            (str(source.topic),)
-            if source.tf is None
-            else tuple(name for name, info in recording.topics.items() if info.type_name == TF_TYPE and info.count)
-        )
+    def __init__(self, recording: Recording, source: WheelSource, image: str) -> None:
+        self._tf = None if source.tf is None else FramePoses(TransformBuffer(), *source.tf)
+        self.names = (str(source.topic),) if source.tf is None else tuple(transform_topics(recording, image))
 
     def read(self, message: Message, lost: Counter[str]) -> Iterator[WheelPose]:
         if self._tf is None:
@@ -197,37 +213,11 @@ class _Wheels:
             else:
                 yield WheelPose(header_stamp_ns(value), pose)
             return
-        for each in message.value.transforms:
-            yield from self._transform(each, self._tf, message.topic.endswith("static"), lost)
-
-    def _transform(self, each: Any, tf: tuple[str, str], static: bool, lost: Counter[str]) -> Iterator[WheelPose]:
-        frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-        stamp_ns = header_stamp_ns(each)
-        if frames == tf:  # the usual case, without a tree
-            pose = _planar(each.transform.translation, each.transform.rotation)
-            if pose is None:
-                lost[BAD_WHEELS] += 1
-            elif not static:
-                yield WheelPose(stamp_ns, pose)
-            return
-        step = ros_pose(each.transform.translation, each.transform.rotation)
-        if step is None:
-            return
-        self._tree.add(*frames, stamp_ns, step, static)
-        if static:
-            return
-        self._tree.forget_before(stamp_ns - 10 * _TF_GAP_NS, frames[1])
-        # The chain is known up to the transform that lags most: one pose for each of its stamps.
-        known_ns = self._tree.known_until_ns(*tf)
-        if known_ns is None or not 0 <= known_ns < 2**63 - 1:
-            return
-        if known_ns <= self._last_ns - RESTART_NS:
-            self._tree.clear()
-            self._last_ns = -1
-            return
-        if known_ns > self._last_ns and (found := self._tree.lookup(*tf, known_ns)) is not None:
-            self._last_ns = known_ns
-            yield WheelPose(known_ns, found.planar()[0])
+        bad = self._tf.bad
+        for stamp_ns, found in self._tf.read(message.value.transforms, message.topic.endswith("static")):
+            yield WheelPose(stamp_ns, found.planar()[0])
+        if self._tf.bad > bad:
+            lost[BAD_WHEELS] += self._tf.bad - bad
 
 
 def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> LidarScan:

@@ -11,6 +11,7 @@ from pathlib import Path
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.images import COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, SCAN_TYPE, SENSOR_TYPES
 from ngo_recordings.recording import Recording
+from ngo_recordings.transform_buffer import TransformBuffer, is_named
 
 ACTION_TYPE = "ngo_msgs/msg/DiscreteAction"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
@@ -22,7 +23,8 @@ _NONE = "none"
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _ODOMETRY_FRAME = "odom"
 _GLOBAL_FRAMES = ("map", "world", "earth")
-_WHEEL_NAMES = re.compile(r"wheel|(^|/)odom$", re.IGNORECASE)
+# Of several odometries of a robot, those of the first pattern come first; others are not taken without being named.
+_WHEEL_NAMES = tuple(re.compile(pattern, re.IGNORECASE) for pattern in (r"wheel|encoder|odom_enc", r"(^|/)odom$"))
 # How much of the transforms is looked through for odom -> base_link.
 _LOOK_NS = 10_000_000_000
 _TRUTH_NAMES = re.compile(r"ground_?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
@@ -140,11 +142,11 @@ class RecordingTopics:
 def choose_topics(recording: Recording, given: TopicArguments | None = None) -> RecordingTopics:
     """What is given, and for the rest what the types and names of the recording's topics make clear.
 
-    Not given, the image is the only colour or grey Image, else the only CompressedImage, else the only LaserScan; the
-    action is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped;
-    the ground truth an Odometry or pose topic whose name says so. Where the image is a LaserScan, the wheels are the
-    only Odometry that is neither ground truth nor in a global frame (map, world); of several, the only one that is
-    called odom or wheel; and where there is none, the transform odom -> base_link. Nothing else is guessed.
+    Not given, the image is the only colour or grey Image, else the only CompressedImage, else `choose_scan`; the action
+    is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped; the
+    ground truth an Odometry or pose topic whose name says so. Where the image is a LaserScan, the wheels are the first
+    of `wheel_candidates`, if it is the only one or its name says so; where there is none, the transform from odom to
+    the robot. Nothing else is guessed.
 
     Raises:
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
@@ -171,6 +173,58 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
     )
 
 
+def choose_scan(recording: Recording) -> str | None:
+    """The topic of laser scans, of several the one called scan in the shortest namespace; None: there is none."""
+    names = _filled(recording, (SCAN_TYPE,))
+    return min(
+        names,
+        key=lambda name: (not name.endswith("/scan"), name.count("/"), -recording.topics[name].count, name),
+        default=None,
+    )
+
+
+def wheel_candidates(recording: Recording, image: str, truth: GroundTruth | None = None) -> list[str]:
+    """The topics of odometry that may be the wheels of the robot whose scans are on `image`, the best one first.
+
+    Not those of the truth, of a global frame (map, world) or of another robot's namespace. What is called wheels comes
+    before odom, and this before others, which may be computed of it.
+    """
+    frame = _scan_frame(recording, image)
+    prefix = frame.rpartition("/")[0]
+    found = []
+    for name in _filled(recording, (ODOMETRY_TYPE,)):
+        if _TRUTH_NAMES.search(name) or (truth is not None and name == truth.topic) or not _related(name, image):
+            continue
+        parent, child = _odometry_frames(recording, name)
+        if any(is_named(parent, each, frame) for each in _GLOBAL_FRAMES):
+            continue
+        kind = next((k for k, names in enumerate(_WHEEL_NAMES) if names.search(name)), len(_WHEEL_NAMES))
+        other = child.rpartition("/")[0] != prefix
+        found.append((-_shared(name, image), other, kind, -recording.topics[name].count, name))
+    return [name for *_, name in sorted(found)]
+
+
+def transform_topics(recording: Recording, image: str) -> list[str]:
+    """The topics of transforms of the robot whose scans are on `image`: those of other robots' namespaces are not."""
+    names = _filled(recording, (TF_TYPE,))
+    return [name for name in names if _related(name, image)] or names
+
+
+def _related(one: str, other: str) -> bool:
+    """Whether two topics may belong to one robot: one's namespace is within the other's."""
+    return _shared(one, other) == min(len(_namespace(one)), len(_namespace(other)))
+
+
+def _shared(one: str, other: str) -> int:
+    """How many parts of their namespaces two topics share."""
+    pairs = zip(_namespace(one), _namespace(other), strict=False)
+    return next((k for k, (a, b) in enumerate(pairs) if a != b), min(len(_namespace(one)), len(_namespace(other))))
+
+
+def _namespace(topic: str) -> list[str]:
+    return topic.strip("/").split("/")[:-1]
+
+
 def _given(recording: Recording, use: str, name: str | None, types: Collection[str]) -> str | None:
     """The topic that was given for a use, if one was and it fits."""
     if name is None or name == _NONE:
@@ -195,7 +249,8 @@ def _given(recording: Recording, use: str, name: str | None, types: Collection[s
 def _choose_image(recording: Recording) -> str:
     raw = _filled(recording, (IMAGE_TYPE,))
     coloured = [name for name in raw if _encoding(recording, name) not in DEPTH_ENCODINGS]
-    for names in (coloured, _filled(recording, (COMPRESSED_TYPE,)), _filled(recording, (SCAN_TYPE,)), raw):
+    scan = choose_scan(recording)
+    for names in (coloured, _filled(recording, (COMPRESSED_TYPE,)), [] if scan is None else [scan], raw):
         if len(names) > 1:
             raise RecordingError(f"several topics may be the image ({', '.join(names)}): name one (--image)")
         if names:
@@ -237,35 +292,43 @@ def _choose_wheels(
         return wheels
     if recording.topics[image].type_name != SCAN_TYPE:
         return None
-    named = [
-        name
-        for name in _filled(recording, (ODOMETRY_TYPE,))
-        if not _TRUTH_NAMES.search(name) and (truth is None or name != truth.topic)
-    ]
-    local = [name for name in named if _odometry_frame(recording, name) not in _GLOBAL_FRAMES]
-    if local:
-        found = _only(local) or _only(name for name in local if _WHEEL_NAMES.search(name))
-        return None if found is None else WheelSource(found)
-    return _choose_transform(recording, truth)
+    if candidates := wheel_candidates(recording, image, truth):
+        clear = len(candidates) == 1 or any(names.search(candidates[0]) for names in _WHEEL_NAMES)
+        return WheelSource(candidates[0]) if clear else None
+    return _choose_transform(recording, image, truth)
 
 
-def _odometry_frame(recording: Recording, name: str) -> str:
-    first = recording.first(name)
-    return str(getattr(getattr(first.value, "header", None), "frame_id", "")).strip("/")
+def _scan_frame(recording: Recording, image: str) -> str:
+    return str(getattr(getattr(recording.first(image).value, "header", None), "frame_id", "")).strip("/")
 
 
-def _choose_transform(recording: Recording, truth: GroundTruth | None) -> WheelSource | None:
-    """The transform odom -> base_link, if it comes within the first seconds."""
+def _odometry_frames(recording: Recording, name: str) -> tuple[str, str]:
+    first = recording.first(name).value
+    parent = str(getattr(getattr(first, "header", None), "frame_id", ""))
+    return parent.strip("/"), str(getattr(first, "child_frame_id", "")).strip("/")
+
+
+def _choose_transform(recording: Recording, image: str, truth: GroundTruth | None) -> WheelSource | None:
+    """The transform from odom to the robot in the first seconds: one that carries the scanner comes first."""
+    scan, names, tree = _scan_frame(recording, image), transform_topics(recording, image), TransformBuffer()
+    static = [name for name in names if name.endswith("static")]
+    for message in recording.messages(static):
+        tree.take(getattr(message.value, "transforms", ()), static=True)
+    found: list[tuple[str, str]] = []
     start_ns: int | None = None
-    for message in recording.messages([name for name in _filled(recording, (TF_TYPE,)) if not name.endswith("static")]):
+    for message in recording.messages([name for name in names if name not in static]):
         start_ns = message.log_time_ns if start_ns is None else start_ns
         if message.log_time_ns > start_ns + _LOOK_NS:
             break
+        tree.take(getattr(message.value, "transforms", ()), static=False)
         for each in getattr(message.value, "transforms", ()):
             frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-            if frames[0] == _ODOMETRY_FRAME and frames[1] in _BASE_FRAMES:
-                return None if truth is not None and truth.tf == frames else WheelSource(tf=frames)
-    return None
+            if frames not in found and is_named(frames[0], _ODOMETRY_FRAME, scan):
+                found.append(frames)
+    found = [frames for frames in found if truth is None or truth.tf != frames]
+    carrying = [frames for frames in found if frames[1] in tree.above(scan)]
+    named = [frames for frames in found if any(is_named(frames[1], base, scan) for base in _BASE_FRAMES)]
+    return next((WheelSource(tf=frames) for frames in (*carrying, *named)), None)
 
 
 def _frames(text: str, use: str, example: str) -> tuple[str, str]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.view.live_view import LiveView
-from ngo_recordings.poses import TransformTree
+from ngo_recordings.transform_buffer import TransformBuffer
 
 S = 1_000_000_000
 
@@ -100,7 +100,7 @@ def test_a_scan_is_drawn_at_the_corrected_pose(notes: Notes) -> None:
     limits = {"range_min": 0.1, "range_max": 9.0, "time_increment": 0.0}
     angles = {"angle_min": 0.0, "angle_max": 0.2, "angle_increment": 0.1}
     message = SimpleNamespace(header=header, ranges=[4.0, np.inf, np.inf], **limits, **angles)
-    view.show_scan(message, "scan", TransformTree(0), "base_link")
+    view.show_scan(message, "scan", TransformBuffer(), "base_link")
     np.testing.assert_allclose(notes.last["scan"][0], [[-3.0, 2.0]], atol=1e-9)
 
 

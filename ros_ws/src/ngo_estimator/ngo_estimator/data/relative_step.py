@@ -59,7 +59,8 @@ class RelativeStep:
     ``motion_feature`` and ``place_code`` (of the newer frame) are float32 vectors. ``from_place_code`` is that of the
     older one. Only the first step after a start has it: later ones would repeat it. ``key`` is there if the step ends
     at a key scan of a lidar. ``origin_scan``, the lidar's first scan, is in the first step after a start.
-    ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one.
+    ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one: not a number
+    where it is not known at this stamp.
     ``unlikeness`` of the newer frame: over 1 it is unlike what the networks learned from, 0 where nobody knows.
     With ``segment`` no scan measured the motion: the covariance says how little is known, and only loops tie the frames
     behind it to those before.
@@ -83,7 +84,12 @@ class RelativeStep:
     @property
     def tf_odom_xyyaw(self) -> np.ndarray:
         """Pose (3,) of the newer frame in the frame ``odom`` on TF: the robot's own where it has one."""
-        return self.odom_xyyaw if self.robot_odom_xyyaw is None else self.robot_odom_xyyaw
+        return self.robot_odom_xyyaw if self.robot_odom_xyyaw is not None and self.tf_odom_known else self.odom_xyyaw
+
+    @property
+    def tf_odom_known(self) -> bool:
+        """Whether ``map`` -> ``odom`` follows from this step."""
+        return self.robot_odom_xyyaw is None or not bool(np.isnan(self.robot_odom_xyyaw).all())
 
 
 def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:
@@ -108,7 +114,7 @@ def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | 
         raise RejectedStep(f"unlikeness is {step.unlikeness}; expected a finite number of at least 0")
     if step.from_stamp_ns >= step.stamp_ns:
         raise RejectedStep(f"step goes from {step.from_stamp_ns} ns to {step.stamp_ns} ns; expected a later end")
-    if step.robot_odom_xyyaw is not None:
+    if step.robot_odom_xyyaw is not None and step.tf_odom_known:
         # The wheels' largest pose, carried on to the scan.
         _check_values("robot_odom_xyyaw", step.robot_odom_xyyaw, (3,), LARGEST_ODOMETRY + LARGEST_VALUE)
     if step.key is not None:

@@ -17,25 +17,29 @@ from ngo_estimator.frontend.lidar.front_ends import load_front_end
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
+from ngo_estimator.nodes.odometry_on_tf import OdometryOnTf
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
 from ngo_recordings.association import ros_pose
+from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.poses import TransformTree
 from ngo_recordings.scan_stream import LidarScan, scan_of
+from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
 _DEPTH = 1000
 _MOUNTING_WAIT_NS = 2_000_000_000
 _MOST_HELD = 200
+_NO_POSE = "pose has values that are not finite, or no orientation"
 
 
 class LidarInput:
-    """Subscribes to scans, to the robot's odometry and to /tf_static, and hands on an estimate for each scan.
+    """Subscribes to scans, to the robot's odometry and to transforms, and hands on an estimate for each scan.
 
-    Scans wait for the scanner's mounting for 2 s at most, by their stamps; then it is taken to be the base frame.
+    Scans wait for the scanner's mounting for 2 s at most, by their stamps; then it is taken to be the base frame, until
+    it comes: then the odometry starts anew with it.
 
     Args:
         publish: takes each estimate, and None where the odometry starts anew.
@@ -48,11 +52,13 @@ class LidarInput:
             warm_up_odometry()
         self._base_frame = settings.framed(settings.base_frame)
         self._odom_frame = settings.framed(settings.odom_frame)
-        self._static = TransformTree(0)
+        self._transforms = TransformBuffer()
+        self._wheels = FramePoses(self._transforms, self._odom_frame, self._base_frame)
+        self._on_tf = OdometryOnTf(self._transforms, self._odom_frame, self._base_frame)
+        self._said = ""
         self._held: deque[LidarScan] = deque(maxlen=_MOST_HELD)
-        self._mounted = settings.scan_yaw_deg != 0.0
-        if self._mounted:
-            self._core.mounting = Mounting(np.array([0.0, 0.0, math.radians(settings.scan_yaw_deg)]))
+        self._frame: str | None = None  # of the scanner whose mounting is known, or taken to be the base frame
+        self._known: KnownMounting | None = None
         self._restarts = 0
         self._unsure = self._newly_unsure = 0
 
@@ -79,16 +85,25 @@ class LidarInput:
         if settings.robot_odometry == "topic":
             listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
         # Every node on a robot publishes transforms: no single publisher is held on to.
-        if settings.robot_odometry == "tf":
-            listening.to_all(TFMessage, settings.tf_topic, self._on_tf, QoSProfile(depth=_DEPTH))
+        listening.to_all(TFMessage, settings.tf_topic, self._on_moving, QoSProfile(depth=_DEPTH))
         latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         listening.to_all(TFMessage, settings.tf_topic + "_static", self._on_static, latched)
 
     def _on_static(self, message: TFMessage) -> None:
-        for each in message.transforms:
-            pose = ros_pose(each.transform.translation, each.transform.rotation)
-            if pose is not None:
-                self._static.add(each.header.frame_id.strip("/"), each.child_frame_id.strip("/"), 0, pose, static=True)
+        self._take_transforms(message, static=True)
+
+    def _on_moving(self, message: TFMessage) -> None:
+        self._take_transforms(message, static=False)
+
+    def _take_transforms(self, message: TFMessage, static: bool) -> None:
+        bad = self._wheels.bad
+        for stamp_ns, pose in self._wheels.read(message.transforms, static):
+            if self._settings.robot_odometry == "tf":
+                self._add_wheels(stamp_ns, pose.planar()[0])
+        if self._wheels.bad > bad and self._settings.robot_odometry == "tf":
+            self._status.dropped("robot odometry", _NO_POSE)
+        if static or self._known is None:
+            self._look_for_mounting()
         self._update()
 
     def _on_scan(self, message: LaserScan) -> None:
@@ -102,32 +117,21 @@ class LidarInput:
         self._update()
 
     def _on_odometry(self, message: Odometry) -> None:
-        pose = message.pose.pose
-        self._add_wheels(messages.to_ns(message.header.stamp), pose.position, pose.orientation)
-
-    def _on_tf(self, message: TFMessage) -> None:
-        for each in message.transforms:
-            if (each.header.frame_id.strip("/"), each.child_frame_id.strip("/")) == (
-                self._odom_frame,
-                self._base_frame,
-            ):
-                transform = each.transform
-                self._add_wheels(messages.to_ns(each.header.stamp), transform.translation, transform.rotation)
-
-    def _add_wheels(self, stamp_ns: int, position: Any, orientation: Any) -> None:
-        pose = ros_pose(position, orientation)
+        pose = ros_pose(message.pose.pose.position, message.pose.pose.orientation)
         if pose is None:
-            self._status.dropped("robot odometry", "pose has values that are not finite, or no orientation")
+            self._status.dropped("robot odometry", _NO_POSE)
             return
-        try:
-            self._core.add_wheels(stamp_ns, pose.planar()[0])
-        except ValueError as error:
-            self._status.dropped("robot odometry", error)
-            return
+        self._add_wheels(messages.to_ns(message.header.stamp), pose.planar()[0])
         self._update()
 
+    def _add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
+        try:
+            self._core.add_wheels(stamp_ns, pose_xyyaw)
+        except ValueError as error:
+            self._status.dropped("robot odometry", error)
+
     def _update(self) -> None:
-        while self._held and (self._mounted or self._find_mounting()):
+        while self._held and self._is_mounted():
             try:
                 self._core.add_scan(self._held.popleft())
             except ValueError as error:
@@ -139,6 +143,7 @@ class LidarInput:
                 break
             except ValueError as error:
                 self._status.dropped("scan", error)
+        self._hand_on()
         if self._core.restarts > self._restarts:
             self._restarts = self._core.restarts
             self._publish(None)
@@ -149,35 +154,75 @@ class LidarInput:
     def _take(self, step: Any) -> None:
         self._unsure += step.unsure
         self._newly_unsure += step.unsure
-        self._publish(step)
+        if self._settings.robot_odometry == "tf":
+            self._on_tf.add(step)
+        else:
+            self._publish(step)
 
-    def _find_mounting(self) -> bool:
+    def _hand_on(self) -> None:
+        """Publish the steps whose odometry on TF is known, and say what is missing."""
+        for step in self._on_tf.ready(self._core.lag_s):
+            self._publish(step)
+        problem = self._on_tf.problem()
+        if problem and not self._said:
+            self._node.get_logger().warning(problem)
+        self._said = problem
+
+    def _is_mounted(self) -> bool:
         """Whether the mounting of the scanner is known by now, or has been waited for long enough."""
-        frame, base = self._held[0].frame_id.strip("/"), self._base_frame
-        found = mounting_in(self._static, base, frame)
-        if found is not None:
-            self._core.mounting = Mounting(found.base_from_scan_xyyaw, found.upside_down)
-            self._node.get_logger().info(f"scanner: {found}")
-        elif frame not in ("", base):
+        frame = self._held[0].frame_id.strip("/")
+        if self._frame is None:
+            self._look_for_mounting()
+        if self._frame is None:
             if self._held[-1].stamp_ns - self._held[0].stamp_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
                 return False
             self._node.get_logger().warning(
-                f"/tf_static does not say where '{frame}' sits on '{base}': it is taken to be there, looking ahead"
+                f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': it is "
+                "taken to be there, looking ahead, until a transform says it"
             )
-        self._mounted = True
+            self._mount(frame, None)
         return True
+
+    def _look_for_mounting(self) -> None:
+        """Take the mounting that the transforms say by now, if it is news."""
+        frame = self._frame if self._frame is not None or not self._held else self._held[0].frame_id.strip("/")
+        if frame is None:
+            return
+        if frame in ("", self._base_frame):
+            if self._frame is None:
+                self._mount(frame, None)
+            return
+        found = mounting_in(self._transforms, self._base_frame, frame, self._settings.tf_topic)
+        if found is None or (self._known is not None and found.near(self._known)):
+            return
+        self._node.get_logger().info(f"scanner: {found}")
+        before, late = self._core.mounting, self._frame is not None and self._known is None
+        self._mount(frame, found)
+        if late and not _same(before, self._core.mounting):
+            self.reset()
+            self._node.get_logger().warning("the scanner's mounting came late: the odometry starts anew with it")
+
+    def _mount(self, frame: str, found: KnownMounting | None) -> None:
+        """Take the scanner of this frame to sit there; None: at the base frame, looking ahead."""
+        self._frame, self._known = frame, found
+        sensor = np.zeros(3) if found is None else found.base_from_scan_xyyaw.copy()
+        if self._settings.scan_yaw_deg != 0.0:
+            sensor[2] = math.radians(self._settings.scan_yaw_deg)
+        self._core.mounting = Mounting(sensor, found is not None and found.upside_down)
 
     def reset(self) -> str:
         """Start anew with the next scan; returns what that means, in words."""
         self._core.reset()
         self._held.clear()
+        self._on_tf.reset()
         self._publish(None)
         return "the next scan is the new origin of the odometry"
 
     def details(self) -> dict[str, str]:
         """Values for diagnostics."""
         return {
-            "scans waiting for odometry": str(self._core.waiting + len(self._held)),
+            "scans waiting for odometry": str(self._core.waiting + len(self._held) + self._on_tf.waiting),
+            "scanner": "not on TF" if self._known is None else str(self._known),
             "robot odometry": "heard" if self._core.has_wheels else "none",
             "age of scans against odometry (s)": f"{self._core.lag_s:.3f}",
             "yaw of the scanner against its mounting (deg)": f"{math.degrees(self._core.mounting_yaw_rad):.1f}",
@@ -193,4 +238,13 @@ class LidarInput:
             self._newly_unsure = 0
         if self._settings.robot_odometry != "none" and not self._core.has_wheels:
             found.append("no odometry of the robot came yet")
+        if self._known is None and self._frame not in (None, "", self._base_frame):
+            found.append(f"no transform says where '{self._frame}' sits on '{self._base_frame}'")
+        if problem := self._on_tf.problem():
+            found.append(problem)
         return found
+
+
+def _same(one: Mounting, other: Mounting) -> bool:
+    off = one.sensor_xyyaw - other.sensor_xyyaw
+    return one.upside_down == other.upside_down and bool((np.abs(off) < 0.01).all())

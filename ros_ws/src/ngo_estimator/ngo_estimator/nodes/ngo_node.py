@@ -171,6 +171,7 @@ class NgoNode(ManagedNode):
     def _begin_anew(self) -> None:
         """Reset the state that belongs to one trajectory."""
         self._latest: TrajectoryUpdate | None = None
+        self._odom_xyyaw: np.ndarray | None = np.zeros(3)
         self._search = None
         self._covariance = np.zeros((3, 3))
         self._report.begin_anew()
@@ -198,10 +199,11 @@ class NgoNode(ManagedNode):
         self._starts -= 1
         if self._starts == 0:
             release_code()
+        odom_xyyaw = step.tf_odom_xyyaw if step.tf_odom_known else None
         if found is not None:
-            self._on_found(found, step.tf_odom_xyyaw, publish=update is None)
+            self._on_found(found, odom_xyyaw, publish=update is None)
         if update is not None:
-            self._on_update(update, step.tf_odom_xyyaw)
+            self._on_update(update, odom_xyyaw)
             self._correct()
 
     def _on_internal_error(self) -> None:
@@ -242,7 +244,7 @@ class NgoNode(ManagedNode):
         self._search, self._covariance = PoseSearch(search), np.zeros((3, 3))
         self._out.smoothing.reset()
 
-    def _on_update(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray) -> None:
+    def _on_update(self, update: "TrajectoryUpdate", odom_xyyaw: np.ndarray | None) -> None:
         """Publish what a step changed in the trajectory."""
         if self._search is not None:
             self._search = None
@@ -265,7 +267,7 @@ class NgoNode(ManagedNode):
         self._whole.changed(loops=update.optimized or begins)
         self._odom_xyyaw = odom_xyyaw
 
-    def _on_found(self, step: "LocalisedStep", odom_xyyaw: np.ndarray, publish: bool) -> None:
+    def _on_found(self, step: "LocalisedStep", odom_xyyaw: np.ndarray | None, publish: bool) -> None:
         """Tell what is new about the pose in the saved map, and publish it where it is known."""
         found = step.found
         self._report.count(step.gap, step.restarted)
@@ -398,6 +400,8 @@ class NgoNode(ManagedNode):
     def _problems(self) -> list[str]:
         found = [line for entry in self._inputs for line in entry.problems()]
         found += self._report.problems()
+        if self._latest is not None and self._odom_xyyaw is None:
+            found.append("no map -> odom: the robot's own odometry is not known at the scans' stamps, see local_node")
         if self._search is not None:
             found += self._search.problems()
         if (std_m := position_std(self._covariance)) >= self._settings.lost_position_std_m:

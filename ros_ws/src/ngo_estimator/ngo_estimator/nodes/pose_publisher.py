@@ -46,15 +46,20 @@ class PosePublisher:
         self._tf_writer = TransformsWriter([(map_frame, odom_frame)], serialize_message)
 
     def publish(
-        self, stamp_ns: int, pose: np.ndarray, covariance: np.ndarray, map_from_odom: np.ndarray, odom: np.ndarray
+        self,
+        stamp_ns: int,
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        map_from_odom: np.ndarray,
+        odom: np.ndarray | None,
     ) -> None:
         """Publish a pose ``(3,)`` and its covariance ``(3, 3)`` in map, and what goes to ``send_transform``."""
         self.send_transform(stamp_ns, map_from_odom, odom)
         self._pose.publish(self._pose_writer.write(stamp_ns, pose, covariance))
 
-    def send_transform(self, stamp_ns: int, map_from_odom: np.ndarray, odom: np.ndarray) -> None:
-        """Publish map -> odom ``(3,)``, smoothed, with the robot's pose ``(3,)`` in odom."""
-        if self._tf is None:
+    def send_transform(self, stamp_ns: int, map_from_odom: np.ndarray, odom: np.ndarray | None) -> None:
+        """Publish map -> odom ``(3,)``, smoothed, with the robot's pose ``(3,)`` in odom; None: nothing."""
+        if self._tf is None or odom is None:
             return
         smoothed = self.smoothing.update(stamp_ns, map_from_odom, odom)
         ahead_ns = round(1e9 * self._settings().tf_ahead_s)

@@ -37,7 +37,7 @@ from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
 from ngo_recordings.images import SCAN_TYPE
 from ngo_recordings.recording import Recording, open_recording
-from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_topics
+from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, choose_topics
 
 if TYPE_CHECKING:
     from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
@@ -76,7 +76,8 @@ class Arguments:
     iterations_per_step: int = 1
     """Iterations of an optimisation at each frame, which spreads it over frames; 0 for all at once."""
     scan_yaw_deg: float = 0.0
-    """Where a scanner's angle 0 points, counter-clockwise from straight ahead; 0: as the recording's transforms say."""
+    """Where a scanner's angle 0 points, counter-clockwise from straight ahead; 0: as the recording's transforms say.
+    Where the scanner sits is as they say."""
     base_frame: str = "base_link"
     """Frame of the robot in trajectories.mcap."""
     odom_frame: str = "odom"
@@ -270,16 +271,17 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
 
     odometry = load_front_end(folder, arguments.world)
     online = ScanTrajectory.load(folder, arguments.world, arguments.iterations_per_step)
-    scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
     given = replace(arguments.topics, action="none", twist="none")
-    if given.image is None and len(scans) == 1:
-        given = replace(given, image=scans[0])
+    if given.image is None:
+        given = replace(given, image=choose_scan(recording))
     topics = choose_topics(recording, given)
     described = describe_lidar(recording, topics)
+    if arguments.scan_yaw_deg != 0.0:
+        described = described.looking_at(math.radians(arguments.scan_yaw_deg))
     for line in described.lines():
         console.print(line, soft_wrap=True, highlight=False)
-    mounting = Mounting(np.array([0.0, 0.0, math.radians(arguments.scan_yaw_deg)]))
-    if described.mounting is not None and arguments.scan_yaw_deg == 0.0:
+    mounting = Mounting(np.zeros(3))
+    if described.mounting is not None:
         mounting = Mounting(described.mounting.base_from_scan_xyyaw, described.mounting.upside_down)
     truth = Truth()
     if topics.ground_truth is not None:
@@ -293,9 +295,8 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
 
 def _for_weights(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
     """The arguments, with the only laser scan for weights of scans, and without inputs that the weights do not take."""
-    scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
-    if given.image is None and local.image_format.is_scan and len(scans) == 1:
-        given = replace(given, image=scans[0])
+    if given.image is None and local.image_format.is_scan:
+        given = replace(given, image=choose_scan(recording))
     if given.action is None and not local.uses_action:
         given = replace(given, action="none")
     if given.twist is None and not local.uses_twist:

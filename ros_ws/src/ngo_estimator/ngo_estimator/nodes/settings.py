@@ -67,14 +67,14 @@ class LocalNodeSettings(EstimatorSettings):
     scan_yaw_deg: float = setting(
         0.0,
         "Direction of a scan's angle 0, counter-clockwise from straight ahead, degrees; other than 0 it stands for the "
-        "scanner's pose on /tf_static.",
+        "direction on TF, which then says the scanner's place alone.",
         minimum=-360.0,
         maximum=360.0,
     )
     robot_odometry: str = setting(
         "none",
         "Odometry that the robot has of its own, with world:=scan: none, an Odometry on robot_odometry_topic, or "
-        "odom_frame to base_frame on tf_topic, which then stays the robot's.",
+        "any chain from odom_frame to base_frame on tf_topic, which then stays the robot's.",
         choices=("none", "topic", "tf"),
     )
     robot_odometry_topic: str = topic("wheel_odom", "Odometry of the robot, with robot_odometry:=topic.")

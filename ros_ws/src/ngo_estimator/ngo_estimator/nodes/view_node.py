@@ -22,7 +22,7 @@ from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.view_settings import ViewNodeSettings
 from ngo_recordings.association import ros_pose
 from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE
-from ngo_recordings.poses import TransformTree
+from ngo_recordings.transform_buffer import TransformBuffer
 
 if TYPE_CHECKING:
     from ngo_estimator.view.live_view import LiveView
@@ -40,7 +40,7 @@ class ViewNode(Node):
         live = LiveSettings(self, ViewNodeSettings)
         self._settings = settings = live.values
         self._view = self._make_view(settings)
-        self._static = TransformTree(0)
+        self._static = TransformBuffer()
         self._newest: dict[str, Any] = {}
         self._subscribe(settings)
         steady = Clock(clock_type=ClockType.STEADY_TIME)

@@ -15,8 +15,8 @@ from ngo_estimator.view.tracks import (
 )
 from ngo_recordings.images import picture
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.poses import TransformTree
 from ngo_recordings.scan_stream import scan_of
+from ngo_recordings.transform_buffer import TransformBuffer
 
 _ARROW_SHARE = 0.06
 """Length of the robot's arrow as a share of half the window: seen in a room and in a building."""
@@ -99,7 +99,7 @@ class LiveView:
         """An image message. Raises ``ValueError`` for one that cannot be read."""
         self._canvas.picture(shown_picture(picture(message, type_name, topic)[0]))
 
-    def show_scan(self, message: Any, topic: str, static: TransformTree, base_frame: str) -> None:
+    def show_scan(self, message: Any, topic: str, static: TransformBuffer, base_frame: str) -> None:
         """A scan message at the newest corrected pose. Raises ``ValueError`` for one that cannot be read."""
         scan = scan_of(message, topic)
         self._canvas.scan(scan_points(scan, mounting_in(static, base_frame, scan.frame_id), self._pose))

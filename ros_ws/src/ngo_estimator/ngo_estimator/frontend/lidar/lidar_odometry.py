@@ -298,13 +298,12 @@ class LidarOdometry:
         return self._swept(scan, replace(sweep, twist=twist))
 
     def _key_scan(self, scan: LidarScan, sweep: Sweep | None) -> KeyScan:
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
         try:
             return key_scan(
                 scan.stamp_ns,
-                angles,
+                scan.angles,
                 scan.ranges,
                 (least, largest),
                 self.mounting,
@@ -316,7 +315,7 @@ class LidarOdometry:
 
     def _sweep(self, scan: LidarScan) -> Sweep | None:
         """How the robot moves during the scan, where the scan says how long it takes and the motion is known."""
-        if self._last is None or not self._last_steps or scan.time_increment == 0.0:
+        if self._last is None or not self._last_steps or scan.sweep_s == 0.0:
             return None
         between_s, sweep_s = (scan.stamp_ns - self._last.stamp_ns) * 1e-9, _duration_s(scan)
         # A sweep that lasts longer than from scan to scan is none.
@@ -330,10 +329,9 @@ class LidarOdometry:
             froze = self._wheels.frozen_s(scan.stamp_ns) > 0.0 or self._wheels.frozen_s(end_ns) > 0.0
             if not froze and ends[0] is not None and ends[1] is not None:
                 twist = between(ends[0], ends[1]) / sweep_s
-        return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)
+        return Sweep(scan.ray_offsets_s, twist)
 
 
 def _duration_s(scan: LidarScan) -> float:
     """How long the sweep lasts (s); 0 where the scan does not say it, or says what cannot be."""
-    duration_s = abs(scan.time_increment) * len(scan.ranges)
-    return duration_s if duration_s <= _LONGEST_SWEEP_S else 0.0
+    return scan.sweep_s if scan.sweep_s <= _LONGEST_SWEEP_S else 0.0

@@ -227,12 +227,11 @@ class MixtureLidar:
         )
 
     def _key_scan(self, scan: LidarScan, sweep: Sweep | None) -> KeyScan:
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M
         least = scan.range_min if 0.0 <= scan.range_min < largest else 0.0
         try:
             key = key_scan(
-                scan.stamp_ns, angles, scan.ranges, (least, largest), self.mounting, sweep, self.config.points
+                scan.stamp_ns, scan.angles, scan.ranges, (least, largest), self.mounting, sweep, self.config.points
             )
         except ValueError as error:
             raise UnusableImage(str(error)) from error
@@ -243,13 +242,12 @@ class MixtureLidar:
     def _sweep(self, scan: LidarScan, gap_s: float, by_wheels: Array | None) -> Sweep | None:
         """How the robot moves during the scan, where the scan says how long it takes."""
         sweep_s = _duration_s(scan)
-        if scan.time_increment == 0.0 or not 0.0 < sweep_s <= 1.2 * gap_s:
+        if scan.sweep_s == 0.0 or not 0.0 < sweep_s <= 1.2 * gap_s:
             return None
         twist = self._twist if by_wheels is None else by_wheels / gap_s
-        return Sweep(scan.time_increment * np.arange(len(scan.ranges), dtype=np.float64), twist)
+        return Sweep(scan.ray_offsets_s, twist)
 
 
 def _duration_s(scan: LidarScan) -> float:
     """How long the sweep lasts (s); 0 where the scan does not say it, or says what cannot be."""
-    duration_s = abs(scan.time_increment) * len(scan.ranges)
-    return duration_s if duration_s <= _LONGEST_SWEEP_S else 0.0
+    return scan.sweep_s if scan.sweep_s <= _LONGEST_SWEEP_S else 0.0
