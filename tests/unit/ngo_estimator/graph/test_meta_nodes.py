@@ -17,7 +17,8 @@ def nodes(monkeypatch: pytest.MonkeyPatch) -> MetaNodes:
     monkeypatch.setattr(key_frames, "SLACK", 3)
     nodes, nothing = MetaNodes(2), np.zeros(NO_CODES, np.float32)
     for _ in range(7):
-        nodes.append(np.array([1.0, 0.0, 0.0]))
+        nodes.append(np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)))
+        nodes.add_node()
     for node in range(5):
         nodes.leave(KeyFrame(node, nodes.step(), np.full(3, 0.01), nothing, nothing, np.zeros((8, 3))))
     assert nodes.keys.crowded
@@ -35,19 +36,20 @@ def test_key_frames_and_the_window_are_optimised(nodes: MetaNodes) -> None:
 
 
 def test_a_correction_is_spread_over_the_nodes_between_two_key_frames(nodes: MetaNodes) -> None:
-    before = nodes.all()
-    nodes.move(before[nodes.active[1:]] + [0.0, 0.4, 0.0])
+    before = nodes.node_poses()
+    moved = before[nodes.active] + np.where(nodes.active > 0, 0.4, 0.0)[:, None] * [0.0, 1.0, 0.0]
+    nodes.move(nodes.active, moved, np.eye(3))
     assert nodes.largest_move_m == pytest.approx(0.4)
-    np.testing.assert_allclose(nodes.all()[:, 1], [0.0, 0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4])
-    np.testing.assert_allclose(nodes.all()[:, 0], before[:, 0])
-    np.testing.assert_array_equal(nodes.all(before=True), before)
+    np.testing.assert_allclose(nodes.node_poses()[:, 1], [0.0, 0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4])
+    np.testing.assert_allclose(nodes.node_poses()[:, 0], before[:, 0])
+    np.testing.assert_array_equal(nodes.node_poses(before=True), before)
 
 
 def test_nodes_are_restored_as_they_were(nodes: MetaNodes) -> None:
-    nodes.move(nodes.all()[nodes.active[1:]] + [0.0, 0.4, 0.0])
+    nodes.move(nodes.active[1:], nodes.poses[nodes.active[1:]] + [0.0, 0.4, 0.0], np.eye(3))
     restored = restore(MetaNodes(2), state_of(nodes))
     assert restored.first == 5 and restored.largest_move_m == nodes.largest_move_m
-    np.testing.assert_array_equal(restored.all(), nodes.all())
-    np.testing.assert_array_equal(restored.all(before=True), nodes.all(before=True))
+    np.testing.assert_array_equal(restored.node_poses(), nodes.node_poses())
+    np.testing.assert_array_equal(restored.node_poses(before=True), nodes.node_poses(before=True))
     with pytest.raises(StateError, match="key frames do not end where the window begins"):
         restore(MetaNodes(2), state_of(nodes) | {"first": np.array(4)})

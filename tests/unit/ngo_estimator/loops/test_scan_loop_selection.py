@@ -19,7 +19,7 @@ def straight(keys: int) -> KeyScanChain:
     chain.begin_at(0)
     for k in range(1, keys):
         chain.append(step, COVARIANCE, joins=False)
-        chain.append_node(KeyScanStep(no_scan(k), k - 1, step, COVARIANCE), joins=False)
+        chain.add_key(KeyScanStep(no_scan(k), k - 1, step, COVARIANCE), joins=False)
     return chain
 
 

@@ -39,7 +39,8 @@ class Recorded:
 def intake(recorded: Any, blocks: int = 1, overlaps: bool = True) -> BlockIntake:
     nodes = MetaNodes(2)
     for _ in range(blocks):
-        nodes.append(np.zeros(3))
+        nodes.append(np.zeros(3), np.zeros((3, 3)))
+        nodes.add_node()
     return BlockIntake(recorded, nodes, recorded, overlaps, 1.0)
 
 

@@ -182,19 +182,3 @@ def frames_between_nodes(nodes: Array, odometry: Array, at: Array, joins: Array)
             poses[k, 0], poses[k, 1] = x + cos * in_x - sin * in_y, y + sin * in_x + cos * in_y
             poses[k, 2] = wrap(yaw + wrap(odometry[k, 2] - yaw0) + part * moved[2])
     return poses
-
-
-@njit(cache=True)
-def carried(pose: Array, covariance: Array, odometry: Array, relative: Array, variance: Array) -> tuple[Array, Array]:
-    """A pose and its covariance after further steps, as ``planar_covariance.propagate`` has it for each.
-
-    Args:
-        pose: ``(3,)`` where the steps begin, covariance: ``(3, 3)`` of it.
-        odometry: poses ``(n + 1, 3)`` by odometry where they begin and after each.
-        relative: the steps ``(n, 3)``, with independent errors of this ``variance`` ``(n, 3)``.
-    """
-    last = pose
-    for k in range(len(relative)):
-        last = compose(pose, between(odometry[0], odometry[k + 1]))
-        covariance = propagated(covariance, last, relative[k], np.diag(variance[k]))
-    return last, covariance

@@ -3,37 +3,32 @@
 import numpy as np
 import torch
 
-from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_motion import all_between, between, compose
+from ngo_estimator.geometry.planar_motion import all_between, between
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
+from ngo_estimator.graph.node_chain import NodeChain
 
 
-class MetaNodes:
-    """The nodes of a window, the key frames before it, and the nodes between key frames, which are let go."""
+class MetaNodes(NodeChain):
+    """The nodes of a window, the key frames before it, and the nodes between key frames, which are let go.
+
+    Nodes that were let go are, among ``poses``, where they were then; ``node_poses`` has them where they are.
+    """
 
     def __init__(self, key_frames: int) -> None:
-        self._poses = GrowingRows((3,), np.float64)
-        self._poses.append(np.zeros(3))
+        super().__init__()
         self.first = 0
         """Node where the window begins."""
         self.keys = KeyFrames(key_frames)
         """Those before it."""
         self._kept = np.zeros((0, 3))  # poses of key frames when some were let go last
         self._gone = np.zeros(0, np.int64)  # nodes between these
-        self._moved = np.zeros(0, np.int64)  # nodes optimised last, with their poses before
-        self._before = np.zeros((0, 3))
 
     @property
     def blocks(self) -> int:
         """Blocks between the nodes: the number of the last node."""
-        return len(self._poses) - 1
-
-    @property
-    def poses(self) -> np.ndarray:
-        """Of all nodes in the map ``(blocks + 1, 3)``, without a copy; nodes let go are where they were then."""
-        return self._poses.values
+        return len(self) - 1
 
     @property
     def active(self) -> np.ndarray:
@@ -45,22 +40,6 @@ class MetaNodes:
         """Poses of the active nodes ``(n, 3)`` but the first, each seen from the one before."""
         nodes = self.poses.take(self.active, axis=0)
         return all_between(nodes[:-1], nodes[1:])
-
-    @property
-    def largest_move_m(self) -> float:
-        """How far ``move`` moved a node at most."""
-        moved = self.poses[self._moved, :2] - self._before[:, :2]
-        return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
-
-    def append(self, relative: np.ndarray) -> None:
-        """Add a node, seen from the last one ``(3,)``."""
-        self._poses.append(compose(self.poses[-1], relative))
-
-    def move(self, poses: np.ndarray) -> None:
-        """Move the active nodes but the first, which is the origin, to these poses ``(n - 1, 3)``."""
-        self._moved = self.active
-        self._before = self.poses.take(self._moved, axis=0)
-        self.poses[self._moved[1:]] = poses
 
     def step(self) -> np.ndarray:
         """The window's second node as seen from its first ``(3,)``."""
@@ -78,7 +57,7 @@ class MetaNodes:
             The key frames before ``(n,)``, which of them stay ``(n,)``, their poses and variances ``(n, 3)``.
         """
         nodes, variance = self.keys.nodes, self.keys.variance
-        self.poses[:] = self.all()
+        self.poses[:] = self.node_poses()
         poses = self.poses[nodes]
         stay = self.keys.thin(poses)
         self._kept = poses[stay]
@@ -86,11 +65,9 @@ class MetaNodes:
         self._gone = inside[~np.isin(inside, self.keys.nodes)]
         return nodes, stay, poses, variance
 
-    def all(self, before: bool = False) -> np.ndarray:
-        """Poses of all nodes ``(blocks + 1, 3)``, as they are or as they were before the last optimisation."""
-        nodes: np.ndarray = self.poses.copy()
-        if before:
-            nodes[self._moved] = self._before
+    def node_poses(self, before: bool = False) -> np.ndarray:
+        """Poses of all nodes ``(blocks + 1, 3)``; those let go move with the key frames around them."""
+        nodes = super().node_poses(before)
         if len(self._gone):
             keys = self.keys.nodes[: len(self._kept)]
             old, new = torch.from_numpy(self._kept), torch.from_numpy(nodes[keys])
@@ -102,14 +79,14 @@ class MetaNodes:
             nodes[self._gone] = se2.compose(new[segment], relative + share[:, None] * bent[segment]).numpy()
         return nodes
 
-    SAVED = ("_poses", "first", "keys", "_kept", "_gone", "_moved", "_before")
+    SAVED = (*NodeChain.SAVED, "first", "keys", "_kept", "_gone")
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
+        super().check_state()
         keys = self.keys.nodes
-        for name, nodes in (("key frames", keys), ("gone", self._gone), ("active", self._moved)):
+        for name, nodes in (("key frames", keys), ("gone", self._gone)):
             require_ascending(nodes, name, self.blocks + 1)
-        require(len(self._moved) == len(self._before), "poses of other nodes than those that moved are given")
         require(
             self.first == (keys[-1] + 1 if len(keys) else 0) and len(self._kept) <= len(keys),
             "key frames do not end where the window begins",

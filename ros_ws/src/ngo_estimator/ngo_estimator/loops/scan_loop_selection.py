@@ -44,7 +44,7 @@ class ScanLoopSelection:
         config, windows = self._config, self._config.windows
         loops, known = found[rows], found[self.rows]
         covariance = path_covariances(
-            chain.nodes,
+            chain.poses,
             np.concatenate((chain.edges, known.pairs)),
             np.concatenate((chain.step_covariance, known.covariance)),
             loops.pairs,
@@ -61,9 +61,9 @@ class ScanLoopSelection:
         """Take those of the believed loops into the graph that it needs; returns whether one surprises."""
         loops, known, config = found[rows], found[self.rows], self._config
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
-        off = (measured.residuals(chain.nodes) ** 2).sum(1)
+        off = (measured.residuals(chain.poses) ** 2).sum(1)
         at_walls = np.tile(np.diag((1.0, 1.0, WALLS_M)), (len(rows), 1, 1))
-        moved = (RelativePoses(loops.pairs, loops.relative, at_walls).residuals(chain.nodes) ** 2).sum(1)
+        moved = (RelativePoses(loops.pairs, loops.relative, at_walls).residuals(chain.poses) ** 2).sum(1)
         surprising = (off > config.surprise**2) & (moved > config.surprise_m**2)
         needed = needed_loops(
             np.concatenate((chain.edges, known.pairs)),

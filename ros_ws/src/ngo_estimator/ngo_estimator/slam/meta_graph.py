@@ -11,8 +11,7 @@ import torch
 
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_covariance import propagate
-from ngo_estimator.geometry.planar_motion import chained, compose
+from ngo_estimator.geometry.planar_motion import chained
 from ngo_estimator.graph.key_frames import KeyFrame
 from ngo_estimator.graph.meta_nodes import MetaNodes
 from ngo_estimator.graph.solved_graph import SolvedGraph
@@ -26,7 +25,7 @@ from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_varian
 from ngo_estimator.slam.block_intake import BlockIntake
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
-from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, require_sound
 from ngo_estimator.slam.step_log import StepLog
 
 _SHRUNK = 1e-5
@@ -53,19 +52,18 @@ class MetaGraph(PoseGraph):
         anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
-        super().__init__()
+        self._nodes = MetaNodes(key_frames)
+        super().__init__(self._nodes)
         self._optimizer = optimizer
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
         self._log = log  # of the steps as they came
-        self._odometry = OdometryBlocks(optimizer, pair_head, window, log)
-        self._nodes = MetaNodes(key_frames)
-        self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))  # of the newest frame
+        self._odometry = OdometryBlocks(optimizer, pair_head, window, log, self._nodes.frames)
         self._loops: OnlineLoops | None = None
         self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
             assert pair_head is not None
-            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._odometry.frames)
+            self._loops = OnlineLoops(pair_head, optimizer.config.search, self._block, window, self._nodes.frames)
         overlaps = optimizer.config.search.overlaps > 0
         self._intake = BlockIntake(self._odometry, self._nodes, self._loops, overlaps, self._scale)
         self._network_every, self._anneal_every = network_every, anneal_every
@@ -77,11 +75,6 @@ class MetaGraph(PoseGraph):
     def window_fill(self) -> float:
         """Share of the window that is in use."""
         return min(1.0, self._odometry.steps / (self._window * self._block))
-
-    @property
-    def largest_move_m(self) -> float:
-        """How far the last optimisation moved a node at most."""
-        return self._nodes.largest_move_m
 
     def begin_at(self, origin_code: np.ndarray | None) -> None:
         """Take the place code of the first frame, where it is known, before the first step."""
@@ -107,9 +100,8 @@ class MetaGraph(PoseGraph):
             code, variance = np.zeros_like(code), variance / self._scale
             if self._odometry.is_familiar:
                 self._recall()
-        self._pose = compose(self._pose, relative.astype(np.float64))
-        self._covariance = propagate(self._covariance, self._pose, relative, np.diag(variance))
-        self._odometry.append(relative, variance, motion, familiar, joins)
+        self._nodes.append(relative.astype(np.float64), np.diag(variance.astype(np.float64)), joins)
+        self._odometry.append(relative, variance, motion, familiar)
         if self._loops is not None:
             self._loops.append(code)
 
@@ -124,7 +116,8 @@ class MetaGraph(PoseGraph):
 
     def _take_in(self) -> bool:
         self._guarded("the registration of steps", lambda: self._register(self._nodes.blocks * self._block))
-        self._nodes.append(self._odometry.complete())
+        self._odometry.complete()
+        self._nodes.add_node()
         self.fault = self._intake.take() or self.fault
         self._make_room()
         return True
@@ -187,16 +180,12 @@ class MetaGraph(PoseGraph):
         corrections = None if known is None else known.for_blocks(first, blocks)
         *_, result = self._optimizer.iterate(steps, loops, corrections, solution)
         end = self._scale * result.end_covariance()[0].numpy()
-        if not (
-            result.meta_relative[-1].isfinite().all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()
-        ):
-            raise ArithmeticError("poses or their covariances came out as no numbers")
-        moved = self._apply(result, numbers, end)
+        require_sound(result.meta_relative[-1].numpy(), end)
+        self._apply(result, numbers, end)
         if solution is None:
             self._annealed = blocks
         if runs_network and self._network_every > 1:
             self._corrections = NetworkCorrections.of(first, result.corrections)
-        self._pose, self._covariance = self._odometry.carried(self._nodes.poses[-1], end + np.outer(moved, moved))
 
     def _verified(self, loops: Loops) -> Loops:
         """The same loops; none across a blind stretch where place codes alone show them.
@@ -225,8 +214,8 @@ class MetaGraph(PoseGraph):
             return True
         return is_due(self._nodes.blocks - self._annealed, self._annealed - first, self._anneal_every)
 
-    def _apply(self, result: OptimizedMetaPoses, numbers: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Take the result; how far the last node is from it ``(3,)``, as unfamiliar frames make corrections unsure."""
+    def _apply(self, result: OptimizedMetaPoses, numbers: np.ndarray, end: np.ndarray) -> None:
+        """Take the result; how far the last node is from it adds to its covariance ``end``."""
         if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
             weight, information = (of[0].double().numpy() for of in (result.loop_weights, result.loop_information))
             std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
@@ -234,12 +223,11 @@ class MetaGraph(PoseGraph):
             self._loops.weigh(numbers, weight, information)
         solution = chained(result.meta_relative[-1][0].double().numpy())
         poses = self._shrink(solution)
-        self._nodes.move(poses[1:])
+        moved = poses[-1] - solution[-1]
+        self._nodes.move(self._nodes.active, poses, end + np.outer(moved, moved))
         keys, first = self._nodes.keys.nodes, self._nodes.first
         self._odometry.optimized_std.replace(first, result.step_std[0, len(keys) :].double().numpy())
         self._intake.solved = SolvedGraph(keys, first, self._nodes.blocks, end, result.equations)
-        moved: np.ndarray = poses[-1] - solution[-1]
-        return moved
 
     def _shrink(self, solution: np.ndarray) -> np.ndarray:
         """Poses of the active nodes ``(n, 3)``, whose corrections are shrunk across blind stretches."""
@@ -255,14 +243,6 @@ class MetaGraph(PoseGraph):
         self._shrunk = bool(np.abs(shrunk - solution).max() > _SHRUNK)
         return shrunk
 
-    def newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
-        return self._pose, self._covariance
-
-    def frame_poses(self, before: bool = False) -> np.ndarray:
-        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
-        return self._odometry.frames.poses(self._nodes.all(before))
-
     def places(self) -> PlaceMap:
         """The frames whose place codes are kept; raises ``ValueError`` where none are."""
         if self._loops is None:
@@ -270,8 +250,7 @@ class MetaGraph(PoseGraph):
         return self._loops.places(self._nodes.first * self._block, self._nodes.keys, self.frame_poses())
 
     SAVED = (
-        "_odometry", "_nodes", "_loops", "_intake", "_pose", "_covariance", "_annealed", "_shrunk", "_corrections",
-        "_origin_code", "closed",
+        "_nodes", "_odometry", "_loops", "_intake", "_annealed", "_shrunk", "_corrections", "_origin_code", "closed",
     )  # fmt: skip
 
     def check_state(self) -> None:

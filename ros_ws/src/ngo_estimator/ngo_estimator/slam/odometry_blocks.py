@@ -8,7 +8,6 @@ import torch
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_motion import carried
 from ngo_estimator.graph.frames import Frames
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
@@ -30,7 +29,12 @@ class OdometryBlocks:
     """
 
     def __init__(
-        self, optimizer: NeuralGraphOptimizer, pair_head: PairHead | None, window: int, log: Callable[[], StepLog]
+        self,
+        optimizer: NeuralGraphOptimizer,
+        pair_head: PairHead | None,
+        window: int,
+        log: Callable[[], StepLog],
+        frames: Frames,
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._context = optimizer.block, optimizer.config.context
@@ -39,8 +43,7 @@ class OdometryBlocks:
         registers = pair_head is not None and pair_head.config.registers_odometry
         self.registrations = optimizer.config.registrations if registers else 0
         """Of each step; 0: steps stay as they came."""
-        self.frames = Frames()
-        """All of them, each last one of a block a node."""
+        self._frames = frames  # each last one of a block a node; their owner appends to them
         config = optimizer.config.aggregation
         recalled = -(-_NOTICED_LATE // self._block) + 1
         steps_kept = (2 * self._context + 2 + recalled) * self._block
@@ -64,7 +67,7 @@ class OdometryBlocks:
     @property
     def steps(self) -> int:
         """Steps so far."""
-        return len(self.frames) - 1
+        return len(self._relative)
 
     @property
     def blocks(self) -> int:
@@ -81,11 +84,8 @@ class OdometryBlocks:
         """Whether there is a newest frame, and it is familiar."""
         return len(self._familiar) > 0 and bool(self._familiar.slice(len(self._familiar) - 1)[0])
 
-    def append(
-        self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, familiar: bool, joins: bool
-    ) -> None:
-        """Take a step ``(3,)``; with ``joins`` another odometry goes on from there."""
-        self.frames.append(relative, joins)
+    def append(self, relative: np.ndarray, variance: np.ndarray, motion: np.ndarray, familiar: bool) -> None:
+        """Take a step ``(3,)``, that to the newest of the frames."""
         self._relative.append(relative)
         self._log_std.append(0.5 * np.log(variance))
         self._motion.append(motion)
@@ -100,7 +100,7 @@ class OdometryBlocks:
         first = self.blocks * self._block
         if self._pair_head is None or self.registrations == 0 or not self._familiar.slice(first).all():
             return
-        if self.frames.last_join > first:
+        if self._frames.last_join > first:
             return  # the frames were seen from two places
         before = None if code_before is None else torch.from_numpy(code_before).unsqueeze(0)
         rows = self._relative.slice(first), self._log_std.slice(first), codes
@@ -110,20 +110,17 @@ class OdometryBlocks:
         )
         self._relative.replace(first, relative[0].numpy())
         self._log_std.replace(first, log_std[0].numpy())
-        odometry = torch.from_numpy(self.frames.odometry)
+        odometry = torch.from_numpy(self._frames.odometry)
         odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
 
-    def complete(self) -> np.ndarray:
-        """Make a block of the newest steps; returns the relative pose ``(3,)`` of its end, by odometry."""
+    def complete(self) -> None:
+        """Make a block of the newest steps."""
         in_block, std = self._in_blocks(self.blocks * self._block)
         self._blind.append(self._blind_variance(self.blocks))
         self.relative.append(in_block[0, 0, -1])
         self.std.append(std[0])
         self.optimized_std.append(std[0])
         self.fixed.append(False)
-        since = self.frames.since_node
-        self.frames.add_node()
-        return since
 
     def _in_blocks(self, first: int, stop: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Poses within the blocks of steps from number ``first`` on, and the deviations ``(blocks, 3)`` of blocks."""
@@ -150,7 +147,7 @@ class OdometryBlocks:
         relative = se2.between(torch.from_numpy(odometry[:-1]), torch.from_numpy(odometry[1:]))
         self._relative.replace(began, relative.numpy())
         self._log_std.replace(began, np.log(std[: len(relative)].clip(*_STD)))
-        own = torch.from_numpy(self.frames.odometry)
+        own = torch.from_numpy(self._frames.odometry)
         own[began + 1 :] = se2.compose(own[began], se2.r2g(relative))
         in_block, block_std = self._in_blocks(began, self.blocks * self._block)
         self.relative.replace(first, in_block[0, :, -1].numpy())
@@ -185,15 +182,9 @@ class OdometryBlocks:
             for buffer, smooth, raw in smoothed:
                 buffer.replace(changed, torch.where(stays, raw, smooth)[changed - start :].numpy())
 
-    def carried(self, pose: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A pose ``(3,)`` of the last block's end and its covariance ``(3, 3)``, carried to the newest frame."""
-        whole = self.blocks * self._block
-        relative, log_std = (rows.slice(whole).astype(np.float64) for rows in (self._relative, self._log_std))
-        return carried(pose, covariance, self.frames.odometry[whole:], relative, np.exp(2.0 * log_std))
-
     _OF_STEPS = ("_relative", "_log_std", "_motion", "_familiar")
     _OF_BLOCKS = ("relative", "std", "optimized_std", "fixed")
-    SAVED = (*_OF_STEPS, *_OF_BLOCKS, "frames", "_blind", "_recalled", "features")
+    SAVED = (*_OF_STEPS, *_OF_BLOCKS, "_blind", "_recalled", "features")
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
@@ -202,7 +193,8 @@ class OdometryBlocks:
             steps // self._block == blocks == len(self._blind)
             and {len(getattr(self, name)) for name in self._OF_STEPS} == {steps}
             and {len(getattr(self, name)) for name in self._OF_BLOCKS} == {blocks}
-            and np.array_equal(self.frames.nodes, self._block * np.arange(blocks + 1)),
+            and len(self._frames) == steps + 1
+            and np.array_equal(self._frames.nodes, self._block * np.arange(blocks + 1)),
             f"{steps} steps and {blocks} meta-poses do not belong together",
         )
         require(self._recalled >= 0, f"frames are recalled from meta-pose {self._recalled} on")

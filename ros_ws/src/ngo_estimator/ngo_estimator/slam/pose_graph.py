@@ -1,4 +1,7 @@
-"""What every pose graph behind a corrected trajectory does: follow frames, and do the work that a node makes due."""
+"""The pose graph behind a corrected trajectory: a chain of nodes, the loops that join them, and the work they make due.
+
+A meta-pose is a node by count, a key scan one by motion.
+"""
 
 import time
 from abc import ABC, abstractmethod
@@ -7,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.loops.loop_record import LoopRecord, rows
 from ngo_estimator.slam.trajectory_update import fault_of
 
@@ -23,12 +27,14 @@ class ClosedLoops(LoopRecord):
 
 
 class PoseGraph(ABC):
-    """The owner of all poses in ``map``, of the newest covariance, and of the loops.
+    """Follows frames by odometry; a node makes work due: the search for its loops, and an optimisation.
 
-    Frames follow the last node by odometry. A node makes work due: the search for its loops, and an optimisation.
+    Args:
+        chain: owns all poses in ``map``, and the newest covariance.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, chain: NodeChain) -> None:
+        self._nodes = chain
         self.closed = ClosedLoops.none()
         self.fault = ""
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
@@ -87,14 +93,23 @@ class PoseGraph(ABC):
         """Share of the window that is in use."""
 
     @property
-    @abstractmethod
     def largest_move_m(self) -> float:
         """How far the last optimisation moved a node at most."""
+        return self._nodes.largest_move_m
 
-    @abstractmethod
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
+        return self._nodes.newest()
 
-    @abstractmethod
-    def frame_poses(self, before: bool = False) -> np.ndarray:
-        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation."""
+    def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation.
+
+        With ``nodes`` ``(nodes, 3)`` these are the poses of the nodes.
+        """
+        return self._nodes.frame_poses(before, nodes)
+
+
+def require_sound(poses: np.ndarray, end: np.ndarray) -> None:
+    """Raise ``ArithmeticError`` about poses ``(n, 3)``, or a covariance ``(3, 3)`` of the last, that are none."""
+    if not (np.isfinite(poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
+        raise ArithmeticError("poses or their covariances came out as no numbers")

@@ -19,7 +19,7 @@ from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.map_origin import MapOrigin
-from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, require_sound
 from ngo_estimator.slam.scan_matcher import ScanMatcher
 
 _KEYS_PER_OPTIMISED = 20
@@ -33,9 +33,10 @@ class ScanGraph(PoseGraph):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
     def __init__(self, config: ScanGraphConfig) -> None:
-        super().__init__()
+        floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
+        self._nodes = KeyScanChain(floor)
+        super().__init__(self._nodes)
         self.config = config
-        self._chain = KeyScanChain(np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2)))
         self._scans = KeyScanStore()
         self._finder = ScanLoopFinder(config.loops)
         self._selection = ScanLoopSelection(config)
@@ -48,17 +49,12 @@ class ScanGraph(PoseGraph):
     @property
     def keys(self) -> int:
         """Key scans so far."""
-        return len(self._chain)
-
-    @property
-    def largest_move_m(self) -> float:
-        """How far the last optimisation moved a node at most."""
-        return self._chain.largest_move_m
+        return len(self._nodes)
 
     def begin_at(self, step: RelativeStep) -> None:
         """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""
         self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
-        self._chain.begin_at(step.from_stamp_ns)
+        self._nodes.begin_at(step.from_stamp_ns)
 
     def append(
         self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None, joins: bool = False
@@ -67,9 +63,9 @@ class ScanGraph(PoseGraph):
 
         With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place.
         """
-        self._chain.append(relative, covariance, joins)
+        self._nodes.append(relative, covariance, joins)
         if key is not None:
-            self._chain.append_node(key, joins)
+            self._nodes.add_key(key, joins)
             self._scans.append(key.scan)
             self._is_key = True
 
@@ -92,11 +88,11 @@ class ScanGraph(PoseGraph):
     def _look_for_loops(self) -> None:
         """Ask for loops of the newest key."""
         if (self.keys - 1) % self.config.loops.every == 0:
-            poses, used = self._chain.nodes, self.used_loops.pairs
+            poses, used = self._nodes.poses, self.used_loops.pairs
             windows = distance_windows(self.config.windows, graph_distances(poses, used, self.keys - 1))
             fresh = self._finder.find(self._scans, poses, windows)
             self._save_memory()
-            found, chain = self._finder.loops, self._chain
+            found, chain = self._finder.loops, self._nodes
             believed = self._selection.believed(fresh, found, chain)
             if len(believed):
                 surprises = self._selection.use(believed, found, chain)
@@ -109,12 +105,12 @@ class ScanGraph(PoseGraph):
         most = self.config.most_scans
         if self._scans.kept > most + most // 10:
             newest = self.config.loops.submap_keys
-            self._finder.forget(self._scans.forget(self._scans.kept - most, self._chain.nodes, newest))
+            self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.poses, newest))
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
         return ScanMatcher(
-            self._scans[:], origin.poses(self._chain.nodes.copy()), self._finder.views, self.config.loops
+            self._scans[:], origin.poses(self._nodes.poses.copy()), self._finder.views, self.config.loops
         )
 
     @property
@@ -126,21 +122,20 @@ class ScanGraph(PoseGraph):
         """The steps from each node to the next, and the loops that the graph needs."""
         loops = self.used_loops
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
-        return self._chain.steps, measured
+        return self._nodes.steps, measured
 
     def _optimise(self) -> None:
         self._waiting = 0
         loops, (steps, measured) = self.used_loops, self.measurements()
-        problem = GraphProblem(self._chain.nodes, steps, measured, np.ones(len(loops)))
+        problem = GraphProblem(self._nodes.poses, steps, measured, np.ones(len(loops)))
         solution = self._corrector.correct(problem, self._warm_start(problem))
-        end = self._end_covariance(solution) if self.keys > 1 else self._chain.end
-        if not (np.isfinite(solution.poses).all() and np.isfinite(end).all() and (np.diagonal(end) > 0.0).all()):
-            raise ArithmeticError("poses or their covariances came out as no numbers")
+        end = self._end_covariance(solution) if self.keys > 1 else self._nodes.end
+        require_sound(solution.poses, end)
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
-        self._chain.move(solution.poses, end)
+        self._nodes.move(np.arange(self.keys), solution.poses, end)
         weights = solution.loop_weights
         variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
-        self.closed = ClosedLoops(self._chain.frames[loops.pairs], loops.relative, np.sqrt(variance), weights)
+        self.closed = ClosedLoops(self._nodes.frames.nodes[loops.pairs], loops.relative, np.sqrt(variance), weights)
 
     def _warm_start(self, problem: GraphProblem) -> CorrectedGraph | None:
         """The last solution, whose nodes the newer ones follow; None where there is none."""
@@ -156,7 +151,7 @@ class ScanGraph(PoseGraph):
         Neighbouring scans err together, so that small residuals do not say that covariances are stated too large. An
         edge that fits badly says less.
         """
-        steps, loops = self._chain.published_steps, solution.problem.loops
+        steps, loops = self._nodes.published_steps, solution.problem.loops
         parts = (
             (steps, _soft_weights(solution.problem.steps, solution.poses, self.config.kernel)),
             (loops, solution.loop_weights * _soft_weights(loops, solution.poses, self.config.kernel)),
@@ -178,27 +173,16 @@ class ScanGraph(PoseGraph):
         self.fault = ""
         return len(self._selection) > 0 and self._guarded("an optimisation", self._optimise)
 
-    def newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
-        return self._chain.newest()
-
-    def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
-        """Poses of all frames ``(frames, 3)``, as they are or as they were before the last optimisation.
-
-        With ``nodes`` ``(nodes, 3)`` these are the poses of the nodes.
-        """
-        return self._chain.frame_poses(before, nodes)
-
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
         every = max(1, -(-self._scans.points // most))
         parts = [
-            transformed(pose, scan.points[::every]) for pose, scan in zip(self._chain.nodes, self._scans, strict=True)
+            transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.poses, self._scans, strict=True)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     SAVED = (
-        "_chain", "_scans", "_finder", "_selection", "_waiting", "closed", "_loops_from_nothing", "_scale",
+        "_nodes", "_scans", "_finder", "_selection", "_waiting", "closed", "_loops_from_nothing", "_scale",
     )  # fmt: skip
 
     def check_state(self) -> None:
