@@ -27,7 +27,7 @@ from training.scoring import stress_tables
 from training.scoring.lidar_rows import ROWS
 from training.scoring.lidar_scores import scored_rows, with_runs
 from training.scoring.stress_bars import stress_bars
-from training.scoring.stress_cells import CLEAN, StressCell, StressLog, cell_numbers
+from training.scoring.stress_cells import CLEAN, StressLog, cell_numbers
 from training.scoring.stress_tables import StressTable
 from training.scoring.table import Measured, measure
 
@@ -167,13 +167,13 @@ def _paths(folder: Path) -> list[Path]:
 
 def _measure(log: StressLog, changes: Sequence[str], seed: int, rows: Sequence[str]) -> None:
     """Every row after every change, and before them without any, which says what would be possible."""
-    clean = dict(log.cells(CLEAN, seed, rows))
+    clean = log.cells(CLEAN, seed, rows)
     for change in changes:
-        for name, cell in log.cells(change, seed, rows):
+        for name, cell in log.cells(change, seed, rows).items():
             print(f"{log.name:10s} {change:22s} seed {seed}  {name:20s} {_words(log, cell, clean[name])}", flush=True)
 
 
-def _words(log: StressLog, cell: StressCell, clean: StressCell) -> str:
+def _words(log: StressLog, cell: Measured, clean: Measured) -> str:
     if cell.failed:
         return f"failed: {cell.failed}"
     return "  ".join(f"{key} {value:.3f}" for key, value in cell_numbers(log.relations, cell, clean).items())
@@ -182,16 +182,18 @@ def _words(log: StressLog, cell: StressCell, clean: StressCell) -> str:
 def _table(log: StressLog, rows: Sequence[str], seeds: Sequence[int]) -> dict[str, dict[str, Any]]:
     """``CHANGE.ROW.KEY`` of all that is known: means over the seeds, and under ``seeds`` the numbers of each."""
     table: dict[str, dict[str, Any]] = {}
+    clean = log.cells(CLEAN, 0, rows, known_only=True)
     for change in CHANGES:
+        asked = seeds[:1] if change in UNSEEDED else seeds
+        cells = {seed: log.cells(change, seed, rows, known_only=True) for seed in asked}
         for name in rows:
-            cells = {seed: log.known(change, seed, name) for seed in (seeds[:1] if change in UNSEEDED else seeds)}
-            known = {seed: cell for seed, cell in cells.items() if cell is not None}
+            known = {seed: found[name] for seed, found in cells.items() if name in found}
             if known:
-                table.setdefault(change, {})[name] = _numbers(log, known, log.known(CLEAN, 0, name))
+                table.setdefault(change, {})[name] = _numbers(log, known, clean.get(name))
     return table
 
 
-def _numbers(log: StressLog, cells: Mapping[int, StressCell], clean: StressCell | None) -> dict[str, Any]:
+def _numbers(log: StressLog, cells: Mapping[int, Measured], clean: Measured | None) -> dict[str, Any]:
     if failed := {str(seed): cell.failed for seed, cell in cells.items() if cell.failed}:
         return {"failed": failed}
     each = {str(seed): cell_numbers(log.relations, cell, clean) for seed, cell in cells.items()}

@@ -7,7 +7,7 @@ import pytest
 from training.data.lidar_drives import Relations
 from training.scoring import stress_cells
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row
-from training.scoring.stress_cells import StressCell, StressLog, cell_numbers
+from training.scoring.stress_cells import StressLog, cell_numbers, cell_of
 
 S = 1_000_000_000
 TAKEN = S * np.arange(1, 101)
@@ -18,7 +18,7 @@ RELATIONS = Relations(RELATIONS.stamps_s, WANTED)
 
 
 def test_numbers_are_means_over_the_relations_they_name() -> None:
-    numbers = cell_numbers(RELATIONS, StressCell(TAKEN, POSES, TAKEN, 250.0), None)
+    numbers = cell_numbers(RELATIONS, cell_of(TAKEN, POSES, TAKEN, 250.0), None)
     turn_deg = np.degrees(0.1)
     assert numbers["translation_m"] == pytest.approx(0.99 / 4)
     assert numbers["rotation_deg"] == pytest.approx(turn_deg / 4)
@@ -31,11 +31,11 @@ def test_numbers_are_means_over_the_relations_they_name() -> None:
 
 def test_at_scans_counts_scans_that_were_kept() -> None:
     kept = np.isin(TAKEN, S * np.array([1, 2, 3, 60, 100]))
-    cell = StressCell(TAKEN[kept], POSES[kept], TAKEN[kept])
+    cell = cell_of(TAKEN[kept], POSES[kept], TAKEN[kept])
     assert cell_numbers(RELATIONS, cell, None)["at_scans_m"] == pytest.approx(0.0, abs=1e-9)
-    failed = StressCell(TAKEN[:0], POSES[:0], TAKEN, failed="no scan fits")
+    failed = cell_of(TAKEN[:0], POSES[:0], TAKEN, failed="no scan fits")
     assert "best_possible_m" not in cell_numbers(RELATIONS, cell, failed)
-    none = StressCell(TAKEN[kept][3:], POSES[kept][3:], TAKEN[kept][3:])
+    none = cell_of(TAKEN[kept][3:], POSES[kept][3:], TAKEN[kept][3:])
     with pytest.raises(ValueError, match="none of 4 relations"):
         cell_numbers(RELATIONS, none, None)
 
@@ -43,11 +43,11 @@ def test_at_scans_counts_scans_that_were_kept() -> None:
 def test_the_best_possible_is_the_clean_solution_between_the_scans_that_were_kept() -> None:
     bent = POSES.copy()
     bent[50, 1] = 3.0  # at 51 s, an end of the second relation
-    cell = StressCell(TAKEN, POSES + (0.0, 9.0, 0.0), TAKEN)
-    assert cell_numbers(RELATIONS, cell, StressCell(TAKEN, bent, TAKEN))["best_possible_m"] == pytest.approx(3.99 / 4)
+    cell = cell_of(TAKEN, POSES + (0.0, 9.0, 0.0), TAKEN)
+    assert cell_numbers(RELATIONS, cell, cell_of(TAKEN, bent, TAKEN))["best_possible_m"] == pytest.approx(3.99 / 4)
     kept = np.arange(100) % 20 == 0  # the pose that is off is gone
-    seen = StressCell(TAKEN[kept], POSES[kept], TAKEN[kept])
-    assert cell_numbers(RELATIONS, seen, StressCell(TAKEN, bent, TAKEN))["best_possible_m"] < 0.34
+    seen = cell_of(TAKEN[kept], POSES[kept], TAKEN[kept])
+    assert cell_numbers(RELATIONS, seen, cell_of(TAKEN, bent, TAKEN))["best_possible_m"] < 0.34
 
 
 def flaser(k: int) -> str:
@@ -80,20 +80,20 @@ def test_a_cell_is_measured_once_and_at_the_times_when_scans_were_taken(
     rows = {"ours": Row(estimate, None, code=()), "kiss_icp": Row(fails, None, code=())}
     monkeypatch.setattr(stress_cells, "ROWS", rows)
     log = StressLog(write_log(tmp_path), tmp_path, tmp_path / "cache")
-    assert log.known("scans_bunched", 0, "ours") is None
+    assert log.cells("scans_bunched", 0, rows, known_only=True) == {}
     for _ in range(2):
-        cells = dict(log.cells("scans_bunched", 0, rows))
-        cell = cells["ours"]
-        np.testing.assert_array_equal(cell.taken_ns, cell.kept_ns[5:])
-        np.testing.assert_allclose(np.diff(cell.kept_ns) / S, 0.2, atol=1e-3)
-        assert (cell.scans_per_s, cell.failed) == (100.0, "")
+        cells = log.cells("scans_bunched", 0, rows)
+        drawn = cells["ours"].drawn
+        np.testing.assert_array_equal(drawn["taken_ns"], drawn["kept_ns"][5:])
+        np.testing.assert_allclose(np.diff(drawn["kept_ns"]) / S, 0.2, atol=1e-3)
+        assert (cells["ours"].errors["scans_per_s"], cells["ours"].failed) == ([100.0], "")
         assert cells["kiss_icp"].failed == "no scan fits"
     assert asked == ["straight, scans_bunched, 0"]
     other = StressLog(tmp_path / "straight.clf.gz", tmp_path, tmp_path / "cache")
-    assert other.known("scans_bunched", 0, "ours") is not None
-    assert other.known("scans_bunched", 1, "ours") is None
+    assert other.cells("scans_bunched", 0, ["ours"], known_only=True)
+    assert not other.cells("scans_bunched", 1, ["ours"], known_only=True)
     monkeypatch.setitem(rows, "ours", Row(estimate, {"other": 1}, code=()))
-    assert other.known("scans_bunched", 0, "ours") is None
+    assert not other.cells("scans_bunched", 0, ["ours"], known_only=True)
 
 
 def test_rows_without_wheels_see_no_change_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,5 +107,5 @@ def test_rows_without_wheels_see_no_change_of_them(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(stress_cells, "ROWS", rows)
     log = StressLog(write_log(tmp_path), tmp_path, tmp_path / "cache")
     for change, seed in (("clean", 0), ("clean", 1), ("wheels_spin", 1)):
-        assert list(dict(log.cells(change, seed, rows))) == list(rows)
+        assert list(log.cells(change, seed, rows)) == list(rows)
     assert asked == ["straight, clean, 0"] * 2 + ["straight, wheels_spin, 1"]
