@@ -27,8 +27,9 @@ from ngo_estimator.networks.step_scaling import STEP_DEVIATION, StepDeviationCon
 from training.common import records
 from training.common.command_line import run_command
 from training.common.training import descend, save_weights
-from training.data.lidar_steps import KeySteps, building_steps, log_steps
+from training.data.lidar_steps import KeySteps, building_steps, key_steps
 from training.data.step_windows import WINDOWS, StepWindows, figures, negative_log_likelihood, windows_of
+from training.recordings.lidar_logs import read_drive
 
 WORLD = "scan"
 REFERENCE = (0.05, math.radians(0.25))
@@ -101,6 +102,11 @@ def building_drives(arguments: Arguments, seed: int, with_wheels: int, without: 
             name = "-".join(map(str, settings))
             drives.append(_stored(arguments.runs, f"building-{name}", partial(building_steps, *settings)))
     return drives
+
+
+def log_steps(path: Path) -> KeySteps:
+    """Steps along a log by the poses that a mapper wrote into it; raises ``RecordingError`` where it has none."""
+    return key_steps(read_drive(path, with_relations=False))
 
 
 def data_of(

@@ -36,7 +36,7 @@ def building_drive(
     if slips_per_km is not None:
         building.reset(seed)
         building = Building2d(plan, wheels=replace(building.wheels, slips_per_km=slips_per_km))
-    return _drive(
+    return lidar_drive(
         building.record(seed, length_m, most_scans),
         f"{'aliased' if aliased else 'building'}_{seed}",
         f"building seed {seed}, aliased {aliased}, {length_m:g} m, at most {most_scans} scans, slips {slips_per_km}",
@@ -64,7 +64,7 @@ def poor_wheels_drive(seed: int, length_m: float, most_scans: int = 100_000) -> 
     scanner = replace(building.scanner, scan_period_s=max(building.scanner.scan_period_s, 0.1))
     drive = Building2d(FloorPlanConfig(), scanner, wheels).record(seed, length_m, most_scans)
     words = f"building seed {seed}, poor wheels, {length_m:g} m, at most {most_scans} scans"
-    return _drive(drive, f"poor_wheels_{seed}", words)
+    return lidar_drive(drive, f"poor_wheels_{seed}", words)
 
 
 def two_buildings(seeds: tuple[int, int], length_m: float, most_scans: int = 100_000) -> tuple[LidarDrive, LidarDrive]:
@@ -73,11 +73,15 @@ def two_buildings(seeds: tuple[int, int], length_m: float, most_scans: int = 100
     drives = [first.record(seeds[0], length_m, most_scans)]
     drives.append(Building2d(FloorPlanConfig(), first.scanner, first.wheels).record(seeds[1], length_m, most_scans))
     words = f"scanner of {seeds[0]}, {length_m:g} m, at most {most_scans} scans"
-    one, other = (_drive(d, f"building_{s}", f"building seed {s}, {words}") for d, s in zip(drives, seeds, strict=True))
+    one, other = (
+        lidar_drive(drive, f"building_{seed}", f"building seed {seed}, {words}")
+        for drive, seed in zip(drives, seeds, strict=True)
+    )
     return one, other
 
 
-def _drive(drive: BuildingDrive, name: str, identity: str) -> LidarDrive:
+def lidar_drive(drive: BuildingDrive, name: str, identity: str) -> LidarDrive:
+    """What a robot measured on a drive, as a recording has it."""
     scanner = drive.scanner
     increment = scanner.increment_rad * (1.0 + scanner.increment_error)
     stamps_ns = simulated_stamps_ns(drive.stamps_s)

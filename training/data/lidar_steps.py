@@ -1,6 +1,6 @@
 """Steps between the key scans of a lidar where the poses are known: simulated buildings, and logs with a reference."""
 
-from collections import Counter
+import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,18 +9,12 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarStep
-from ngo_estimator.geometry.scan_points import Mounting
-from ngo_recordings.association import header_stamp_ns, ros_pose
-from ngo_recordings.carmen_log import CORRECTED_TOPIC
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.mounting import find_mounting
-from ngo_recordings.recording import open_recording
-from ngo_recordings.scan_stream import LidarScan, WheelPose, scan_stream
-from ngo_recordings.topics import TopicArguments, choose_topics
-from ngo_sim.building2d import Building2d, BuildingDrive
+from ngo_recordings.scan_stream import LidarScan, WheelPose
+from ngo_sim.building2d import Building2d
 from ngo_sim.floor_plans import FloorPlanConfig
-
-_START_NS = 10**9
+from training.data.building_drives import lidar_drive
+from training.data.lidar_drives import LidarDrive, ReferencePoses, TruePoses
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,65 +46,29 @@ class KeySteps:
 def building_steps(seed: int, length_m: float, aliased: bool, wheels: bool) -> KeySteps:
     """Drive through a building that is drawn from the seed, with its scanner, and its wheels if they are to be used."""
     drive = Building2d(FloorPlanConfig(aliased=aliased)).record(seed, length_m)
-    scanner = drive.scanner
-    sensor = np.array((scanner.laser_x_m, scanner.laser_y_m, np.radians(scanner.laser_yaw_deg)))
-    stamps_ns = np.array([_stamp_ns(stamp_s) for stamp_s in drive.stamps_s])
-    mounting = Mounting(sensor, scanner.upside_down)
-    return key_steps(building_records(drive, wheels), mounting, stamps_ns, drive.true_poses_xyyaw)
+    scanner = dataclasses.replace(drive.scanner, increment_error=0.0)  # the angles are known
+    return key_steps(lidar_drive(dataclasses.replace(drive, scanner=scanner), f"building_{seed}", ""), wheels)
 
 
-def building_records(drive: BuildingDrive, wheels: bool = True) -> Iterator[LidarScan | WheelPose]:
-    """Scans and wheel poses of a drive in order of time."""
-    scanner, angles = drive.scanner, drive.scanner.angles_rad
-    per_ray_s = scanner.sweep * scanner.scan_period_s / len(angles)
-    reading = 0
-    for k, stamp_s in enumerate(drive.stamps_s):
-        while wheels and reading < len(drive.wheel_stamps_s) and drive.wheel_stamps_s[reading] <= stamp_s:
-            yield WheelPose(_stamp_ns(drive.wheel_stamps_s[reading]), drive.wheel_poses_xyyaw[reading])
-            reading += 1
-        yield LidarScan(
-            _stamp_ns(stamp_s), float(angles[0]), float(angles[1] - angles[0]), drive.ranges_m[k],
-            scanner.range_min_m, scanner.range_max_m, per_ray_s, "laser",
-        )  # fmt: skip
-
-
-def log_steps(path: Path) -> KeySteps:
-    """Steps along a CARMEN log; the poses that a mapper wrote into it are the reference.
+def key_steps(drive: LidarDrive, wheels: bool = True) -> KeySteps:
+    """Run the front end, without learning, over a drive whose poses are known.
 
     Raises:
-        RecordingError: it cannot be read, or has no such poses.
+        RecordingError: they are not, or the robot does not move.
     """
-    with open_recording([path]) as recording:
-        if CORRECTED_TOPIC not in recording.topics:
-            raise RecordingError(f"{path} has no poses of a mapper; expected a CARMEN log that GMapping corrected")
-        stamps, poses = [], []
-        for message in recording.messages([CORRECTED_TOPIC]):
-            pose = ros_pose(message.value.pose.position, message.value.pose.orientation)
-            if pose is not None:
-                stamps.append(header_stamp_ns(message.value))
-                poses.append(pose.planar()[0])
-        topics = choose_topics(recording, TopicArguments())
-        found = find_mounting(recording, topics)
-        mounting = Mounting(np.zeros(3)) if found is None else Mounting(found.base_from_scan_xyyaw, found.upside_down)
-        records = scan_stream(recording, topics, skipped=Counter())
-        return key_steps(records, mounting, np.array(stamps), np.array(poses))
-
-
-def key_steps(
-    records: Iterable[LidarScan | WheelPose], mounting: Mounting, stamps_ns: np.ndarray, truth: np.ndarray
-) -> KeySteps:
-    """Run the front end, without learning; the scans at ``stamps_ns`` ``(n,)`` have the poses ``truth`` ``(n, 3)``."""
+    if not isinstance(drive.reference, TruePoses | ReferencePoses):
+        raise RecordingError(f"{drive.name} has no poses of a mapper; expected a CARMEN log that GMapping corrected")
     keys: list[tuple[LidarStep, KeyScanStep]] = []
     origin_ns = 0
-    for step in _steps(LidarOdometry(mounting=mounting), records):
+    for step in _steps(LidarOdometry(mounting=drive.mounting), drive.records(wheels)):
         origin_ns = step.origin_stamp_ns
         if step.key is not None:
             keys.append((step, step.key))
     if not keys:
         raise RecordingError("the drive has no key scan after its first scan; expected a robot that moves")
-    rows = np.searchsorted(stamps_ns, [origin_ns, *(step.stamp_ns for step, _ in keys)])
+    rows = np.searchsorted(drive.reference.stamps_ns, [origin_ns, *(step.stamp_ns for step, _ in keys)])
     return KeySteps(
-        truth[rows],
+        drive.reference.poses_xyyaw[rows],
         np.stack([key.relative_xyyaw for _, key in keys]),
         np.stack([key.covariance for _, key in keys]),
         np.stack([step.evidence for step, _ in keys]),
@@ -134,7 +92,3 @@ def _ready(odometry: LidarOdometry, at_end: bool) -> Iterator[LidarStep]:
             return
         except ValueError:  # a scan without usable rays, which is gone
             continue
-
-
-def _stamp_ns(stamp_s: float) -> int:
-    return _START_NS + round(stamp_s * 1e9)

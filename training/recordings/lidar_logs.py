@@ -8,6 +8,7 @@ import numpy as np
 
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.association import header_stamp_ns, ros_pose
+from ngo_recordings.carmen_log import CORRECTED_TOPIC
 from ngo_recordings.mounting import find_mounting
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.scan_stream import LidarScan, WheelPose, scan_stream
@@ -15,7 +16,6 @@ from ngo_recordings.topics import TopicArguments, choose_topics
 from training.data.lidar_drives import LidarDrive, ReferencePoses, Relations
 
 _ENDINGS = (".bag", ".log", ".clf", ".log.gz", ".clf.gz")
-_CORRECTED_TOPIC = "/corrected_pose"  # of a CARMEN log that a mapper wrote
 _RELATION_COLUMNS = 8
 
 
@@ -44,13 +44,13 @@ def log_drive(path: Path) -> LidarDrive:
     return drive
 
 
-def read_drive(path: Path) -> LidarDrive:
-    """The log as a drive, with its reference if there is one; raises as `log_drive`."""
+def read_drive(path: Path, with_relations: bool = True) -> LidarDrive:
+    """The log as a drive, with its reference if there is one: without relations a mapper's; raises as `log_drive`."""
     with open_recording([path]) as recording:
         topics = choose_topics(recording, TopicArguments())
         found = find_mounting(recording, topics)
         records = list(scan_stream(recording, topics, skipped=Counter()))
-        reference = _reference(path, recording)
+        reference = _reference(path, recording, with_relations)
     return LidarDrive(
         path.name.partition(".")[0],
         log_identity(path),
@@ -78,13 +78,13 @@ def relations_of(path: Path) -> Path:
     return path.with_name(path.name.partition(".")[0] + ".relations")
 
 
-def _reference(path: Path, recording: Recording) -> Relations | ReferencePoses | None:
-    if (relations := relations_of(path)).is_file():
+def _reference(path: Path, recording: Recording, with_relations: bool) -> Relations | ReferencePoses | None:
+    if with_relations and (relations := relations_of(path)).is_file():
         return read_relations(relations)
-    if _CORRECTED_TOPIC not in recording.topics:
+    if CORRECTED_TOPIC not in recording.topics:
         return None
     stamps_ns, poses = [], []
-    for message in recording.messages([_CORRECTED_TOPIC]):
+    for message in recording.messages([CORRECTED_TOPIC]):
         pose = ros_pose(message.value.pose.position, message.value.pose.orientation)
         if pose is not None:
             stamps_ns.append(header_stamp_ns(message.value))
