@@ -42,6 +42,8 @@ class MetaGraph(PoseGraph):
     ``anneal_every``-th block all loops are judged from the odometry on; between, only new ones.
     """
 
+    _nodes: MetaNodes
+
     def __init__(
         self,
         optimizer: NeuralGraphOptimizer,
@@ -52,8 +54,7 @@ class MetaGraph(PoseGraph):
         anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
-        self._nodes = MetaNodes(key_frames)
-        super().__init__(self._nodes)
+        super().__init__(MetaNodes(key_frames))
         self._optimizer = optimizer
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale

@@ -33,6 +33,8 @@ class PoseGraph(ABC):
         chain: owns all poses in ``map``, and the newest covariance.
     """
 
+    _nodes: NodeChain
+
     def __init__(self, chain: NodeChain) -> None:
         self._nodes = chain
         self.closed = ClosedLoops.none()

@@ -32,10 +32,11 @@ _KEYS_PER_SURPRISED = 400
 class ScanGraph(PoseGraph):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
+    _nodes: KeyScanChain
+
     def __init__(self, config: ScanGraphConfig) -> None:
         floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
-        self._nodes = KeyScanChain(floor)
-        super().__init__(self._nodes)
+        super().__init__(KeyScanChain(floor))
         self.config = config
         self._scans = KeyScanStore()
         self._finder = ScanLoopFinder(config.loops)
