@@ -13,6 +13,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
     ],
+    install_requires=["numpy", "pillow", "pyyaml"],
     zip_safe=False,
     maintainer="NGO maintainers",
     maintainer_email="maintainers@ngo.invalid",

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from ngo_sim.building_drivers import BuildingDriver, BuildingDriverConfig
+from ngo_sim.commanded_driver import CommandedDriver
 from ngo_sim.convex_shapes import Floats
 from ngo_sim.floor_plans import FloorPlan, FloorPlanConfig, draw_floor_plan
 from ngo_sim.lidar import RayWorld, ScannerConfig, cast_scans, draw_scanner, ray_world
 from ngo_sim.people import People
+from ngo_sim.plan_files import read_floor_plan
 from ngo_sim.routes import RouteMap
 from ngo_sim.wheels import WheelOdometry, WheelsConfig, draw_wheels
 
@@ -78,23 +82,51 @@ class Building2d:
         self.plan: FloorPlan
         self.scanner: ScannerConfig
         self.wheels: WheelsConfig
-        self._driver: BuildingDriver | None = None
+        self._driver: BuildingDriver | CommandedDriver | None = None
 
     def reset(self, seed: int) -> None:
-        """Draw the building, the robot and where it starts; the robot stands."""
-        self.plan = draw_floor_plan(seed, self._plan_config)
+        """Draw the building, the robot and where it starts; the robot stands.
+
+        Raises ValueError where the robot has no place in it, or a plan's file is no map.
+        """
+        config = self._plan_config
+        self.plan = (
+            read_floor_plan(Path(config.plan).expanduser(), seed) if config.plan else draw_floor_plan(seed, config)
+        )
         streams = [np.random.default_rng((int(seed), 2, part)) for part in range(6)]
         drawn = draw_scanner(streams[0])
         self.scanner = self._scanner_config if self._scanner_config is not None else drawn
         self.wheels = self._wheels_config if self._wheels_config is not None else draw_wheels(streams[1])
         routes = RouteMap(self.plan, self._driver_config.radius_m)
         self.period_s = self.scanner.scan_period_s
-        self._driver = BuildingDriver(routes, self._driver_config, self.period_s, streams[2])
+        self._world = _world_of(self.plan)
+        self._driver = self._make_driver(routes, streams[2])
         self._people = People(routes, self._plan_config.people, streams[3])
         self._odometry = WheelOdometry(self.wheels, self.period_s, streams[4])
         self._noise = streams[5]
-        self._world = _world_of(self.plan)
         self._index = 0
+
+    def _make_driver(self, routes: RouteMap, rng: np.random.Generator) -> BuildingDriver | CommandedDriver:
+        config = self._driver_config
+        if config.driver != "cmd_vel":
+            return BuildingDriver(routes, config, self.period_s, rng)
+        goal = routes.goals_m[int(rng.integers(len(routes.goals_m)))]
+        start = np.array((*routes.path(goal, goal)[0], rng.uniform(-math.pi, math.pi)))
+        return CommandedDriver(self._world, self._leaves_at, config, self.period_s, start)
+
+    def _leaves_at(self, time_s: float) -> Floats:
+        return self.plan.doors.leaves(np.array((time_s,)))[0]
+
+    def command(self, speed_mps: float, turn_rate_rps: float) -> None:
+        """Drive so from the next frame on; raises ValueError unless the driver is cmd_vel and both are finite."""
+        if not isinstance(self._driver, CommandedDriver):
+            raise ValueError(f"driver is {self._driver_config.driver!r}; a command needs 'cmd_vel'")
+        self._driver.command.set(speed_mps, turn_rate_rps)
+
+    @property
+    def blocked(self) -> bool:
+        """Whether something stopped a robot that is commanded on its way to the next frame."""
+        return isinstance(self._driver, CommandedDriver) and self._driver.blocked
 
     def step(self) -> BuildingFrame:
         """The next frame. Raises RuntimeError before the first reset."""
@@ -127,7 +159,7 @@ class Building2d:
         while len(poses) < most_scans and gone < length_m:
             poses.append(driver.pose_xyyaw)
             twists.append(driver.advance())
-            gone += twists[-1][0] * self.period_s
+            gone += abs(twists[-1][0]) * self.period_s
         true_poses, moved = np.array(poses), np.array(twists)
         count = len(true_poses)
         stamps = (self._index + np.arange(count, dtype=np.float64)) * self.period_s

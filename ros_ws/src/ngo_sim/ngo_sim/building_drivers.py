@@ -13,10 +13,10 @@ from ngo_common.settings import Settings, setting
 from ngo_sim.convex_shapes import Floats
 from ngo_sim.routes import CELL_M, RouteMap
 
-DRIVERS = ("any", "wander", "patrol")
+DRIVERS = ("any", "wander", "patrol", "cmd_vel")
 _LOOKAHEAD_M = (0.35, 0.9)  # at rest and at 1 m/s
 _ARRIVED_M = 0.15
-_TURN_RPS2 = 4.0
+TURN_RPS2 = 4.0
 _PATROL_ROOMS = (3, 8)
 
 
@@ -26,7 +26,8 @@ class BuildingDriverConfig(Settings):
 
     driver: str = setting(
         "any",
-        "Chooses the goals. wander: random rooms; patrol: a fixed tour of rooms; any: drawn from the seed.",
+        "Who drives. wander: to random rooms; patrol: a fixed tour of rooms; any: one of these, drawn from the seed; "
+        "cmd_vel: whoever publishes velocities.",
         choices=DRIVERS,
     )
     radius_m: float = setting(0.22, "Radius of the robot, m.", minimum=0.05, maximum=0.3)
@@ -37,6 +38,9 @@ class BuildingDriverConfig(Settings):
         0.3, "Probability of a stop at a goal. Most stops last seconds, a few last minutes.", minimum=0.0, maximum=1.0
     )
     spin: float = setting(0.25, "Probability of a turn on the spot at a goal.", minimum=0.0, maximum=1.0)
+    cmd_vel_timeout_s: float = setting(
+        0.5, "Simulated time after the last cmd_vel after which the robot stops.", minimum=0.05, maximum=10.0
+    )
 
 
 class BuildingDriver:
@@ -195,7 +199,7 @@ def _follow(
     else:
         rate = np.sign(bearing) * min(top_rate, 2.5 * abs(bearing))
     speed = min(max(speed, twist[0] - acceleration * period), twist[0] + acceleration * period)
-    rate = min(max(rate, twist[1] - _TURN_RPS2 * period), twist[1] + _TURN_RPS2 * period)
+    rate = min(max(rate, twist[1] - TURN_RPS2 * period), twist[1] + TURN_RPS2 * period)
     rate = min(max(rate, -top_rate), top_rate)
     for part in (0.25, 0.5, 0.75, 1.0):
         turn = rate * period * part

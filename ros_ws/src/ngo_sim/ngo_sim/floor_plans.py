@@ -51,6 +51,11 @@ class FloorPlanConfig(Settings):
         1.0, "Amount of furniture and of objects in corridors; 0: empty rooms, 1: usual.", minimum=0.0, maximum=2.0
     )
     people: int = setting(3, "Number of people who walk from room to room.", minimum=0, maximum=50)
+    plan: str = setting(
+        "",
+        "YAML file of a map server's map, whose walls are the building's. What is drawn is then only people and goals. "
+        "Empty: a drawn building.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +97,7 @@ class FloorPlan:
 
     segments_m: (n, 4) x0, y0, x1, y1 of walls and furniture. glass: (n,) which of them are glass. circles_m: (m, 3)
     x, y, radius. goals_m: (g, 2) points that the robot can reach: one a passable room, and some in corridors.
+    frame_xyyaw: pose of this frame in that of the file that the plan was read from.
     """
 
     segments_m: Floats
@@ -100,12 +106,20 @@ class FloorPlan:
     doors: Doors
     goals_m: Floats
     layout: str
+    frame_xyyaw: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @cached_property
     def size_m(self) -> tuple[float, float]:
         """Width and height of the area around the building."""
         high = self.segments_m.reshape(-1, 2).max(axis=0) + _MARGIN_M
         return float(high[0]), float(high[1])
+
+    def in_file(self, pose_xyyaw: Floats) -> Floats:
+        """(3,) a pose of this frame in that of the file; the same pose where the plan was drawn."""
+        x, y, yaw = self.frame_xyyaw
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turned = (cos * pose_xyyaw[0] - sin * pose_xyyaw[1], sin * pose_xyyaw[0] + cos * pose_xyyaw[1])
+        return np.array((x + turned[0], y + turned[1], pose_xyyaw[2] + yaw))
 
 
 class _Builder:

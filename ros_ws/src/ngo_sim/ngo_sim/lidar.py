@@ -15,7 +15,7 @@ from ngo_sim.convex_shapes import Floats
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
-_CELL_M = 0.7
+CELL_M = 0.7
 # Within this angle of its normal a pane reflects the beam.
 _GLASS_SHINES_COS = math.cos(math.radians(8.0))
 NO_RETURNS = ("inf", "max", "zero")
@@ -159,8 +159,8 @@ def ray_world(segments_m: Floats, glass: Bools, circles_m: Floats, door_circles_
     )
     if not len(points):
         raise ValueError("the world is empty; it must have at least one segment or circle")
-    low = points.min(axis=0) - _CELL_M
-    columns, rows = (np.ceil((points.max(axis=0) + _CELL_M - low) / _CELL_M)).astype(int).tolist()
+    low = points.min(axis=0) - CELL_M
+    columns, rows = (np.ceil((points.max(axis=0) + CELL_M - low) / CELL_M)).astype(int).tolist()
     discs = np.concatenate((circles_m, door_circles_m))
     starts, items = _fill_cells(np.ascontiguousarray(segments_m), discs, low, columns, rows)
     return RayWorld(
@@ -185,7 +185,7 @@ def _touches_cell(segment: Floats, x: float, y: float, half: float) -> bool:
 
 @njit(cache=True)
 def _fill_cells(segments: Floats, discs: Floats, low: Floats, columns: int, rows: int) -> tuple[Ints, Ints]:
-    half = _CELL_M / 2 + 1e-6
+    half = CELL_M / 2 + 1e-6
     starts = np.zeros(rows * columns + 1, np.int64)
     items = np.zeros(0, np.int64)
     for sweep in range(2):  # count, then fill
@@ -197,9 +197,9 @@ def _fill_cells(segments: Floats, discs: Floats, low: Floats, columns: int, rows
             else:
                 c = discs[index - len(segments)]
                 x0, y0, x1, y1 = c[0] - c[2], c[1] - c[2], c[0] + c[2], c[1] + c[2]
-            for row in range(int((y0 - low[1] - 1e-6) // _CELL_M), int((y1 - low[1] + 1e-6) // _CELL_M) + 1):
-                for col in range(int((x0 - low[0] - 1e-6) // _CELL_M), int((x1 - low[0] + 1e-6) // _CELL_M) + 1):
-                    middle_x, middle_y = low[0] + (col + 0.5) * _CELL_M, low[1] + (row + 0.5) * _CELL_M
+            for row in range(int((y0 - low[1] - 1e-6) // CELL_M), int((y1 - low[1] + 1e-6) // CELL_M) + 1):
+                for col in range(int((x0 - low[0] - 1e-6) // CELL_M), int((x1 - low[0] + 1e-6) // CELL_M) + 1):
+                    middle_x, middle_y = low[0] + (col + 0.5) * CELL_M, low[1] + (row + 0.5) * CELL_M
                     if index < len(segments) and not _touches_cell(segments[index], middle_x, middle_y, half):
                         continue
                     cell = row * columns + col
@@ -274,7 +274,7 @@ def cast_ray(
     lost_at = np.inf
     # A ray from outside begins where it enters the cells; one that never does sees moving circles only.
     enter, leave = 0.0, np.inf
-    for begin, along, size in ((x - low[0], ux, columns * _CELL_M), (y - low[1], uy, rows * _CELL_M)):
+    for begin, along, size in ((x - low[0], ux, columns * CELL_M), (y - low[1], uy, rows * CELL_M)):
         if along == 0.0:
             if begin < 0.0 or begin >= size:
                 leave = -1.0
@@ -284,11 +284,11 @@ def cast_ray(
     if enter >= leave:
         return best if best < reach else np.inf
     enter += 1e-9 if enter > 0.0 else 0.0
-    cell_x, cell_y = (x + enter * ux - low[0]) / _CELL_M, (y + enter * uy - low[1]) / _CELL_M
+    cell_x, cell_y = (x + enter * ux - low[0]) / CELL_M, (y + enter * uy - low[1]) / CELL_M
     col, row = int(np.floor(cell_x)), int(np.floor(cell_y))
     step_col, step_row = (1 if ux > 0 else -1), (1 if uy > 0 else -1)
-    per_col = _CELL_M / abs(ux) if ux != 0.0 else np.inf
-    per_row = _CELL_M / abs(uy) if uy != 0.0 else np.inf
+    per_col = CELL_M / abs(ux) if ux != 0.0 else np.inf
+    per_row = CELL_M / abs(uy) if uy != 0.0 else np.inf
     next_col = enter + ((col + 1 - cell_x) if ux > 0 else (cell_x - col)) * per_col if ux != 0.0 else np.inf
     next_row = enter + ((row + 1 - cell_y) if uy > 0 else (cell_y - row)) * per_row if uy != 0.0 else np.inf
     while 0 <= col < columns and 0 <= row < rows:

@@ -16,6 +16,7 @@ from ngo_common.settings import Settings, setting
 from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_aliased, check_maze_size, prim_maze, repeated_maze
 from ngo_sim.raycast import cast_rays
+from ngo_sim.velocity_command import VelocityLimits
 
 _THRUST: dict[int, float] = {Action.FORWARD: 1.0, Action.TURN_LEFT: 0.0, Action.TURN_RIGHT: 0.0}
 _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TURN_RIGHT: -1.0}
@@ -24,6 +25,7 @@ _SUBSTEP_RADII = 0.25
 _SETTLING_SUBSTEPS = 20  # at most, after a collision
 _COLLISION_SLOP_M = 1e-6  # overlap that the solver leaves alone
 _PIXELS_A_BLOCK = 24
+_BLOCKED_SHARE = 0.02  # of the speed, taken by a wall that was met
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,20 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         self._velocity_m = (0.0, 0.0)  # a step
         self._turn_rate_rad = 0.0  # a step
         self._frame = 0
+        self.blocked = False
+        """Whether a wall stopped the robot in the last `drive`."""
+
+    @property
+    def limits(self) -> VelocityLimits:
+        """Speeds and accelerations that actions give without noise, which hold for `drive` as well."""
+        config, period = self.config, self.config.period_s
+        speed_m, turn_rad = config.travel_decay * config.thrust_m, config.turn_decay * math.radians(config.turn_deg)
+        return VelocityLimits(
+            speed_m / (1.0 - config.travel_decay) / period,
+            turn_rad / (1.0 - config.turn_decay) / period,
+            speed_m / period**2,
+            turn_rad / period**2,
+        )
 
     @property
     def default_driver(self) -> str:
@@ -135,6 +151,7 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         start = (*self.maze.block_center(start_cell), rng.uniform(-math.pi, math.pi))
         self._place_body(*self._checked_pose(options.get("pose_xyyaw", start)))
         self._velocity_m, self._turn_rate_rad, self._frame = (0.0, 0.0), 0.0, 0
+        self.blocked = False
         return self._scan(), self._info()
 
     def step(self, action: np.int64 | int) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -161,6 +178,25 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         self._frame += 1
         travelled = math.hypot(self._x - last_x, self._y - last_y)
         return self._scan(), travelled, False, False, self._info()
+
+    def drive(self, speed_mps: float, turn_rate_rps: float) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """Let period_s pass at this speed along the heading and turn rate; a wall that is met stops the robot.
+
+        Returns observation and info as `step` does. Raises RuntimeError before the first reset.
+        """
+        if self._space is None:
+            raise RuntimeError("drive() before reset()")
+        period = self.config.period_s
+        self._turn_rate_rad = turn_rate_rps * period
+        heading = self._yaw + self._turn_rate_rad / 2
+        way = speed_mps * period
+        left_x, left_y = self._move_body(self._space, way * math.cos(heading), way * math.sin(heading))
+        self.blocked = math.hypot(left_x, left_y) < (1.0 - _BLOCKED_SHARE) * abs(way)
+        self._velocity_m = (0.0, 0.0) if self.blocked else (left_x, left_y)
+        self._x, self._y = self._body.position
+        self._yaw = math.remainder(self._body.angle, math.tau)
+        self._frame += 1
+        return self._scan(), self._info()
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The world from above, uint8 (height, width, 3), y up; None without a render mode."""

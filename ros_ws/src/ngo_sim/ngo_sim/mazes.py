@@ -86,8 +86,7 @@ class Maze:
 
     def wall_segments(self) -> npt.NDArray[np.float64]:
         """(n, 2, 2) both ends x, y, in metres, of every straight stretch of wall that bounds free blocks."""
-        along_x, along_y = _segments_along_x(self.walls), _segments_along_x(self.walls.T)[..., ::-1]
-        return np.concatenate((along_x, along_y)) * self.block_m
+        return wall_segments(self.walls) * self.block_m
 
     def shortest_path(self, start_block: Iterable[int], goal_block: Iterable[int]) -> npt.NDArray[np.int64]:
         """(n, 2) the (row, col) blocks from start to goal, both included, by Dijkstra's algorithm.
@@ -208,6 +207,11 @@ def draw_maze(axes: Axes, maze: Maze, colors: npt.ArrayLike | None = None) -> No
         extent=(0.0, width_m, 0.0, height_m),
     )
     axes.set(aspect="equal", xlim=(0.0, width_m), ylim=(0.0, height_m), xlabel="x [m]", ylabel="y [m]")
+
+
+def wall_segments(walls: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    """(n, 2, 2) both ends x, y, in blocks, of every straight stretch between wall and free blocks (height, width)."""
+    return np.concatenate((_segments_along_x(walls), _segments_along_x(walls.T)[..., ::-1]))
 
 
 def _segments_along_x(walls: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:

@@ -12,7 +12,9 @@ import numpy.typing as npt
 from ngo_sim.driver_choice import driver_generator, make_driver
 from ngo_sim.drivers import Action, Driver
 from ngo_sim.external_actions import ExternalActions
+from ngo_sim.maze2d import Maze2D
 from ngo_sim.mazes import Maze
+from ngo_sim.velocity_command import VelocityCommand
 
 
 class World(Protocol):
@@ -61,16 +63,28 @@ class Frame:
 class Simulation:
     """Frame after frame of one seed.
 
-    driver: a name for make_driver, "auto": the world's own choice, or "none": only actions from outside move it.
-    maze_seed: seed of the maze and its textures, where it is another one. Raises ValueError where there is no maze.
+    driver: a name for make_driver, "auto": the world's own choice, "none": only actions from outside move it, or
+    "cmd_vel": only velocities from outside do, each for velocity_timeout_s.
+    maze_seed: seed of the maze and its textures, where it is another one. Raises ValueError where there is no maze, and
+    for "cmd_vel" in a world that takes actions alone.
     """
 
-    def __init__(self, world: World, seed: int, driver: str, maze_seed: int | None = None) -> None:
+    def __init__(
+        self, world: World, seed: int, driver: str, maze_seed: int | None = None, velocity_timeout_s: float = 0.5
+    ) -> None:
         self.world = world
         self.external = ExternalActions()
         observation, info = world.reset(seed=seed, options=None if maze_seed is None else {"maze_seed": maze_seed})
         name = world.default_driver if driver == "auto" else driver
-        self._driver: Driver | None = None if name == "none" else make_driver(name, world.maze, driver_generator(seed))
+        outside = name in ("none", "cmd_vel")
+        self._driver: Driver | None = None if outside else make_driver(name, world.maze, driver_generator(seed))
+        self.velocity: VelocityCommand | None = None
+        """The newest velocity from outside, where such ones drive."""
+        if name == "cmd_vel":
+            if not isinstance(world, Maze2D):
+                raise ValueError("driver is 'cmd_vel', which maze2d alone takes")
+            self.velocity = VelocityCommand(world.limits, velocity_timeout_s)
+        self._commanded = np.zeros(2)
         self.frame = Frame(0, observation, info["pose_xyyaw"], np.zeros(3))
 
     def choose_action(self, now_s: float, timeout_s: float, hold: bool) -> Action | None:
@@ -84,7 +98,9 @@ class Simulation:
         return self.external.next_action(hold) if self.external.in_charge(now_s, timeout_s, hold) else own
 
     def ready(self, now_s: float, timeout_s: float, hold: bool) -> bool:
-        """Whether choose_action would give an action."""
+        """Whether choose_action would give an action, or the robot drives by velocities."""
+        if self.velocity is not None:
+            return True
         if self.external.in_charge(now_s, timeout_s, hold):
             return self.external.pending()
         return self._driver is not None
@@ -92,6 +108,19 @@ class Simulation:
     def advance(self, action: Action) -> Frame:
         """Take the action; return the next frame, which also becomes `frame`."""
         observation, _, _, _, info = self.world.step(int(action))
+        return self._taken(observation, info)
+
+    def drive(self) -> tuple[Frame, bool]:
+        """Drive on by the newest velocity; return the next frame, and whether a wall stopped the robot."""
+        world = self.world
+        assert self.velocity is not None and isinstance(world, Maze2D)
+        self._commanded = self.velocity.next_twist(self._commanded, world.period_s)
+        observation, info = world.drive(*self._commanded.tolist())
+        if world.blocked:
+            self._commanded[0] = 0.0
+        return self._taken(observation, info), world.blocked
+
+    def _taken(self, observation: npt.NDArray[Any], info: dict[str, Any]) -> Frame:
         pose = info["pose_xyyaw"]
         twist = body_twist(self.frame.pose_xyyaw, pose, self.world.period_s)
         self.frame = Frame(self.frame.index + 1, observation, pose, twist)

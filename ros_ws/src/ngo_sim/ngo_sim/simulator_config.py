@@ -35,8 +35,9 @@ class SimulatorConfig(FramedSettings):
         "auto",
         "Chooses the actions. corners: paths to the corners; random_goals: paths to random cells; distance: long "
         "straights; learned: a trained network; explorer: a driver without a map; random: random actions; none: only "
-        "action_command; auto: corners in 2D, random_goals in 3D, explorer on a Doom map.",
-        choices=("auto", *DRIVER_NAMES, "none"),
+        "action_command; cmd_vel: only velocities, in maze2d; auto: corners in 2D, random_goals in 3D, explorer on a "
+        "Doom map.",
+        choices=("auto", *DRIVER_NAMES, "none", "cmd_vel"),
         alias="policy",
     )
     frames: int = setting(
@@ -69,6 +70,12 @@ class SimulatorConfig(FramedSettings):
         minimum=0.0,
         maximum=3600.0,
         live=True,
+    )
+    cmd_vel_timeout_s: float = setting(
+        0.5,
+        "Simulated time after the last cmd_vel after which the robot stops, with driver cmd_vel.",
+        minimum=0.05,
+        maximum=10.0,
     )
     start_time_s: float = setting(
         1.0,

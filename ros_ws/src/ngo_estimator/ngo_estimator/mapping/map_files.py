@@ -8,6 +8,7 @@ import yaml
 from PIL import Image
 
 from ngo_common.files import write_together
+from ngo_common.map_files import read_map_file
 from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 
 FORMATS = ("pgm", "png")
@@ -69,14 +70,8 @@ def write_map(
 
 def read_map(description: Path) -> OccupancyMap:
     """Read a map of the mode trinary, as Nav2's map server does; raises ``ValueError`` for another mode."""
-    facts = yaml.safe_load(description.read_text())
-    if facts["mode"] != "trinary":
-        raise ValueError(f"{description}: its mode is {facts['mode']}; expected trinary")
-    with Image.open(description.with_name(facts["image"])) as image:
-        occupancy = 1.0 - np.asarray(image.convert("L"), np.float64)[::-1] / 255.0
-    sure = [occupancy > facts["occupied_thresh"], occupancy < facts["free_thresh"]]
-    values = np.select(sure, [100, 0], -1).astype(np.int8)
-    return OccupancyMap(values, float(facts["resolution"]), np.array(facts["origin"][:2], np.float64))
+    values, resolution, origin = read_map_file(description)
+    return OccupancyMap(values, resolution, origin[:2])
 
 
 def _check(name: Path, found: OccupancyMap, image_format: str, mode: str, free: float, occupied: float) -> None:

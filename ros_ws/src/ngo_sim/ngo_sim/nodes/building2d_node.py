@@ -33,6 +33,7 @@ from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.lidar import ScannerConfig
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
+from ngo_sim.nodes.velocity_input import VelocityInput
 from ngo_sim.simulation import yaw_quaternion_zw
 from ngo_sim.wheels import WheelsConfig
 
@@ -44,7 +45,8 @@ _SETTINGS = (BuildingNodeConfig, FloorPlanConfig, BuildingDriverConfig, ScannerC
 class Building2dNode(Node):
     """Publishes `scan`, wheel odometry, `ground_truth` and `/tf_static`, and on request `/tf` and `/clock`.
 
-    Angles of a scan are in the laser's frame; one that hangs upside down is turned by `/tf_static`.
+    Angles of a scan are in the laser's frame; one that hangs upside down is turned by `/tf_static`. With driver
+    `cmd_vel` it takes `cmd_vel` and publishes `collision`.
     """
 
     def __init__(self, name: str) -> None:
@@ -56,7 +58,7 @@ class Building2dNode(Node):
         self._building = Building2d(plan, None if drawn else scanner, None if drawn else wheels, driver)
         try:
             self._building.reset(self.config.seed)
-        except ValueError as error:  # what only the building can say
+        except (ValueError, OSError) as error:  # what only the building, or the file of its plan, can say
             raise BadParameter(str(error)) from None
         config = self.config
         self._name_watch = NameWatch(self)
@@ -72,6 +74,8 @@ class Building2dNode(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._static_tf = self.outputs.create(TFMessage, "/tf_static", latched)
         self._static_tf.publish(TFMessage(transforms=[self._mounting()]))
+        building, commanded = self._building, driver.driver == "cmd_vel"
+        self._velocity = VelocityInput(self, self.outputs, building.command) if commanded else None
         self._pacer = Pacer()
         self._published = 0
         self._looked_s = 0.0
@@ -145,11 +149,12 @@ class Building2dNode(Node):
             moved.transform.translation.x, moved.transform.translation.y = frame.wheel_pose_xyyaw[:2].tolist()
             moved.transform.rotation = wheels.pose.pose.orientation
             self._tf.publish(TFMessage(transforms=[moved]))
-        truth = _odometry(
-            frame.true_pose_xyyaw, stamp, config.framed(config.ground_truth_frame), config.framed(config.base_frame)
-        )
+        true_pose, truth_frame = self._building.plan.in_file(frame.true_pose_xyyaw), config.ground_truth_frame
+        truth = _odometry(true_pose, stamp, config.framed(truth_frame), config.framed(config.base_frame))
         truth.twist.twist.linear.x, truth.twist.twist.angular.z = frame.twist.tolist()
         self._truth.publish(truth)
+        if self._velocity is not None:
+            self._velocity.publish(self._building.blocked, true_pose, stamp, config.framed(truth_frame))
         scanner = self._building.scanner
         increment = scanner.increment_rad * (1.0 + scanner.increment_error)
         scan = LaserScan(

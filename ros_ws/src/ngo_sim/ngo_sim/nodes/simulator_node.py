@@ -26,6 +26,7 @@ from ngo_common.settings import BadParameter, Settings
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
+from ngo_sim.nodes.velocity_input import VelocityInput
 from ngo_sim.simulation import Frame, Simulation, World, inverse_pose, yaw_quaternion_zw
 from ngo_sim.simulator_config import SimulatorConfig
 
@@ -63,9 +64,13 @@ class SimulatorNode(Node):
         try:
             config = self.config
             maze_seed = None if config.maze_seed < 0 else config.maze_seed
-            self.simulation = Simulation(self.make_world(), config.seed, config.driver, maze_seed)
+            self.simulation = Simulation(
+                self.make_world(), config.seed, config.driver, maze_seed, config.cmd_vel_timeout_s
+            )
         except ValueError as error:  # an error that only the files or the world can show
             raise BadParameter(str(error)) from None
+        command = self.simulation.velocity
+        self._velocity = VelocityInput(self, self.outputs, command.set) if command is not None else None
         self._pacer = Pacer()
         self._published = 0
         self._looked_s = 0.0
@@ -159,7 +164,10 @@ class SimulatorNode(Node):
 
     def _publish_next(self, now_s: float) -> None:
         config, simulation = self.config, self.simulation
-        if self._published > 0:
+        blocked = False
+        if self._published > 0 and self._velocity is not None:
+            _, blocked = simulation.drive()
+        elif self._published > 0:
             action = simulation.choose_action(now_s, config.action_timeout_s, hold=config.rate > 0)
             assert action is not None  # ready() said so
             message = DiscreteAction(action=int(action))
@@ -177,6 +185,8 @@ class SimulatorNode(Node):
         if self._clock_out is not None:
             self._clock_out.publish(Clock(clock=self._stamp))
         self._publish_truth(frame)
+        if self._velocity is not None:
+            self._velocity.publish(blocked, frame.pose_xyyaw, self._stamp, self.framed(config.ground_truth_frame))
         self.publish_sensors(frame, self._stamp)
         self._published += 1
         self._consumers.published(stamp_ns, now_s)
