@@ -174,6 +174,21 @@ def test_angles_are_within_a_turn_or_refused(low: float, high: float, increment:
     assert abs(angles.angle_increment) * (rays - 1) < 6.4
 
 
+def test_an_empty_scan_and_one_of_more_than_a_turn_do_not_end_a_recording(tmp_path: Path) -> None:
+    increment = math.radians(1.0)
+    whole = [scan(stamp(k), rays=360, increment=increment) for k in range(4)]
+    whole[0].ranges = np.zeros(0, np.float32)
+    whole[2] = scan(stamp(2), rays=400, increment=increment)
+    entries = [("/scan", stamp(k), each) for k, each in enumerate(whole)]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        topics = choose_topics(recording)
+        skipped: Counter[str] = Counter()
+        found = [each for each in scan_stream(recording, topics, skipped=skipped) if isinstance(each, LidarScan)]
+        assert [len(each.ranges) for each in found] == [360, 360, 360] and skipped == {BAD_SCAN: 1}
+        described = describe_lidar(recording, topics)
+    assert described.rays == 360 and "1 of the first 200 scans of /scan are damaged" in described.notes[0]
+
+
 def test_a_caller_may_override_the_increment(tmp_path: Path) -> None:
     with open_recording([m.write_mcap(tmp_path / "a.mcap", drive(2))]) as recording:
         found = list(scan_stream(recording, RecordingTopics("/scan"), angle_increment=0.25))

@@ -30,6 +30,7 @@ class LidarDescription:
     """
 
     scan_topic: str
+    scan_frame: str
     scans: int
     rays: int
     angles: ScanAngles
@@ -89,9 +90,10 @@ def _others(recording: Recording, topics: RecordingTopics) -> list[str]:
     scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
     wheels = wheel_candidates(recording, topics.image, topics.ground_truth)
     notes = []
-    if len(scans) > 1:
-        others = ", ".join(_with_rate(recording, name) for name in scans if name != topics.image)
-        notes.append(f"scans of {topics.image} are used; others are {others}: --image names another one")
+    if len(scans) > len(topics.scans):
+        others = ", ".join(_with_rate(recording, name) for name in scans if name not in topics.scans)
+        used = ", ".join(topics.scans)
+        notes.append(f"scans of {used} are used; others are {others}: --image names another one, --scan-topics several")
     if len(wheels) > 1:
         taken = "no odometry" if topics.wheels is None else str(topics.wheels)
         there = ", ".join(_with_rate(recording, name) for name in wheels)
@@ -132,6 +134,7 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
     wheels = topics.wheels
     return LidarDescription(
         scan_topic=topics.image,
+        scan_frame=str(first[0].header.frame_id).strip("/"),
         scans=info.count,
         rays=len(first[0].ranges),
         angles=angles,

@@ -57,8 +57,8 @@ class Mounting:
         )
 
 
-def find_mounting(recording: Recording, topics: RecordingTopics) -> Mounting | None:
-    """Where the scanner of topics.image sits on the robot; None where no transform says it.
+def find_mounting(recording: Recording, topics: RecordingTopics, frame: str | None = None) -> Mounting | None:
+    """Where the scanner of a frame (None: of topics.image) sits on the robot; None where no transform says it.
 
     Chains of transforms are composed. Those of /tf_static count; where they do not join the two frames, the first
     transforms of /tf (10 min of it) are taken, without those that move the robot itself. The robot's frame is the child
@@ -68,7 +68,7 @@ def find_mounting(recording: Recording, topics: RecordingTopics) -> Mounting | N
     Raises:
         RecordingError: a message that cannot be read.
     """
-    scan_frame = _scan_frame(recording, topics)
+    scan_frame = _scan_frame(recording, topics) if frame is None else frame
     bases = [frame for frame in (_wheel_frame(recording, topics), *_BASE_FRAMES) if frame]
     tree = TransformBuffer()
     names = transform_topics(recording, topics.image)
@@ -125,7 +125,11 @@ def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, A
 def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str, source: str) -> Mounting | None:
     for name in bases:
         base = tree.like(name, scan_frame)
-        if base is not None and (pose := tree.newest_lookup(base, scan_frame)) is not None:
+        if base is None or any(
+            is_named(part, each, scan_frame) for part in tree.between(base, scan_frame) for each in _OUTSIDE
+        ):
+            continue
+        if (pose := tree.newest_lookup(base, scan_frame)) is not None:
             return _mounting(base, scan_frame, pose, source)
     return None
 

@@ -180,6 +180,14 @@ class TransformTree:
         """Whether a chain of transforms joins two frames."""
         return not set(self.above(one)).isdisjoint(self.above(other))
 
+    def between(self, one: str, other: str) -> list[str]:
+        """The frames of the chain that joins two, the uppermost included; none where no chain does."""
+        above_one, above_other = self.above(one), self.above(other)
+        top = next((frame for frame in above_one if frame in above_other), None)
+        if top is None:
+            return []
+        return [*above_one[: above_one.index(top)], top, *above_other[: above_other.index(top)]]
+
     def root(self, frame: str) -> str:
         """The uppermost frame above a frame, which may be itself."""
         return self.above(frame)[-1]

@@ -26,6 +26,8 @@ _WAIT_NS = 1_000_000_000
 _FULL_TURN = 2.0 * math.pi
 # Rad; scanners have 50 times this, and a message with a finer one could cost its reader without bound.
 _LEAST_INCREMENT = 1e-5
+# Rad; a scan of more than a turn with a wider one is no scan of a scanner that turns on.
+_WIDEST_INCREMENT = 0.1
 # Rays by which the ends of a scan may contradict its increment: some drivers count one ray more or less.
 _SLACK_RAYS = 1.5
 
@@ -86,13 +88,14 @@ class ScanAngles:
     """The angles of a scan's rays, and a note where the message contradicts itself or is likely wrong.
 
     likely_increment: what the increment probably is where the message's is doubtful, else None; it is not used unless
-    a caller gives it to `scan_stream`.
+    a caller gives it to `scan_stream`. rays: how many count, from the first on; None: all.
     """
 
     angle_min: float
     angle_increment: float
     note: str | None = None
     likely_increment: float | None = None
+    rays: int | None = None
 
 
 def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
@@ -101,7 +104,7 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
     The message's increment counts while ``angle_min + (n - 1) * increment`` is within 1.5 rays of angle_max. Otherwise,
     and where it is 0 or no number, ``(angle_max - angle_min) / (n - 1)`` counts, if that is an increment. An increment
     that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg)
-    contradicts nothing; it counts and is noted.
+    contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts.
 
     Raises:
         RecordingError: neither gives angles within a full turn.
@@ -110,6 +113,10 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
     low, high, increment = float(message.angle_min), float(message.angle_max), float(message.angle_increment)
     if not count or not math.isfinite(low) or abs(low) > 2.0 * _FULL_TURN:
         raise RecordingError(f"a scan of {topic} has {count} rays from {low:g} rad on; expected rays, and an angle")
+    if _FULL_TURN < 0.99 * abs(increment) * (count - 1) <= 2.0 * _FULL_TURN and abs(increment) < _WIDEST_INCREMENT:
+        turn = math.ceil(_FULL_TURN / abs(increment) - 1e-3)
+        note = f"a scan of {topic} has {count} rays, more than a full turn: the first {turn} count"
+        return ScanAngles(low, increment, note, rays=turn)
     implied = (high - low) / (count - 1) if count > 1 and math.isfinite(high) else 0.0
     if not _spans(increment, count):
         if not _spans(implied, count):
@@ -143,7 +150,7 @@ def scan_stream(
     angle_increment: float | None = None,
     skipped: Counter[str] | None = None,
 ) -> Iterator[LidarScan | WheelPose]:
-    """Scans of topics.image and poses of topics.wheels in order of their stamps; at equal stamps wheels come first.
+    """Scans of topics.scans and poses of topics.wheels in order of their stamps; at equal stamps wheels come first.
 
     A message that was recorded up to 1 s after one with a later stamp comes at its place. Stamps that jump back by 1 s
     begin anew, as a source that restarted does.
@@ -162,12 +169,12 @@ def scan_stream(
     if angle_increment is not None and not _spans(angle_increment, 1):
         raise RecordingError(f"the increment is {angle_increment:g} rad; expected at least {_LEAST_INCREMENT:g} rad")
     wheels = None if topics.wheels is None else _Wheels(recording, topics.wheels, topics.image)
-    names = {topics.image, *(wheels.names if wheels is not None else ())}
+    names = {*topics.scans, *(wheels.names if wheels is not None else ())}
     lost: Counter[str] = Counter() if skipped is None else skipped
     waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose]] = []
-    newest: dict[bool, int] = {}
+    newest: dict[str, int] = {}
     for order, message in enumerate(recording.messages(names)):
-        is_scan = message.topic == topics.image
+        is_scan = message.topic in topics.scans
         try:
             found: list[LidarScan | WheelPose] = (
                 [scan_of(message.value, message.topic, angle_increment)]
@@ -182,14 +189,14 @@ def scan_stream(
             lost[BAD_SCAN if is_scan else BAD_WHEELS] += 1
             continue
         for record in found:
-            before = newest.get(is_scan)
+            before = newest.get(message.topic)
             if is_scan and record.stamp_ns == 0 and before == 0:
                 raise RecordingError(f"scans of {topics.image} have no stamps (all are 0): the driver must stamp them")
             if before is not None and record.stamp_ns <= before - RESTART_NS:
                 while waiting:
                     yield heapq.heappop(waiting)[-1]
                 newest.clear()
-            newest[is_scan] = max(record.stamp_ns, newest.get(is_scan, 0))
+            newest[message.topic] = max(record.stamp_ns, newest.get(message.topic, 0))
             heapq.heappush(waiting, (record.stamp_ns, is_scan, order, message.log_time_ns, record))
         while waiting and message.log_time_ns - waiting[0][3] > _WAIT_NS:
             yield heapq.heappop(waiting)[-1]
@@ -232,11 +239,12 @@ def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> Lid
         header_stamp_ns(value),
         angles.angle_min,
         angles.angle_increment if angle_increment is None else angle_increment,
-        np.asarray(value.ranges, np.float32),
+        np.asarray(value.ranges, np.float32)[: angles.rays],
         float(value.range_min),
         float(value.range_max),
         time_increment if math.isfinite(time_increment) else 0.0,
         str(value.header.frame_id).strip("/"),
+        topic=topic,
     )
 
 

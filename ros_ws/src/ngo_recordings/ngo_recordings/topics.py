@@ -110,6 +110,8 @@ class TopicArguments:
     """True poses are interpolated between two that are at most this far apart, s."""
     twist_tolerance_s: float = 0.5
     """How old a velocity may be that is used for a step during which none came, s."""
+    scan_topics: tuple[str, ...] = ()
+    """Topics of several laser scanners, whose scans are put together; the first one is the image."""
     wheels: str | None = None
     """Wheel odometry: a topic of Odometry, or tf:PARENT:CHILD; chosen for scans alone."""
 
@@ -122,7 +124,8 @@ class RecordingTopics:
     """What is used for what; None: nothing. `choose_topics` makes one that fits the recording.
 
     image: Image, CompressedImage or LaserScan. depth: Image of depth, one more channel. action: DiscreteAction. twist:
-    Twist, TwistStamped or Odometry. wheels: wheel odometry, for `scan_stream`. The times are those of TopicArguments.
+    Twist, TwistStamped or Odometry. wheels: wheel odometry, for `scan_stream`. more_scans: those of other
+    scanners. The times are those of TopicArguments.
     """
 
     image: str
@@ -134,9 +137,15 @@ class RecordingTopics:
     interpolation_s: float = 0.25
     twist_tolerance_s: float = 0.5
     wheels: WheelSource | None = None
+    more_scans: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """The topics of all scanners."""
+        return (self.image, *self.more_scans)
 
 
 def choose_topics(recording: Recording, given: TopicArguments | None = None) -> RecordingTopics:
@@ -152,7 +161,9 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
     """
     given = given or TopicArguments()
-    image = _given(recording, "image", given.image, SENSOR_TYPES) or _choose_image(recording)
+    scans: list[str | None] = [_given(recording, "scans", name, (SCAN_TYPE,)) for name in given.scan_topics]
+    first, *more = scans or [given.image]
+    image = _given(recording, "image", first, SENSOR_TYPES) or _choose_image(recording)
     action = _given(recording, "action", given.action, (ACTION_TYPE,))
     if given.action is None:
         action = _only(name for name in _filled(recording, (ACTION_TYPE,)) if not name.endswith("command"))
@@ -170,6 +181,7 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
         interpolation_s=given.interpolation_s,
         twist_tolerance_s=given.twist_tolerance_s,
         wheels=_choose_wheels(recording, given.wheels, image, truth),
+        more_scans=tuple(name for name in more if name is not None),
     )
 
 

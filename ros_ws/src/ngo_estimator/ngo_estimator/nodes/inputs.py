@@ -60,15 +60,18 @@ class Input:
         timeout_s: float,
         group: CallbackGroup | None = None,
         at_once: int = 1,
+        each_identity: bool = False,
     ) -> None:
         """Have ``callback`` called with each message; ``identity`` gives the source that a message names.
 
-        A node that fell behind takes up to ``at_once`` messages in one turn of the executor.
+        A node that fell behind takes up to ``at_once`` messages in one turn of the executor. With ``each_identity`` one
+        publisher is held on to for each identity.
         """
         self._node, self._status = node, status
         self._behind = at_once - 1
         self._callback, self._identity = callback, identity
-        self._guard = SourceGuard(timeout_s)
+        self._each_identity = each_identity
+        self._guards: dict[Hashable, SourceGuard] = {None: SourceGuard(timeout_s)}
         self._kind = f"message on {topic}"
         self._others = ""  # who published beside the one that is held on to, since the last call of problems()
         self._misfit_said = ""
@@ -94,7 +97,8 @@ class Input:
 
     def set_timeout(self, timeout_s: float) -> None:
         """Set the silence of the publisher after which another one takes its place."""
-        self._guard.timeout_s = timeout_s
+        for guard in self._guards.values():
+            guard.timeout_s = timeout_s
 
     def problems(self) -> list[str]:
         """One line for each problem with the publishers since the last call."""
@@ -118,7 +122,9 @@ class Input:
     def _take(self, message: Any, info: dict[str, Any]) -> None:
         publishers, identity = self._subscription.get_publisher_count(), self._identity(message)
         received_ns, sequence = info["received_timestamp"], info.get("publication_sequence_number")
-        if self._guard.admits(publishers, identity, sequence, received_ns):
+        whose = identity if self._each_identity else None
+        guard = self._guards.setdefault(whose, SourceGuard(self._guards[None].timeout_s))
+        if guard.admits(publishers, identity, sequence, received_ns):
             self._callback(message)
             return
         if not self._others or _UNKNOWN in self._others:

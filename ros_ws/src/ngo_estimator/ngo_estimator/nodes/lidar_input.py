@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
 from ngo_estimator.frontend.lidar.front_ends import load_front_end
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes import messages
@@ -47,7 +49,7 @@ class LidarInput:
 
     def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
         self._node, self._settings, self._publish = node, settings, publish
-        self._core = load_core(load_front_end, settings)
+        self._core = LidarIntake(load_core(load_front_end, settings), self._mounting_of, settings.min_range)
         with compiling(node.get_logger().info):
             warm_up_odometry()
         self._base_frame = settings.framed(settings.base_frame)
@@ -57,8 +59,8 @@ class LidarInput:
         self._on_tf = OdometryOnTf(self._transforms, self._odom_frame, self._base_frame)
         self._said = ""
         self._held: deque[LidarScan] = deque(maxlen=_MOST_HELD)
-        self._frame: str | None = None  # of the scanner whose mounting is known, or taken to be the base frame
-        self._known: KnownMounting | None = None
+        self._mountings: dict[str, KnownMounting | None] = {}  # by frame; None: taken to be the base frame
+        self._topics = settings.scan_topics or (settings.scan_topic,)
         self._restarts = 0
         self._unsure = self._newly_unsure = 0
 
@@ -70,18 +72,17 @@ class LidarInput:
             "topic": f"odometry on '{self._node.resolve_topic_name(self._settings.robot_odometry_topic)}'",
             "tf": f"odometry from {self._odom_frame} to {self._base_frame} on TF",
         }[self._settings.robot_odometry]
-        return f"LaserScan on '{self._node.resolve_topic_name(self._settings.scan_topic)}', {own}"
+        topics = "', '".join(map(self._node.resolve_topic_name, self._topics))
+        return f"LaserScan on '{topics}', {own}"
 
     def listen(self, listening: Listening, status: NodeStatus) -> None:
         """Subscribe to scans, odometry and the scanner's mounting."""
         self._status, settings = status, self._settings
         reliability = ReliabilityPolicy[settings.image_reliability.upper()]
-        listening.to(
-            LaserScan,
-            settings.scan_topic,
-            self._on_scan,
-            QoSProfile(depth=settings.image_depth, reliability=reliability),
-        )
+        scans = QoSProfile(depth=settings.image_depth, reliability=reliability)
+        for topic in self._topics:
+            # Each scanner on a topic may have a driver of its own.
+            listening.to(LaserScan, topic, partial(self._on_scan, topic), scans, each_frame=True)
         if settings.robot_odometry == "topic":
             listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
         # Every node on a robot publishes transforms: no single publisher is held on to.
@@ -102,13 +103,14 @@ class LidarInput:
                 self._add_wheels(stamp_ns, pose.planar()[0])
         if self._wheels.bad > bad and self._settings.robot_odometry == "tf":
             self._status.dropped("robot odometry", _NO_POSE)
-        if static or self._known is None:
-            self._look_for_mounting()
+        for frame, known in list(self._mountings.items()):
+            if static or known is None:
+                self._look_for_mounting(frame)
         self._update()
 
-    def _on_scan(self, message: LaserScan) -> None:
+    def _on_scan(self, topic: str, message: LaserScan) -> None:
         try:
-            scan = scan_of(message, self._settings.scan_topic)
+            scan = scan_of(message, topic)
         except ValueError as error:
             self._status.dropped("scan", error)
             return
@@ -132,8 +134,12 @@ class LidarInput:
 
     def _update(self) -> None:
         while self._held and self._is_mounted():
+            scan = self._held.popleft()
+            if scan.frame_id not in self._mountings:  # the first scanner is not held up by others
+                self._status.dropped("scan", f"no transform says where '{scan.frame_id}' sits on '{self._base_frame}'")
+                continue
             try:
-                self._core.add_scan(self._held.popleft())
+                self._core.add_scan(scan)
             except ValueError as error:
                 self._status.dropped("scan", error)
         while True:
@@ -163,52 +169,54 @@ class LidarInput:
         """Publish the steps whose odometry on TF is known, and say what is missing."""
         for step in self._on_tf.ready(self._core.lag_s):
             self._publish(step)
+        for line in self._core.news():
+            self._node.get_logger().info(line)
         problem = self._on_tf.problem()
         if problem and not self._said:
             self._node.get_logger().warning(problem)
         self._said = problem
 
     def _is_mounted(self) -> bool:
-        """Whether the mounting of the scanner is known by now, or has been waited for long enough."""
-        frame = self._held[0].frame_id.strip("/")
-        if self._frame is None:
-            self._look_for_mounting()
-        if self._frame is None:
-            if self._held[-1].stamp_ns - self._held[0].stamp_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
-                return False
-            self._node.get_logger().warning(
-                f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': it is "
-                "taken to be there, looking ahead, until a transform says it"
-            )
-            self._mount(frame, None)
+        """Whether the mounting of the next scan's scanner is known by now, or has been waited for long enough."""
+        frame = self._held[0].frame_id
+        if frame not in self._mountings:
+            self._look_for_mounting(frame)
+        if self._mountings:
+            return True
+        if self._held[-1].stamp_ns - self._held[0].stamp_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
+            return False
+        self._node.get_logger().warning(
+            f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': it is "
+            "taken to be there, looking ahead, until a transform says it"
+        )
+        self._mountings[frame] = None
         return True
 
-    def _look_for_mounting(self) -> None:
+    def _look_for_mounting(self, frame: str) -> None:
         """Take the mounting that the transforms say by now, if it is news."""
-        frame = self._frame if self._frame is not None or not self._held else self._held[0].frame_id.strip("/")
-        if frame is None:
-            return
         if frame in ("", self._base_frame):
-            if self._frame is None:
-                self._mount(frame, None)
+            self._mountings[frame] = None
             return
         found = mounting_in(self._transforms, self._base_frame, frame, self._settings.tf_topic)
-        if found is None or (self._known is not None and found.near(self._known)):
+        known = self._mountings.get(frame)
+        if found is None or (known is not None and found.near(known)):
             return
         self._node.get_logger().info(f"scanner: {found}")
-        before, late = self._core.mounting, self._frame is not None and self._known is None
-        self._mount(frame, found)
-        if late and not _same(before, self._core.mounting):
+        before, again = self._mounting_of(frame), frame in self._mountings
+        self._mountings[frame] = found
+        if again and known is None and not _same(before, self._mounting_of(frame)):
             self.reset()
             self._node.get_logger().warning("the scanner's mounting came late: the odometry starts anew with it")
+        elif again:
+            self._core.remount()
 
-    def _mount(self, frame: str, found: KnownMounting | None) -> None:
-        """Take the scanner of this frame to sit there; None: at the base frame, looking ahead."""
-        self._frame, self._known = frame, found
+    def _mounting_of(self, frame: str) -> Mounting:
+        """Where the scanner of a frame sits: as TF says, else at the base frame, looking ahead."""
+        found = self._mountings.get(frame)
         sensor = np.zeros(3) if found is None else found.base_from_scan_xyyaw.copy()
-        if self._settings.scan_yaw_deg != 0.0:
+        if self._settings.scan_yaw_deg != 0.0 and frame == next(iter(self._mountings), frame):
             sensor[2] = math.radians(self._settings.scan_yaw_deg)
-        self._core.mounting = Mounting(sensor, found is not None and found.upside_down)
+        return Mounting(sensor, found is not None and found.upside_down)
 
     def reset(self) -> str:
         """Start anew with the next scan; returns what that means, in words."""
@@ -222,12 +230,15 @@ class LidarInput:
         """Values for diagnostics."""
         return {
             "scans waiting for odometry": str(self._core.waiting + len(self._held) + self._on_tf.waiting),
-            "scanner": "not on TF" if self._known is None else str(self._known),
+            "scanner": "; ".join(
+                f"'{frame}' not on TF" if at is None else str(at) for frame, at in self._mountings.items()
+            ),
             "robot odometry": "heard" if self._core.has_wheels else "none",
             "age of scans against odometry (s)": f"{self._core.lag_s:.3f}",
             "yaw of the scanner against its mounting (deg)": f"{math.degrees(self._core.mounting_yaw_rad):.1f}",
             "scans that did not say where they were taken": str(self._unsure),
             "restarts": str(self._core.restarts),
+            "remarks": "; ".join(self._core.remarks()),
         }
 
     def problems(self) -> list[str]:
@@ -238,8 +249,10 @@ class LidarInput:
             self._newly_unsure = 0
         if self._settings.robot_odometry != "none" and not self._core.has_wheels:
             found.append("no odometry of the robot came yet")
-        if self._known is None and self._frame not in (None, "", self._base_frame):
-            found.append(f"no transform says where '{self._frame}' sits on '{self._base_frame}'")
+        for frame, known in self._mountings.items():
+            if known is None and frame not in ("", self._base_frame):
+                found.append(f"no transform says where '{frame}' sits on '{self._base_frame}'")
+        found += self._core.problems()
         if problem := self._on_tf.problem():
             found.append(problem)
         return found

@@ -28,15 +28,26 @@ class Listening:
         qos: QoSProfile,
         group: CallbackGroup | None = None,
         at_once: int = 1,
+        each_frame: bool = False,
     ) -> Input:
-        """Take the messages of one publisher; their frames, where they have any, tell publishers apart.
+        """Take the messages of one publisher, or of one for each frame; frames, where there are any, tell them apart.
 
         A node that fell behind takes up to ``at_once`` messages in one turn of the executor.
         """
 
         take = self._safe(topic, callback)
         made = Input(
-            self._node, self._status, message_type, topic, qos, take, _frame_of, self._timeout_s, group, at_once
+            self._node,
+            self._status,
+            message_type,
+            topic,
+            qos,
+            take,
+            _frame_of,
+            self._timeout_s,
+            group,
+            at_once,
+            each_frame,
         )
         self._inputs.append(made)
         return made

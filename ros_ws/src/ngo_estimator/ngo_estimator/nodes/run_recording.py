@@ -23,7 +23,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import tyro
 from ament_index_python.packages import get_package_share_directory
 from rich.console import Console
@@ -78,6 +77,8 @@ class Arguments:
     scan_yaw_deg: float = 0.0
     """Where a scanner's angle 0 points, counter-clockwise from straight ahead; 0: as the recording's transforms say.
     Where the scanner sits is as they say."""
+    min_range: float = 0.0
+    """Nearer ranges of a scanner are not used, m: for a robot that its scanner sees."""
     base_frame: str = "base_link"
     """Frame of the robot in trajectories.mcap."""
     odom_frame: str = "odom"
@@ -267,12 +268,13 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     from ngo_estimator.slam.scan_trajectory import ScanTrajectory
     from ngo_recordings.frames import frames as frames_of
     from ngo_recordings.lidar_description import describe_lidar
+    from ngo_recordings.mounting import find_mounting
     from ngo_recordings.scan_stream import scan_stream
 
     odometry = load_front_end(folder, arguments.world)
     online = ScanTrajectory.load(folder, arguments.world, arguments.iterations_per_step)
     given = replace(arguments.topics, action="none", twist="none")
-    if given.image is None:
+    if given.image is None and not given.scan_topics:
         given = replace(given, image=choose_scan(recording))
     topics = choose_topics(recording, given)
     described = describe_lidar(recording, topics)
@@ -280,16 +282,21 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
         described = described.looking_at(math.radians(arguments.scan_yaw_deg))
     for line in described.lines():
         console.print(line, soft_wrap=True, highlight=False)
-    mounting = Mounting(np.zeros(3))
-    if described.mounting is not None:
-        mounting = Mounting(described.mounting.base_from_scan_xyyaw, described.mounting.upside_down)
+    first_frame = described.scan_frame
+
+    def mounting_of(frame: str) -> Mounting | None:
+        found = described.mounting if frame == first_frame else find_mounting(recording, topics, frame)
+        if frame != first_frame and found is not None:
+            console.print(f"another scanner: {found}", soft_wrap=True, highlight=False)
+        return None if found is None else Mounting(found.base_from_scan_xyyaw, found.upside_down)
+
     truth = Truth()
     if topics.ground_truth is not None:
         for frame in frames_of(recording, topics):
             truth.add(frame)
     with compiling(partial(console.print, highlight=False)):
         warm_up_scans()
-    core = LidarRun(odometry, online, mounting)
+    core = LidarRun(odometry, online, mounting_of, arguments.min_range)
     return LIDAR_WORLD, topics, core, core.run(scan_stream(recording, topics, skipped=core.rejected), truth)
 
 

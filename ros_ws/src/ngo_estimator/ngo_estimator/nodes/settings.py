@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from ngo_common.settings import BadParameter, FramedSettings, frame, pose, setting, topic
+from ngo_common.settings import BadParameter, FramedSettings, frame, pose, setting, topic, topics
 
 SHIPPED_WORLDS = ("maze2d", "maze3d", "doom", "scan")
 """Worlds whose weights are in the package."""
@@ -64,6 +64,16 @@ class LocalNodeSettings(EstimatorSettings):
         "raw", "Type of the images: Image, or CompressedImage on image_topic/compressed.", choices=_TRANSPORTS
     )
     scan_topic: str = topic("scan", "Laser scans to estimate motion from, with weights that take scans.")
+    scan_topics: tuple[str, ...] = topics(
+        (),
+        "Topics of several scanners, each with its pose on TF, whose scans are put together; in place of scan_topic.",
+    )
+    min_range: float = setting(
+        0.0,
+        "Nearer ranges of a scanner are not used, m: for a robot that its scanner sees.",
+        minimum=0.0,
+        maximum=100.0,
+    )
     scan_yaw_deg: float = setting(
         0.0,
         "Direction of a scan's angle 0, counter-clockwise from straight ahead, degrees; other than 0 it stands for the "

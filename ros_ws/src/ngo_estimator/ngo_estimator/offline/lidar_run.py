@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from ngo_estimator.frontend.intake.lidar_intake import LidarIntake, MountingOf
 from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.geometry.scan_points import Mounting
@@ -26,11 +27,19 @@ class LidarRun:
 
     Args:
         odometry, online: the estimators, which begin anew.
-        mounting: where the scanner sits on the robot.
+        mounting: where the scanner sits on the robot; or where the scanner of a frame does, for several.
+        min_range_m: nearer ranges are not used.
     """
 
-    def __init__(self, odometry: LidarFrontEnd, online: ScanTrajectory, mounting: Mounting) -> None:
-        self._odometry, self._online, self._mounting = odometry, online, mounting
+    def __init__(
+        self,
+        odometry: LidarFrontEnd,
+        online: ScanTrajectory,
+        mounting: Mounting | MountingOf,
+        min_range_m: float = 0.0,
+    ) -> None:
+        mounting_of = (lambda frame: mounting) if isinstance(mounting, Mounting) else mounting
+        self._odometry, self._online = LidarIntake(odometry, mounting_of, min_range_m), online
         self.frames = 0
         """Scans that came."""
         self.rejected: Counter[str] = Counter()
@@ -60,7 +69,7 @@ class LidarRun:
 
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
-        lines = []
+        lines = self._odometry.remarks()
         if lag_s := self._odometry.lag_s:
             lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
         if yaw := math.degrees(self._odometry.mounting_yaw_rad):
@@ -84,7 +93,6 @@ class LidarRun:
         """
         self._odometry.reset()
         self._online.reset()
-        self._odometry.mounting = self._mounting
         for record in records:
             if isinstance(record, WheelPose):
                 try:

@@ -1,0 +1,158 @@
+"""What stands before the front end of a lidar: scans as they should be, of all scanners together (no ROS here)."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from ngo_estimator.frontend.intake.no_return import NoReturnValues
+from ngo_estimator.frontend.intake.own_returns import OwnReturns
+from ngo_estimator.frontend.intake.turns import Part, Turns
+from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
+from ngo_estimator.geometry.planar_motion import Array
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_recordings.scan_stream import LidarScan
+
+_NEWS_STEPS = 20
+"""Steps after which there may be news."""
+
+MountingOf = Callable[[str], Mounting | None]
+"""Where the scanner of a frame sits; None where it is not known."""
+
+
+class LidarIntake:
+    """Hands scans and wheels to a front end, whose methods it has.
+
+    Scans of several scanners, and sectors of one, come as one scan of the first scanner. Ranges that are no returns, or
+    see the robot itself, are left out.
+
+    Args:
+        front_end: begins anew.
+        mounting_of: asked once for each frame. A scanner whose mounting is not known is left out beside others.
+        min_range_m: nearer ranges are not used.
+    """
+
+    def __init__(self, front_end: LidarFrontEnd, mounting_of: MountingOf, min_range_m: float = 0.0) -> None:
+        self.front_end, self._mounting_of, self._min_range_m = front_end, mounting_of, min_range_m
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next scan is the new origin of ``odom``."""
+        self.front_end.reset()
+        self._turns = Turns()
+        self._mountings: dict[str, Mounting | None] = {}
+        self._no_return: dict[str, NoReturnValues] = {}
+        self._own: dict[str, OwnReturns] = {}
+        self._steps = 0
+        self._said: set[str] = set()
+
+    @property
+    def waiting(self) -> int:
+        """How many scans wait."""
+        return self.front_end.waiting + self._turns.waiting
+
+    @property
+    def has_wheels(self) -> bool:
+        """Whether wheel odometry came since the start."""
+        return self.front_end.has_wheels
+
+    @property
+    def lag_s(self) -> float:
+        """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
+        return self.front_end.lag_s
+
+    @property
+    def mounting_yaw_rad(self) -> float:
+        """How much further to the left the scanner looks than its mounting says, by the wheels; 0 until it is known."""
+        return self.front_end.mounting_yaw_rad
+
+    @property
+    def restarts(self) -> int:
+        """How often the stamps jumped back."""
+        return self.front_end.restarts
+
+    def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
+        """Take the wheels' pose ``(3,)``; raises ``ValueError`` as the front end does."""
+        self.front_end.add_wheels(stamp_ns, pose_xyyaw)
+
+    def add_scan(self, scan: LidarScan) -> None:
+        """Take a scan of any scanner; raises ``ValueError`` as the front end does."""
+        scanner = f"{scan.topic} {scan.frame_id}".strip()
+        if scanner not in self._mountings:
+            self._meet(scanner, scan.frame_id)
+        mounting = self._mountings[scanner]
+        if mounting is None:
+            return
+        if scan.range_min < self._min_range_m:
+            scan = replace(scan, range_min=self._min_range_m)
+        scan = self._no_return[scanner].clean(scan)
+        ranges = self._own[scanner].clean(scan)
+        if ranges is not scan.ranges:
+            scan = replace(scan, ranges=ranges)
+        self._hand_on(self._turns.add(Part(scan, mounting, scanner)))
+
+    def remount(self) -> None:
+        """Ask anew where all scanners sit."""
+        self._mountings.clear()
+        self._turns = Turns()
+
+    def _hand_on(self, turns: list[LidarScan]) -> None:
+        refused: ValueError | None = None
+        for turn in turns:
+            try:
+                self.front_end.add_scan(turn)
+            except ValueError as error:
+                refused = error
+        if refused is not None:
+            raise refused
+
+    def _meet(self, scanner: str, frame: str) -> None:
+        mounting = self._mounting_of(frame)
+        if not any(self._mountings.values()):  # the first one, whose scans are of no use without a place
+            mounting = mounting or self.front_end.mounting
+            self.front_end.mounting = mounting
+        self._mountings[scanner] = mounting
+        self._no_return.setdefault(scanner, NoReturnValues())
+        self._own.setdefault(scanner, OwnReturns())
+
+    def ready(self, at_end: bool = False) -> Iterator[LidarStep]:
+        """The steps to all scans whose wheels are known by now; ``at_end`` nothing more comes.
+
+        Raises:
+            UnusableImage: a scan has no usable ray. It is gone; call again for the next.
+        """
+        if at_end:
+            self._hand_on(self._turns.flush())
+        for step in self.front_end.ready(at_end):
+            self._steps += 1
+            for own in self._own.values():
+                own.moved(step.relative_xyyaw)
+            yield step
+
+    def remarks(self) -> list[str]:
+        """What a person should know of the scans and wheels, a line each."""
+        lines = self.problems()
+        for name, found in self._no_return.items():
+            if found.values:
+                values = ", ".join(f"{value:g}" for value in found.values)
+                lines.append(f"{name} says {values} m where nothing came back: taken so")
+        for name, own in self._own.items():
+            if own.rays:
+                lines.append(f"{own.rays} rays of {name} see the robot itself: left out")
+        return lines
+
+    def news(self) -> list[str]:
+        """The remarks that are new since the last call, each once whatever its numbers."""
+        if self._steps % _NEWS_STEPS:
+            return []
+        fresh = {_words(line): line for line in self.remarks() if _words(line) not in self._said}
+        self._said |= fresh.keys()
+        return list(fresh.values())
+
+    def problems(self) -> list[str]:
+        """A line for each scanner that is missing."""
+        lines = [f"{name} is left out: its mounting is not known" for name, at in self._mountings.items() if at is None]
+        return [*lines, *(f"nothing more comes from {name}" for name in self._turns.silent())]
+
+
+def _words(line: str) -> str:
+    return " ".join(part for part in line.split() if not part[0].isdigit())

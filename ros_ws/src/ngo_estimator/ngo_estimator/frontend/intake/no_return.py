@@ -1,0 +1,93 @@
+"""Ranges that a driver gives where nothing came back: one value again and again, with nothing just behind it.
+
+A wall piles ranges up, too, where it is straight across the rays and the ranges are rounded. But a wall goes on behind
+its nearest point: the next values are there as well. Behind a value that means "no return" there is a gap.
+"""
+
+import math
+from collections import Counter, deque
+from dataclasses import replace
+
+import numpy as np
+
+from ngo_estimator.geometry.planar_motion import Array
+from ngo_recordings.scan_stream import LidarScan
+
+_BEHIND_M = 0.1
+_LEAST_GAP = 0.25
+"""Ranges within ``_BEHIND_M`` behind a value, per range of the value, below which there is a gap."""
+
+_SHARE = 0.01
+_TOP_SHARE = 0.03
+"""Of the ranges; of a value that is the largest of its scan a few scans suffice."""
+
+_FEWEST = 5
+_SCANS = 8
+_TOP_SCANS = 3
+_KEPT = 16
+"""Scans from different places in which a value is looked for."""
+
+_CHANGED_M, _CHANGED_SHARE = 0.05, 0.5
+"""A scan is from another place where so many ranges changed by so much."""
+
+
+class NoReturnValues:
+    """Learns such values, and takes their ranges for what they are."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        """The values that are known, m."""
+        self._piled: deque[tuple[float, ...]] = deque(maxlen=_KEPT)
+        self._tops: Counter[float] = Counter()
+        self._place = np.zeros(0)
+
+    def clean(self, scan: LidarScan) -> LidarScan:
+        """The scan with no return in the place of these values.
+
+        The largest becomes ``range_max`` where nothing was seen beyond it: up to there all is free. Of another one
+        nothing is known but that it is no range.
+        """
+        self._learn(scan)
+        if not self.values:
+            return scan
+        ranges, largest = scan.ranges, self.values[-1]
+        usual = np.isfinite(ranges) & (ranges < (scan.range_max if scan.range_max > 0.0 else math.inf))
+        range_max = scan.range_max
+        if not (usual & (ranges > largest)).any():
+            range_max = largest
+        unknown = np.isin(ranges, np.array(self.values, np.float32)) & usual & (ranges < range_max)
+        if unknown.any():
+            ranges = np.where(unknown, np.float32(np.nan), ranges)
+        return replace(scan, ranges=ranges, range_max=range_max)
+
+    def _learn(self, scan: LidarScan) -> None:
+        usual = np.isfinite(scan.ranges) & (scan.ranges > max(scan.range_min, 0.0))
+        if 0.0 < scan.range_max < math.inf:
+            usual &= scan.ranges < scan.range_max
+        values, counts = np.unique(scan.ranges[usual], return_counts=True)
+        total = int(counts.sum())
+        if total < 4 * _FEWEST:
+            return
+        found = []
+        for k in np.flatnonzero(counts >= max(_FEWEST, _SHARE * total)):
+            behind = counts[k + 1 : np.searchsorted(values, values[k] + _BEHIND_M, side="right")].sum()
+            if behind < _LEAST_GAP * counts[k]:
+                found.append(float(values[k]))
+                if k == len(values) - 1 and counts[k] >= _TOP_SHARE * total:
+                    self._tops[found[-1]] += 1
+        if self._is_elsewhere(scan.ranges):
+            self._piled.append(tuple(found))
+        seen = Counter(value for values in self._piled for value in values)
+        for value in found:
+            if value not in self.values and (seen[value] >= _SCANS or self._tops[value] >= _TOP_SCANS):
+                self.values = sorted([*self.values, value])
+
+    def _is_elsewhere(self, ranges: Array) -> bool:
+        before = self._place
+        if len(before) == len(ranges):
+            both = np.isfinite(before) & np.isfinite(ranges)
+            changed = np.abs(before[both] - ranges[both]) > _CHANGED_M
+            if len(changed) and changed.mean() < _CHANGED_SHARE:
+                return False
+        self._place = ranges
+        return True
