@@ -9,7 +9,6 @@ FOLDER holds logs (.bag, .log, .clf, gzipped or not) with relations as NAME.rela
 code of today has measured. The command writes ``training/results/stress.json`` and ``docs/results_stress.md``.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +18,10 @@ import numpy as np
 
 from training.common import records
 from training.common.command_line import run_command
-from training.common.records import write_at_once
 from training.data.lidar_changes import CHANGES, UNSEEDED
 from training.recordings.lidar_logs import logs_below, relations_of
 from training.report import stress_page
+from training.report.folders import Folders
 from training.scoring import stress_tables
 from training.scoring.lidar_rows import ROWS
 from training.scoring.lidar_scores import scored_rows, with_runs
@@ -36,7 +35,7 @@ STRESS_ROWS = ("wheels", "ours", "ours_without_wheels", "kiss_icp")
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folders):
     """Settings of the table."""
 
     world: Literal["stress"] = "stress"
@@ -61,14 +60,8 @@ class Arguments:
     """Factor on the length of simulated drives."""
     split: Literal["validation", "test"] = "test"
     """Buildings to drive in. Designs are chosen on validation; test is for the final tables alone."""
-    weights: Path = records.WEIGHTS / "scan"
-    """Folder with lidar.json, the settings of our estimators."""
-    out: Path = records.ROOT / "training" / "results"
-    """Folder that gets stress.json."""
-    docs: Path = records.ROOT / "docs"
-    """Folder that gets results_stress.md."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of what was measured."""
+
+    weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
 
     def __post_init__(self) -> None:
         for name, given, known in (("changes", self.changes, (*CHANGES,)), ("rows", self.rows, STRESS_ROWS)):
@@ -98,9 +91,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "bars": [bar.as_json() for bar in stress_bars(logs)],
         "skipped": [f"{name}: {ROWS[name].missing()}" for name in STRESS_ROWS if name not in rows],
     }
-    write_at_once(arguments.out / "stress.json", json.dumps(result, indent=2) + "\n")
-    write_at_once(arguments.docs / "results_stress.md", stress_page.page(result))
-    return result
+    return arguments.publish("stress", result, stress_page.page(result))
 
 
 def _logs(arguments: Arguments, rows: Sequence[str], asked: Sequence[str]) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 from typing import Any
 
 from training.data.lidar_changes import CHANGES
+from training.report.page import markdown
+from training.report.page import page as whole
 
 _ROWS = {
     "wheels": "wheels",
@@ -31,7 +33,7 @@ def page(result: dict[str, Any]) -> str:
         parts.append("## Bars\n\n" + _bars(result["bars"]))
     parts += [_simulated(name, table) for name, table in result["tables"].items() if table]
     parts.append("## The changes\n\n" + _changes())
-    return "\n\n".join(parts) + "\n"
+    return whole(parts)
 
 
 _TABLES = {
@@ -64,7 +66,7 @@ def _simulated(name: str, table: dict[str, Any]) -> str:
         for group, rows in table.items()
         for row, numbers in rows.items()
     ]
-    return f"{_TABLES[name]}\n\n{_markdown([head, ['---'] * len(head), *body])}"
+    return f"{_TABLES[name]}\n\n{markdown(head, body)}"
 
 
 def _number(numbers: dict[str, Any], key: str) -> str:
@@ -79,7 +81,7 @@ def _table(table: dict[str, Any]) -> str:
         cells = [_both(rows.get(row, {}), "translation_m", "rotation_deg") for row in _ROWS]
         cells += [_both(ours, "at_scans_m", "at_scans_deg"), _both(ours, "best_possible_m", "best_possible_deg")]
         body.append([f"`{change}`", *cells])
-    return _markdown([head, ["---"] * len(head), *body])
+    return markdown(head, body)
 
 
 def _both(numbers: dict[str, Any], metres: str, degrees: str) -> str:
@@ -96,13 +98,9 @@ def _bars(bars: list[dict[str, Any]]) -> str:
     missed = [bar for bar in bars if not bar["met"]]
     body = [[bar["name"], f"{bar['value']:.3f}", f"{bar['at_most']:.3f}"] for bar in missed]
     text = f"{len(bars) - len(missed)} of {len(bars)} are met. Missed are:"
-    return f"{text}\n\n{_markdown([['', 'error (m)', 'at most (m)'], ['---'] * 3, *body])}"
+    return f"{text}\n\n{markdown(['', 'error (m)', 'at most (m)'], body)}"
 
 
 def _changes() -> str:
     rows = [[f"`{name}`", (change.__doc__ or "").strip()] for name, change in CHANGES.items()]
-    return _markdown([["Change", "What happens"], ["---", "---"], *rows])
-
-
-def _markdown(lines: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown(["Change", "What happens"], rows)
