@@ -106,6 +106,19 @@ class NodeProcess:
         assert re.search(pattern, self.log), f"{self.name} ended without writing '{pattern}'; it wrote:\n{self.log}"
 
 
+@contextmanager
+def own_node(name: str, *arguments: str) -> Iterator[Node]:
+    """A node of this process, with the arguments of a command line."""
+    context = Context()
+    rclpy.init(args=list(arguments), context=context)
+    node = rclpy.create_node(name, context=context, start_parameter_services=False)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
 def wait_until(
     condition: Callable[[], Result], what: str, timeout_s: float = TIMEOUT_S, poll_s: float = 0.02
 ) -> Result:

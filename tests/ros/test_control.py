@@ -350,37 +350,30 @@ def test_two_nodes_of_one_name_are_told(weights: Path, parameters: dict[str, Any
         probe.spin_until(lambda: any(problem in array.status[0].message for array in statuses), "diagnostics")
 
 
-@pytest.mark.parametrize("shared_tf", [True, False], ids=["one tf", "a tf each"])
-def test_two_robots_in_one_domain_do_not_meet(weights: Path, parameters: dict[str, Any], shared_tf: bool) -> None:
+def test_two_robots_in_one_domain_with_a_tf_each_do_not_meet(weights: Path, parameters: dict[str, Any]) -> None:
+    """With one tf for both they are in test_two_robots.py."""
     with Probe("two_robots") as probe, ExitStack() as stack:
-        robots = {}
-        for seed, name in enumerate(("red", "blue")):
-            own = {"frame_prefix": f"{name}/"} if shared_tf else {"tf_topic": "tf"}
-            process = stack.enter_context(
-                NodeProcess("ngo_estimator", "ngo_node", {**parameters, **own}, ("-r", f"__ns:=/{name}"))
-            )
-            robots[name] = seed, process
-        topics = ("/tf", "/tf") if shared_tf else ("/red/tf", "/blue/tf")
-        transforms = {topic: probe.collect(TFMessage, topic) for topic in set(topics)}
-        both = {name: Optimizer(process, weights, probe, f"/{name}") for name, (_, process) in robots.items()}
-        drives = {name: optimizer.drive(seed=robots[name][0]) for name, optimizer in both.items()}
+        both, transforms = {}, {}
+        for name in ("red", "blue"):
+            own = {**parameters, "tf_topic": "tf"}
+            process = stack.enter_context(NodeProcess("ngo_estimator", "ngo_node", own, ("-r", f"__ns:=/{name}")))
+            transforms[name] = probe.collect(TFMessage, f"/{name}/tf")
+            both[name] = Optimizer(process, weights, probe, f"/{name}")
+        drives = {name: optimizer.drive(seed=seed) for seed, (name, optimizer) in enumerate(both.items())}
         for step in range(1, 29):
             for name, optimizer in both.items():
                 optimizer.publish(drives[name].step(step))
-        prefixes = {name: f"{name}/" if shared_tf else "" for name in both}
         for name, optimizer in both.items():
             pose = optimizer.wait_for_stamp(drives[name].stamp_ns(28))
-            assert pose.header.frame_id == f"{prefixes[name]}map"
+            assert pose.header.frame_id == "map"
             assert_pose_is(pose, optimizer.expected(drives[name].steps(1, 28)))
             assert len(optimizer.poses) == 28
-        for name, topic in zip(("red", "blue"), topics, strict=True):
-            frames = f"{prefixes[name]}map", f"{prefixes[name]}odom"
             stamps_ns = [drives[name].stamp_ns(step) for step in range(1, 29)]
             # Those of the robot's drives before are later. A transform is sent again where an optimisation is finished
             # while no relative pose comes, as happens here where the machine stands still for a second.
-            own = partial(transform_stamps_ns, transforms[topic], frames, until_ns=stamps_ns[-1])
-            probe.spin_until(lambda own=own: len(own()) >= 28, f"the transforms of {name}")
-            assert own() == stamps_ns
+            own_ns = partial(transform_stamps_ns, transforms[name], ("map", "odom"), until_ns=stamps_ns[-1])
+            probe.spin_until(lambda own_ns=own_ns: len(own_ns()) >= 28, f"the transforms of {name}")
+            assert own_ns() == stamps_ns
 
 
 def transform_stamps_ns(messages: list[TFMessage], frames: tuple[str, str], until_ns: int) -> list[int]:

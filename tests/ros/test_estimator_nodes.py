@@ -22,14 +22,17 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from visualization_msgs.msg import Marker
 
+from ngo_common.nodes.parameters import LiveSettings
+from ngo_common.settings import BadParameter, Settings
 from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
 from ngo_estimator.nodes.messages import relative_step, to_ns, to_time
 from ngo_estimator.nodes.path_message import plain_path
+from ngo_estimator.nodes.settings import LocalNodeSettings, NgoNodeSettings
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .estimator_graph import FIRST_RUN_NS, STEP_NS, Graph, image_message, scan
-from .processes import NodeProcess, Probe, wait_until
+from .processes import NodeProcess, Probe, own_node, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -387,15 +390,7 @@ def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path, number: sig
 
 
 BAD_STARTS = """
-local_node world:=mars             parameter 'world' is 'mars'; allowed: maze2d, maze3d, doom or scan
 local_node wrld:=maze2d            parameter 'wrld' is 'maze2d', but unknown; did you mean world
-local_node image_topic:='a/'       parameter 'image_topic' is 'a/'; allowed: a topic name
-local_node image_depth:=5.5        parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000
-local_node action_timeout_s:=.nan  parameter 'action_timeout_s' is nan; allowed: a number from 0.001 to 60
-local_node publish_tf:=1           parameter 'publish_tf' is 1; allowed: true or false
-ngo_node   window_frames:=one      parameter 'window_frames' is 'one'; allowed: an integer from 16 to 100000
-ngo_node   window_frames:=4000     parameter 'relative_pose_depth' is 2000; allowed: at least window_frames
-ngo_node   map_frame:=odom         parameter 'map_frame' is 'odom'; allowed: another name than odom_frame's
 ngo_node   publish_tf              Couldn't parse parameter override rule: '-p publish_tf'
 ngo_node   weights:=/nowhere       there is no folder '/nowhere'
 """
@@ -417,15 +412,37 @@ def test_bad_parameters_end_the_start_with_one_line_and_code_two() -> None:
             assert_refused(process, pattern)
 
 
+@pytest.mark.parametrize(
+    ("settings", "argument", "expected"),
+    [
+        (LocalNodeSettings, "world:=mars", "parameter 'world' is 'mars'; allowed: maze2d, maze3d, doom or scan"),
+        (LocalNodeSettings, "image_topic:='a/'", "parameter 'image_topic' is 'a/'; allowed: a topic name"),
+        (LocalNodeSettings, "image_depth:=5.5", "parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000"),
+        (LocalNodeSettings, "action_timeout_s:=.nan", "'action_timeout_s' is nan; allowed: a number from 0.001 to 60"),
+        (LocalNodeSettings, "publish_tf:=1", "parameter 'publish_tf' is 1; allowed: true or false"),
+        (NgoNodeSettings, "window_frames:=one", "'window_frames' is 'one'; allowed: an integer from 16 to 100000"),
+        (NgoNodeSettings, "window_frames:=4000", "'relative_pose_depth' is 2000; allowed: at least window_frames"),
+        (
+            NgoNodeSettings,
+            "map_frame:=odom",
+            "'map_frame' is 'odom'; allowed: another name than odom_frame's",
+        ),
+    ],
+)
+def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(
+    settings: type[Settings], argument: str, expected: str
+) -> None:
+    with own_node("estimator", "--ros-args", "-p", argument) as node, pytest.raises(BadParameter) as error:
+        LiveSettings(node, settings)
+    assert expected in str(error.value) and "\n" not in str(error.value)
+
+
 def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp_path: Path) -> None:
     write_untrained(tmp_path, "maze2d")
-    for name in ("local_pose_network", "neural_graph_optimizer"):
-        file = tmp_path / f"{name}.safetensors"
-        file.write_bytes(file.read_bytes()[:-100])
+    file = tmp_path / "local_pose_network.safetensors"
+    file.write_bytes(file.read_bytes()[:-100])
     cases = {
         ("local_node", "maze2d", tmp_path): "local_pose_network.safetensors: is damaged",
-        ("ngo_node", "maze2d", tmp_path): "neural_graph_optimizer.safetensors: is damaged",
-        ("local_node", "maze2d", weights / "maze3d"): "was trained for the world 'maze3d'; expected 'maze2d'",
         ("ngo_node", "maze3d", weights): "cannot be read",
     }
     with ExitStack() as stack:

@@ -67,7 +67,7 @@ def test_two_robots_drive_at_once(tmp_path: Path) -> None:
             core.reset()
             for message, pose in zip(steps[name], poses[name], strict=True):
                 update = core.update(relative_step(message))
-                assert to_ns(pose.header.stamp) == update.stamp_ns
+                assert (to_ns(pose.header.stamp), pose.header.frame_id) == (update.stamp_ns, f"{name}/map")
                 position = pose.pose.pose.position
                 np.testing.assert_allclose((position.x, position.y), update.pose_xyyaw[:2], atol=1e-5)
             frames = {placed(message)[:2] for message in transforms}

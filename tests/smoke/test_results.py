@@ -1,4 +1,4 @@
-"""The tables of results at toy size: from nothing to JSON, page and figures, and nothing made twice."""
+"""The tables of results at toy size: from nothing to JSON, page and figures."""
 
 import dataclasses
 import json
@@ -10,16 +10,7 @@ import numpy as np
 import pytest
 
 from tests.smoke import toy
-from training import (
-    featurise,
-    results,
-    throughput,
-    train_end_to_end,
-    train_local,
-    train_optimizer,
-    train_place,
-    tune_pose_graph,
-)
+from training import results, tune_pose_graph
 from training.data import worlds
 from training.data.feature_store import open_store
 from training.data.worlds import MazeSize, Table, world_named
@@ -104,15 +95,6 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
     for image in images:
         assert f"(images/{image.name})" in page
         assert matplotlib.image.imread(image).std() > 0.01
-
-
-def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, result = made
-    networks = (train_end_to_end, train_local, train_optimizer, train_place)
-    toy.refuse(
-        monkeypatch, (*networks, featurise, throughput, tune_pose_graph), "training.scoring.prefix_errors.scores"
-    )
-    assert results.main(arguments(folder), toy.scripts("maze2d", folder)) == result
 
 
 def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, dict[str, Any]]) -> None:

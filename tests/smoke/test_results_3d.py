@@ -12,11 +12,14 @@ import pytest
 from ngo_estimator.checkpoint import write_untrained
 from tests.smoke import toy
 from training import (
+    featurise,
     results,
+    throughput,
     train_deepvo,
     train_end_to_end,
     train_local,
     train_optimizer,
+    train_place,
     train_smoother,
     tune_pose_graph,
 )
@@ -145,7 +148,8 @@ def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, An
 
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
-    scripts = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_smoother, tune_pose_graph)
+    networks = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_place, train_smoother)
+    scripts = (*networks, featurise, throughput, tune_pose_graph)
     calls = ("training.prerequisites.make_odometry", "training.scoring.prefix_errors.scores")
     toy.refuse(monkeypatch, scripts, *calls)
     assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result

@@ -126,11 +126,15 @@ def print_parameter(node_name: str, parameter_name: str, hide_type: bool) -> int
         response = call(node, GetParameters, f"{_absolute(node_name)}/get_parameters", request)
     if not response.values or response.values[0].type == ParameterType.PARAMETER_NOT_SET:
         raise CommandError("Parameter not set")
-    (value,) = response.values
+    print(value_text(response.values[0], hide_type))
+    return 0
+
+
+def value_text(value: ParameterValue, hide_type: bool = False) -> str:
+    """A parameter's value as `ros2 param get` prints it."""
     label, field = _LABELS[value.type]
     content = getattr(value, f"{field}_value")
-    print(content if hide_type else f"{label}: {content}")
-    return 0
+    return str(content) if hide_type else f"{label}: {content}"
 
 
 def print_state(node_name: str) -> int:
