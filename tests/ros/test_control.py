@@ -19,14 +19,15 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Path as PathMessage
 from ngo_msgs.msg import Trajectory
-from ngo_msgs.srv import SaveTrajectory
+from ngo_msgs.srv import RemoveLoop, SaveGraph, SaveTrajectory
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
-from ngo_estimator.nodes.messages import planar_estimate, pose_message, relative_step, to_ns
+from ngo_estimator.nodes.messages import planar_estimate, pose_message, relative_step, to_ns, to_time
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
+from ngo_estimator.trajectory.g2o import PlanarGraph, read_g2o
 
 from .processes import NodeProcess, Probe
 from .relative_poses import Optimizer, assert_pose_is
@@ -98,6 +99,47 @@ def test_a_trajectory_is_saved_while_steps_go_on(optimizer: Optimizer, tmp_path:
     if ending == "g2o":
         assert path.read_text().count("EDGE_SE2") >= count - 1
     assert len(optimizer.poses) == 200
+
+
+def test_the_graph_is_saved_and_a_loop_is_taken_out(optimizer: Optimizer, tmp_path: Path) -> None:
+    drive, probe = optimizer.drive(), optimizer.probe
+    optimizer.pose_after(*drive.steps(1, 100))
+
+    def saved(name: str) -> PlanarGraph:
+        path = tmp_path / f"{name}.g2o"
+        answer = probe.call(SaveGraph, "ngo_node/save_graph", SaveGraph.Request(path=str(path)))
+        assert answer.success, answer.message
+        beside = file_interface.read_tum_trajectory_file(path.with_suffix(".tum"))
+        graph = read_g2o(path)
+        assert len(graph.ids) == beside.num_poses == 101
+        np.testing.assert_array_equal(graph.poses[:, :2], beside.positions_xyz[:, :2])
+        return graph
+
+    def removed(**fields: Any) -> RemoveLoop.Response:
+        return probe.call(RemoveLoop, "ngo_node/remove_loop", RemoveLoop.Request(**fields))
+
+    before = saved("before")
+    loops = before.edges[before.is_loop].tolist()
+    (first, second), (other_first, other_second) = loops[0], loops[-1]
+    answer = removed(first_id=first, second_id=second)
+    assert answer.success and "loops are out" in answer.message
+    stamps = (to_time(int(before.stamps_ns[name])) for name in (other_first, other_second))
+    assert removed(**dict(zip(("first", "second"), stamps, strict=True))).success
+    after = saved("after")
+    left = after.edges[after.is_loop].tolist()
+    assert [first, second] not in left and [other_first, other_second] not in left and len(left) > 0
+    assert np.abs(after.poses - before.poses).max() > 1e-6
+    for fields, said in (
+        ({"first_id": first, "second_id": second}, "no loop joins these poses; the nearest one joins"),
+        ({"first_id": 0, "second_id": 101}, "there is no vertex 101; expected 0 to 100"),
+        ({"what": 7}, "what is 7; expected 0 (LOOP) or 1 (STRETCH)"),
+        ({}, "no pose has the stamp 0.000000000; the nearest one is at"),
+    ):
+        answer = removed(**fields)
+        assert not answer.success and said in answer.message
+    optimizer.pose_after(*drive.steps(101, 130))
+    wrong = SaveGraph.Request(path=str(tmp_path / "graph.txt"))
+    assert "ends in .g2o" in probe.call(SaveGraph, "ngo_node/save_graph", wrong).message
 
 
 def test_a_trajectory_that_cannot_be_saved_is_said_in_one_line(optimizer: Optimizer, tmp_path: Path) -> None:

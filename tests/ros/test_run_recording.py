@@ -280,6 +280,7 @@ def flat(report: dict[str, Any]) -> dict[str, Any]:
 
 RESULTS = {
     "odometry.tum",
+    "graph.g2o",
     "online.tum",
     "corrected.tum",
     "truth.tum",

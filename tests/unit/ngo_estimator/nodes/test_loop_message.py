@@ -6,7 +6,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ngo_estimator.nodes import loop_message
-from ngo_estimator.nodes.loop_message import LoopMarkerWriter, plain_loops
+from ngo_estimator.nodes.loop_message import LoopMarkerWriter, loop_colors, plain_loops
 from ngo_estimator.slam.trajectory_update import Trajectory
 
 
@@ -34,12 +34,19 @@ def test_equals_the_plain_message_for_any_number_of_loops(frame_id: str) -> None
         given = trajectory(loops)
         read = deserialize_message(writer.write(given), MarkerArray)
         ends, stamp_ns = given.poses_xyyaw[given.loops.reshape(-1), :2], int(given.stamps_ns[-1])
-        plain = plain_loops(frame_id, stamp_ns, ends, np.repeat(given.loop_weights.clip(0.0, 1.0), 2))
+        plain = plain_loops(frame_id, stamp_ns, ends, np.repeat(loop_colors(given.loop_weights), 2, axis=0))
         assert read == deserialize_message(serialize_message(plain), MarkerArray), loops
         (marker,) = read.markers
         assert marker.action == (Marker.ADD if loops else Marker.DELETE)
         assert (marker.type, marker.header.frame_id) == (Marker.LINE_LIST, frame_id)
         assert [(point.x, point.y) for point in marker.points] == [tuple(end) for end in ends.tolist()]
+
+
+def test_what_is_thought_of_a_loop_shows_in_its_color() -> None:
+    believed, faint, doubted, refused = loop_colors(np.array((1.0, 0.6, 0.3, 0.0)))
+    assert believed[2] == faint[2] == max(believed[:3]) and (believed[3], faint[3]) == (1.0, 0.6)  # blue
+    assert doubted[0] == max(doubted[:3]) and doubted[1] > 0.5 > refused[1]  # orange and red
+    assert refused[0] == max(refused[:3]) and doubted[3] == refused[3] > 0.0
 
 
 def test_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

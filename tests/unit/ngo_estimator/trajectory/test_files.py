@@ -2,29 +2,15 @@
 
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
-import gtsam
 import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.geometry import se2
-from ngo_estimator.slam.online_trajectory import OnlineTrajectory
-from ngo_estimator.trajectory.files import ENDINGS, PoseEdges, SpatialPoses, edges_of, read_tum, write_trajectory
-from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
+from ngo_estimator.trajectory.files import ENDINGS, SpatialPoses, read_tum, write_trajectory
 
 STAMPS_NS = np.array([0, 1_700_000_000_057_142_857, 1_700_000_000_114_285_714], dtype=np.int64)
 POSES = np.array([[0.0, 0.0, 0.0], [1.25, -0.5, 0.5 * np.pi], [1.5, 2.0, -3.0]])
-ODOMETRY = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5 * np.pi], [1.0, 2.0, np.pi]])
-TRAJECTORY = SimpleNamespace(
-    odometry_xyyaw=ODOMETRY,
-    odometry_std=np.array([[0.1, 0.2, 0.5], [0.1, 0.2, 0.25]]),
-    loops=np.array([[0, 2]]),
-    loop_relative_xyyaw=np.array([[0.5, 1.5, -3.0]]),
-    loop_std=np.array([[0.5, 0.5, 0.1]]),
-)
 
 
 @pytest.mark.parametrize("name", ["path.tum", "path.txt"])
@@ -53,59 +39,6 @@ def test_evo_reads_kitti_and_the_times_lie_beside(tmp_path: Path) -> None:
         expected = [[cos, -sin, 0.0, x], [sin, cos, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
         np.testing.assert_allclose(matrix, expected, atol=1e-15)
     np.testing.assert_allclose(np.loadtxt(tmp_path / "path.times.txt"), STAMPS_NS / 1e9)
-
-
-def test_gtsam_reads_g2o(tmp_path: Path) -> None:
-    path = tmp_path / "path.g2o"
-    assert write_trajectory(path, STAMPS_NS, POSES, edges_of(TRAJECTORY)) == [path]
-    graph, values = gtsam.readG2o(str(path), False)
-    assert values.size() == len(POSES) and graph.size() == 3
-    for index, (x, y, yaw) in enumerate(POSES):
-        assert values.atPose2(index).equals(gtsam.Pose2(x, y, yaw), 1e-12)
-    keys, information = [], []
-    for k, relative in enumerate([(1.0, 0.0, 0.5 * np.pi), (2.0, 0.0, 0.5 * np.pi), (0.5, 1.5, -3.0)]):
-        factor = graph.at(k)
-        keys.append(tuple(factor.keys()))
-        assert factor.measured().equals(gtsam.Pose2(*relative), 1e-12)
-        information.append(factor.noiseModel().information())
-    assert keys == [(0, 1), (1, 2), (0, 2)]
-    np.testing.assert_allclose(information, [np.diag(d) for d in ((100, 25, 4), (100, 25, 16), (4, 4, 100))], rtol=1e-9)
-
-
-def test_the_edges_of_a_trajectory_are_its_odometry_and_loops(tmp_path: Path) -> None:
-    core = OnlineTrajectory(small_optimizer(trained=True), small_pair_head(), 64)
-    relative, log_std, motion, codes = (values[0].double() for values in trajectory_inputs(1, 80))
-    odometry = se2.r2g(relative).numpy()
-    for k in range(80):
-        place, feature = codes[k].float().numpy(), motion[k].float().numpy()
-        covariance = np.diag(np.exp(2.0 * log_std[k].numpy()))
-        core.update(RelativeStep(k + 1, k, relative[k].numpy(), covariance, 0, odometry[k], feature, place))
-    trajectory = core.trajectory()
-    assert trajectory is not None and len(trajectory.loops) > 0
-    steps, loops = edges_of(trajectory)
-    np.testing.assert_allclose(steps.relative_xyyaw, relative.numpy(), atol=1e-6)
-    np.testing.assert_allclose(steps.std, np.exp(log_std.numpy()), rtol=1e-5)
-    assert (loops.frames[:, 0] < loops.frames[:, 1]).all() and len(loops.frames) == len(trajectory.loop_weights)
-    write_trajectory(tmp_path / "path.g2o", trajectory.stamps_ns, trajectory.poses_xyyaw, [steps, loops])
-    graph, values = gtsam.readG2o(str(tmp_path / "path.g2o"), False)
-    assert (values.size(), graph.size()) == (81, 80 + len(loops.frames))
-
-
-def test_g2o_without_edges_has_the_poses_alone(tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "path.g2o", STAMPS_NS, POSES)
-    graph, values = gtsam.readG2o(str(tmp_path / "path.g2o"), False)
-    assert (values.size(), graph.size()) == (3, 0)
-
-
-def test_edges_that_make_no_sense_are_errors(tmp_path: Path) -> None:
-    far = PoseEdges(np.array([[0, 3]]), np.zeros((1, 3)), np.ones((1, 3)))
-    with pytest.raises(ValueError, match="frames 0 to 3; expected 0 to 2"):
-        write_trajectory(tmp_path / "path.g2o", STAMPS_NS, POSES, [far])
-    assert not list(tmp_path.iterdir())
-    with pytest.raises(ValueError, match="not positive"):
-        PoseEdges(np.array([[0, 1]]), np.zeros((1, 3)), np.zeros((1, 3)))
-    with pytest.raises(ValueError, match=r"expected \(n, 2\)"):
-        PoseEdges(np.array([0, 1]), np.zeros((2, 3)), np.ones((2, 3)))
 
 
 def test_tum_is_read_back_exactly(tmp_path: Path) -> None:
@@ -162,7 +95,7 @@ def test_what_is_no_text_or_no_file_is_an_error(tmp_path: Path) -> None:
 
 
 def test_other_endings_and_empty_trajectories_are_errors(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"path\.csv'; allowed: a name that ends in \.tum, \.txt, \.kitti or \.g2o"):
+    with pytest.raises(ValueError, match=r"path\.csv'; allowed: a name that ends in \.tum, \.txt or \.kitti"):
         write_trajectory(tmp_path / "path.csv", STAMPS_NS, POSES)
     with pytest.raises(ValueError, match="empty"):
         write_trajectory(tmp_path / "path.tum", STAMPS_NS[:0], POSES[:0])
@@ -178,7 +111,7 @@ def test_other_endings_and_empty_trajectories_are_errors(tmp_path: Path) -> None
 def test_a_failed_write_leaves_the_old_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, failing: str
 ) -> None:
-    write_trajectory(tmp_path / f"path{ending}", STAMPS_NS, POSES, edges_of(TRAJECTORY))
+    write_trajectory(tmp_path / f"path{ending}", STAMPS_NS, POSES)
     before = {path: path.read_text() for path in tmp_path.iterdir()}
 
     def fail(*_: object) -> None:

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ngo_estimator.trajectory.g2o import UNSTAMPED, PlanarGraph, g2o_lines, read_g2o, write_g2o
+from ngo_estimator.slam.trajectory_update import Trajectory
+from ngo_estimator.trajectory.g2o import UNSTAMPED, PlanarGraph, g2o_lines, graph_of_frames, read_g2o, write_g2o
 
 SQUARE = (
     "VERTEX_SE2 0 0 0 0\n"
@@ -135,3 +136,27 @@ def test_what_is_no_graph_is_one_clear_error(tmp_path: Path) -> None:
 def _square(folder: Path) -> PlanarGraph:
     (path := folder / "square.g2o").write_text(SQUARE)
     return read_g2o(path)
+
+
+def test_a_trajectory_becomes_its_odometry_and_its_loops(tmp_path: Path) -> None:
+    odometry = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5 * np.pi], [1.0, 2.0, np.pi]])
+    poses = np.array([[0.0, 0.0, 0.0], [1.25, -0.5, 0.5 * np.pi], [1.5, 2.0, -3.0]])
+    trajectory = Trajectory(
+        np.array([0, 1_700_000_000_057_142_857, 1_700_000_000_114_285_714]), poses, odometry, poses, np.zeros(3),
+        np.array([[0.1, 0.2, 0.5], [0.1, 0.2, 0.25]]), np.array([[0, 2]]), np.array([0.75]),
+        np.array([[0.5, 1.5, -3.0]]), np.array([[0.5, 0.5, 0.1]]),
+    )  # fmt: skip
+    write_g2o(path := tmp_path / "path.g2o", graph_of_frames(trajectory))
+    assert "# stamp 1700000000.057142857" in path.read_text() and path.read_text().endswith("# loop 0.75\n")
+    graph, values = gtsam.readG2o(str(path), False)
+    assert values.size() == len(poses) and graph.size() == 3
+    for index, (x, y, yaw) in enumerate(poses):
+        assert values.atPose2(index).equals(gtsam.Pose2(x, y, yaw), 1e-12)
+    keys, information = [], []
+    for k, relative in enumerate([(1.0, 0.0, 0.5 * np.pi), (2.0, 0.0, 0.5 * np.pi), (0.5, 1.5, -3.0)]):
+        factor = graph.at(k)
+        keys.append(tuple(factor.keys()))
+        assert factor.measured().equals(gtsam.Pose2(*relative), 1e-12)
+        information.append(factor.noiseModel().information())
+    assert keys == [(0, 1), (1, 2), (0, 2)]
+    np.testing.assert_allclose(information, [np.diag(d) for d in ((100, 25, 4), (100, 25, 16), (4, 4, 100))], rtol=1e-9)

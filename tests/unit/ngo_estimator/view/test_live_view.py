@@ -106,7 +106,7 @@ def test_a_scan_is_drawn_at_the_corrected_pose(notes: Notes) -> None:
 
 def test_the_loops_are_counted(notes: Notes) -> None:
     view = LiveView(notes)
-    view.show_loops(np.zeros((3, 2, 2)), np.ones(3))
+    view.show_loops(np.zeros((3, 2, 2)), np.ones((3, 4)))
     drive(view, 3)
     assert "3 loops" in notes.last["text"][0]
 

@@ -22,8 +22,8 @@ def test_everything_is_drawn_and_the_page_is_served(capfd: pytest.CaptureFixture
     view.look_at(Window(1.0, 2.0, 5.0))
     for name in ("truth", "odometry", "corrected"):
         view.path(name, np.zeros((4, 2)))
-    view.loops(np.zeros((2, 2, 2)), np.array([0.0, 1.0]))
-    view.loops(np.zeros((0, 2, 2)), np.zeros(0))
+    view.loops(np.zeros((2, 2, 2)), np.array(((0.1, 0.5, 0.9, 0.0), (0.9, 0.1, 0.1, 1.0))))
+    view.loops(np.zeros((0, 2, 2)), np.zeros((0, 4)))
     view.robot(np.array([1.0, 2.0, 0.5]), np.zeros((8, 2)), 0.3)
     view.scan(np.zeros((7, 2)))
     view.grid(np.full((3, 5), -1, np.int8), 0.05, np.array([-1.0, -2.0, 0.1]))

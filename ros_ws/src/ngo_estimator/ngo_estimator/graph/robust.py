@@ -64,7 +64,8 @@ class Robust:
         """
         loops = len(problem.loops)
         if loops == 0:
-            return CorrectedGraph(problem, problem.poses, np.zeros(0), np.ones(len(problem.steps)), 0.0)
+            chain = chain_poses(problem.steps.relative, problem.poses[0])
+            return CorrectedGraph(problem, chain, np.zeros(0), np.ones(len(problem.steps)), 0.0)
         if start is None or len(start.loop_weights) == 0:
             return _from_nothing(problem, self._told)
         warm = _warm(problem, start, self._told)

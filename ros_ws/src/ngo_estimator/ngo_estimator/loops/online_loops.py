@@ -6,6 +6,7 @@ made once and kept.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +86,8 @@ class OnlineLoops:
         self._embeddings = SlidingRows((pair_head.config.embedding_size,), np.float32, keep)
         self._kept = PlaceLoops.none()
         self._candidates: _Candidates | None = None
+        # Pairs of nodes that stay apart: shared walls are looked for again in the newest blocks.
+        self._dropped = np.zeros((0, 2), np.int64)
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -282,6 +285,7 @@ class OnlineLoops:
                 (embeddings[0] * embeddings[1]).sum(-1).double().numpy(),
                 overlap=True,
             )[registered.numpy()]
+            found = found[~(found.pairs[:, None] == self._dropped).all(2).any(1)]
         self._kept = self._kept.extended(found)
         return found
 
@@ -362,6 +366,13 @@ class OnlineLoops:
         self._codes.slice(first)[:] = 0.0
         self._embeddings.slice(first)[:] = 0.0
         self._kept = self._kept[self._kept.end * self._block <= first]
+
+    def drop(self, which: Callable[[np.ndarray], np.ndarray]) -> int:
+        """Forget the loops that ``which`` chooses by the frames that they join ``(n, 2)``; returns how many."""
+        chosen = which(self.edges(np.arange(len(self._kept)))[0])
+        self._dropped = np.concatenate((self._dropped, self._kept.pairs[chosen]))
+        self._kept = self._kept[~chosen]
+        return int(chosen.sum())
 
     def edges(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""

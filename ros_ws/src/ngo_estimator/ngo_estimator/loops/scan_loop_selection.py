@@ -1,6 +1,7 @@
 """Which loops the graph of key scans uses: of those that are accepted, the ones it may believe and needs."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -31,6 +32,16 @@ class ScanLoopSelection:
     def rows(self) -> np.ndarray:
         """The loops that the graph needs ``(n,)``."""
         return self._used.values
+
+    def drop(self, which: Callable[[np.ndarray], np.ndarray]) -> int:
+        """Take out for good the loops that ``which`` chooses among rows ``(n,)``; returns how many were used."""
+        used = self.rows.copy()
+        kept = used[~which(used)]
+        self._used = GrowingRows((), np.int64)
+        for row in kept:
+            self._used.append(row)
+        self.doubted = self.doubted[~which(self.doubted)]
+        return len(used) - len(kept)
 
     def believed(self, fresh: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> np.ndarray:
         """Those of the newly accepted loops that the graph may use, and of others that have waited.

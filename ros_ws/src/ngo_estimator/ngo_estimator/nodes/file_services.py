@@ -3,16 +3,18 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from ngo_msgs.srv import LoadState, SaveState, SaveTrajectory
+from ngo_msgs.srv import LoadState, SaveGraph, SaveState, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
-from ngo_estimator.trajectory.files import edges_of, write_trajectory
+from ngo_estimator.trajectory.files import ENDINGS, tum_lines, write_lines, write_trajectory
+from ngo_estimator.trajectory.g2o import GRAPH_ENDING, g2o_lines, write_g2o
 from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from ngo_estimator.slam.map_localisation import MapLocalisation
     from ngo_estimator.slam.session import Session
     from ngo_estimator.slam.trajectory_update import Trajectory
+    from ngo_estimator.trajectory.g2o import PlanarGraph
 
     Loaded = tuple[Session, MapLocalisation | Joining | None]
 
@@ -27,7 +30,7 @@ Result = TypeVar("Result")
 
 
 class FileServices:
-    """Answers ``~/save_trajectory``, ``~/save_state`` and ``~/load_state``.
+    """Answers ``~/save_trajectory``, ``~/save_graph``, ``~/save_state`` and ``~/load_state``.
 
     Files are written and read in a thread, while relative poses go on.
     """
@@ -38,22 +41,24 @@ class FileServices:
         folder: str,
         localises: bool,
         trajectory: "Callable[[], Trajectory | None]",
+        graph: "Callable[[], PlanarGraph | None]",
         session: "Callable[[], Session]",
         take: "Callable[[Loaded], None]",
     ) -> None:
-        """Save ``trajectory()`` and ``session()``, and hand a loaded session to ``take``; paths lie in ``folder``.
+        """Save ``trajectory()``, ``graph()`` and ``session()``, and hand a loaded session to ``take``.
 
-        With a session comes the search for the robot in its map: if the node ``localises``, or the session goes on from
-        another start.
+        Paths lie in ``folder``. With a session comes the search for the robot in its map: if the node ``localises``, or
+        the session goes on from another start.
         """
         self._node, self._folder, self._localises = node, Path(folder), localises
-        self._trajectory, self._session, self._take = trajectory, session, take
+        self._trajectory, self._graph, self._session, self._take = trajectory, graph, session, take
 
     def open(self, qos: QoSProfile, built: ExitStack) -> None:
         """Offer the services, until ``built`` is closed."""
         self._thread = built.enter_context(ThreadPoolExecutor(1))
         for kind, name, callback in (
             (SaveTrajectory, "~/save_trajectory", self._on_save_trajectory),
+            (SaveGraph, "~/save_graph", self._on_save_graph),
             (SaveState, "~/save_state", self._on_save_state),
             (LoadState, "~/load_state", self._on_load_state),
         ):
@@ -77,7 +82,14 @@ class FileServices:
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
         trajectory, folder = self._trajectory(), self._folder
-        response.success, response.message = await self._aside(lambda: _written(request.path, folder, trajectory))
+        graph = self._graph() if request.path.endswith(GRAPH_ENDING) else None
+        write = partial(_write, trajectory=trajectory, graph=graph)
+        response.success, response.message = await self._aside(lambda: _written(request.path, folder, write))
+        return response
+
+    async def _on_save_graph(self, request: SaveGraph.Request, response: SaveGraph.Response) -> SaveGraph.Response:
+        write = partial(_write_graph, trajectory=self._trajectory(), graph=self._graph())
+        response.success, response.message = await self._aside(lambda: _written(request.path, self._folder, write))
         return response
 
     async def _on_save_state(self, request: SaveState.Request, response: SaveState.Response) -> SaveState.Response:
@@ -128,14 +140,34 @@ def _relocalises(mode: int) -> bool:
     return bool(mode == modes.RELOCALISE)
 
 
-def _written(name: str, folder: Path, trajectory: "Trajectory | None") -> tuple[bool, str]:
+def _written(name: str, folder: Path, write: Callable[[Path], str]) -> tuple[bool, str]:
     """Write a file in the folder; returns whether it succeeded, and a message for the user."""
     try:
-        path = path_inside(folder, name)
-        if trajectory is None:
-            raise ValueError("the trajectory is empty; nothing was written")
-        edges = edges_of(trajectory) if path.suffix == ".g2o" else ()
-        write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw, edges)
+        return True, write(path_inside(folder, name))
     except Exception as error:  # the caller of the service gets an answer in any case
         return False, " ".join(str(error).split()) or repr(error)
-    return True, f"wrote {len(trajectory.stamps_ns)} poses to {path}"
+
+
+def _write(path: Path, trajectory: "Trajectory | None", graph: "PlanarGraph | None") -> str:
+    """Write the trajectory, or where the ending says so its graph; returns what was written."""
+    if trajectory is None:
+        raise ValueError("the trajectory is empty; nothing was written")
+    if path.suffix not in (*ENDINGS, GRAPH_ENDING):
+        raise ValueError(f"file is '{path}'; allowed: a name that ends in {', '.join(ENDINGS)} or {GRAPH_ENDING}")
+    if graph is not None:
+        write_g2o(path, graph)
+        return f"wrote {len(graph.ids)} poses to {path}"
+    write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw)
+    return f"wrote {len(trajectory.stamps_ns)} poses to {path}"
+
+
+def _write_graph(path: Path, trajectory: "Trajectory | None", graph: "PlanarGraph | None") -> str:
+    """Write the graph, and the trajectory beside it; returns what was written."""
+    if trajectory is None or graph is None:
+        raise ValueError("the trajectory is empty; nothing was written")
+    if path.suffix != GRAPH_ENDING:
+        raise ValueError(f"path is '{path}'; expected a name that ends in {GRAPH_ENDING}")
+    beside = path.with_suffix(".tum")
+    write_lines({path: g2o_lines(graph), beside: tum_lines(trajectory.stamps_ns, trajectory.poses_xyyaw)})
+    loops, poses = int(graph.is_loop.sum()), len(trajectory.stamps_ns)
+    return f"wrote {len(graph.ids)} vertices and {loops} loops to {path}, and {poses} poses to {beside}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
-from ngo_msgs.srv import Reset
+from ngo_msgs.srv import RemoveLoop, Reset
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
@@ -23,6 +23,7 @@ from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.code_memory import release_code
 from ngo_estimator.nodes.file_services import FileServices
 from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.managed_node import ManagedNode
 from ngo_estimator.nodes.pose_publisher import PosePublisher
 from ngo_estimator.nodes.pose_search import PoseSearch
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from ngo_estimator.slam.session import Session
     from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
     from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
+    from ngo_estimator.trajectory.g2o import PlanarGraph
 
 NAME = "ngo_node"
 _DEPTH = 100
@@ -104,6 +106,7 @@ class NgoNode(ManagedNode):
             settings.save_directory,
             settings.mode == "localization",
             self._trajectory,
+            self._graph,
             self._session,
             self._take,
         )
@@ -113,7 +116,11 @@ class NgoNode(ManagedNode):
             except ValueError as error:
                 raise StartError(f"state: {error}") from error
         files.open(_SERVICES, built)
-        for kind, name, callback in ((Reset, "~/reset", self._on_reset), (SetBool, "~/pause", self._on_pause)):
+        for kind, name, callback in (
+            (Reset, "~/reset", self._on_reset),
+            (SetBool, "~/pause", self._on_pause),
+            (RemoveLoop, "~/remove_loop", self._on_remove_loop),
+        ):
             service = self.create_service(kind, name, callback, qos_profile=_SERVICES)
             built.callback(self.destroy_service, service)
 
@@ -309,6 +316,26 @@ class NgoNode(ManagedNode):
         trajectory = self._core.trajectory()
         return trajectory and replace(trajectory, poses_xyyaw=self._origin.poses(trajectory.poses_xyyaw))
 
+    def _graph(self) -> "PlanarGraph | None":
+        """The graph, with its poses in map."""
+        graph = self._core.planar_graph()
+        return graph and replace(graph, poses=self._origin.poses(graph.poses))
+
+    def _on_remove_loop(self, request: RemoveLoop.Request, response: RemoveLoop.Response) -> RemoveLoop.Response:
+        try:
+            if self._search is not None:
+                raise ValueError("the robot is looked for in the map, which stays as it is; no loop was taken out")
+            response.message = remove_loops(self._core, request)
+            response.success = True
+        except ValueError as error:
+            response.message = str(error)
+            return response
+        self.get_logger().info(f"as it was told: {response.message}")
+        self._on_correction(self._core.newest())
+        if self._inputs:
+            self._pending.reset()
+        return response
+
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         try:
             given = messages.planar_estimate(message, self._settings.framed(self._settings.map_frame))
@@ -395,7 +422,7 @@ class NgoNode(ManagedNode):
         if self._latest is None:
             return values
         map_from_odom = self._origin.poses(self._latest.map_from_odom_xyyaw)
-        return values | self._report.details(self._latest, map_from_odom, self._covariance)
+        return values | self._report.details(self._latest, self._core.loop_report(), map_from_odom, self._covariance)
 
     def _problems(self) -> list[str]:
         found = [line for entry in self._inputs for line in entry.problems()]

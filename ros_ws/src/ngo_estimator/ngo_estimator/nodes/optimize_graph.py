@@ -24,10 +24,9 @@ from ngo_common.files import write_together
 from ngo_estimator.graph.corrector import CorrectedGraph
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.trajectory.chained_graph import BELIEVED, ChainedGraph, chained
-from ngo_estimator.trajectory.g2o import PlanarGraph, read_g2o, write_g2o
+from ngo_estimator.trajectory.g2o import GRAPH_ENDING, PlanarGraph, read_g2o, write_g2o
 
 NAME = "optimize_graph"
-_ENDING = ".g2o"
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,8 @@ class Arguments:
 
     def check(self) -> None:
         """Raise ``ValueError`` for a place where nothing is to be written."""
-        if self.out.suffix != _ENDING:
-            raise ValueError(f"--out is '{self.out}'; expected a name that ends in {_ENDING}")
+        if self.out.suffix != GRAPH_ENDING:
+            raise ValueError(f"--out is '{self.out}'; expected a name that ends in {GRAPH_ENDING}")
         if not self.out.parent.is_dir():
             raise ValueError(f"--out is '{self.out}', whose folder is not there")
         there = [path for path in self.files if path.exists()]
@@ -56,7 +55,7 @@ class Arguments:
     @property
     def files(self) -> list[Path]:
         """The files that are written."""
-        endings = (_ENDING, ".json", *((".png",) if self.picture else ()))
+        endings = (GRAPH_ENDING, ".json", *((".png",) if self.picture else ()))
         return [self.out.with_suffix(ending) for ending in endings]
 
 

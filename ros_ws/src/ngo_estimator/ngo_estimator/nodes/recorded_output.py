@@ -18,6 +18,7 @@ from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.errors import aligned, associate
 from ngo_estimator.trajectory.files import SpatialPoses, write_trajectory
+from ngo_estimator.trajectory.g2o import write_g2o
 from ngo_estimator.trajectory.plot import save_plot
 from ngo_estimator.trajectory.report import Report, ReportSettings, trajectory_report
 from ngo_recordings.writer import RecordingWriter
@@ -31,6 +32,7 @@ _FILES = (
     "online.tum",
     "corrected.tum",
     "truth.tum",
+    "graph.g2o",
     "trajectories.mcap",
     "map.pgm",
     "map.yaml",
@@ -53,8 +55,9 @@ class RecordedOutput:
 
     ``trajectories.mcap`` grows with every step; the other files are written when the trajectory is whole:
     ``odometry.tum``, ``online.tum`` (each pose as it was when its frame was the newest), ``corrected.tum``,
-    ``plot.png``, with a ``source`` of ranges ``map.pgm`` and ``map.yaml``, and, where the truth is known, ``truth.tum``
-    and ``metrics.json``. All stamps are those of the frames, so that the same recording gives the same bytes.
+    ``graph.g2o``, ``plot.png``, with a ``source`` of ranges ``map.pgm`` and ``map.yaml``, and, where the truth is
+    known, ``truth.tum`` and ``metrics.json``. All stamps are those of the frames, so that the same recording gives the
+    same bytes.
     """
 
     def __init__(
@@ -114,6 +117,7 @@ class RecordedOutput:
         }
         for name, poses in estimates.items():
             write_trajectory(self.folder / f"{name}.tum", stamps_ns, poses)
+        write_g2o(self.folder / "graph.g2o", run.graph)
         self._write_path(PATHS["odometry"], self._frames["odom"], stamps_ns, estimates["odometry"])
         self._write_path(PATHS["corrected"], self._frames["map"], stamps_ns, estimates["corrected"])
         in_map = None

@@ -6,8 +6,9 @@
 
 RECORDINGS are .mcap files, rosbag2 folders, ROS 1 bags or CARMEN logs, several as one. Laser scans need no --world. OUT
 gets odometry.tum, online.tum (each corrected pose as it was when its frame was the newest), corrected.tum,
-trajectories.mcap (odometry, poses, transforms and paths), map.pgm and map.yaml (for Nav2), plot.png and run.json; where
-the recording holds the truth, also truth.tum and metrics.json. The same recording gives the same bytes.
+trajectories.mcap (odometry, poses, transforms and paths), graph.g2o (its loops are marked; optimize_graph reads it),
+map.pgm and map.yaml (for Nav2), plot.png and run.json; where the recording holds the truth, also truth.tum and
+metrics.json. The same recording gives the same bytes.
 """
 
 import gc

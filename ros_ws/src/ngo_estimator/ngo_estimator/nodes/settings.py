@@ -166,8 +166,7 @@ class NgoNodeSettings(EstimatorSettings):
     )
     save_directory: str = setting(
         "",
-        "Folder in which ~/save_trajectory and ~/save_state may write, and ~/load_state may read; empty: the working "
-        "directory of the node.",
+        "Folder in which services may write, and ~/load_state may read; empty: the working directory of the node.",
     )
     state: str = setting("", "Folder of a saved state to go on from, relative to save_directory; empty: none.")
     state_mode: str = setting(

@@ -7,6 +7,7 @@ import numpy as np
 from ngo_estimator.geometry.planar_covariance import position_std
 
 if TYPE_CHECKING:
+    from ngo_estimator.slam.loop_report import LoopReport
     from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 
 
@@ -38,13 +39,17 @@ class TrajectoryReport:
         """Values for diagnostics in any mode."""
         return {"gaps": str(self._gaps), "restarts": str(self._restarts)}
 
-    def details(self, update: "TrajectoryUpdate", map_from_odom: np.ndarray, covariance: np.ndarray) -> dict[str, str]:
+    def details(
+        self, update: "TrajectoryUpdate", loops: "LoopReport", map_from_odom: np.ndarray, covariance: np.ndarray
+    ) -> dict[str, str]:
         """Values for diagnostics: map_from_odom ``(3,)`` and the newest pose's covariance ``(3, 3)`` in map."""
         x, y, yaw = map_from_odom.tolist()
         return {
             "frames": str(update.frames),
             "window fill": f"{update.window_fill:.3f}",
             "loops": str(update.closed_loops),
+            "loops believed, doubted, refused": f"{loops.believed}, {loops.doubted}, {loops.refused}",
+            "newest loop that is refused": loops.newest_refused or "none",
             "last correction, largest move (m)": f"{self._last_correction_m:.3f}",
             "standard deviation of the position (m)": f"{position_std(covariance):.3g}",
             "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",

@@ -126,8 +126,8 @@ class ViewNode(Node):
 
     def _show_loops(self, message: MarkerArray) -> None:
         points = [[point.x, point.y] for marker in message.markers for point in marker.points]
-        opacity = [color.a for marker in message.markers for color in marker.colors]
-        self._view.show_loops(np.array(points).reshape(-1, 2, 2), np.array(opacity)[::2])
+        colors = [[color.r, color.g, color.b, color.a] for marker in message.markers for color in marker.colors]
+        self._view.show_loops(np.array(points).reshape(-1, 2, 2), np.array(colors).reshape(-1, 4)[::2])
 
     def _show_map(self, message: OccupancyGrid) -> None:
         info = message.info

@@ -138,7 +138,8 @@ class LidarRun:
         if self._online.finish() is None:
             self._note_fault()
         trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
+        graph = self._online.planar_graph()
         self._online.reset()
-        if trajectory is not None:
+        if trajectory is not None and graph is not None:
             true, residual = (truth or Truth()).poses()
-            yield RecordedRun(trajectory, true, residual, walls)
+            yield RecordedRun(trajectory, graph, true, residual, walls)

@@ -8,6 +8,7 @@ import numpy as np
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.files import SpatialPoses
+from ngo_estimator.trajectory.g2o import PlanarGraph
 from ngo_recordings.frames import Frame
 
 
@@ -28,6 +29,7 @@ class RecordedRun:
     """
 
     trajectory: Trajectory
+    graph: PlanarGraph
     truth: SpatialPoses | None
     truth_residual: np.ndarray
     walls: np.ndarray | None = None

@@ -160,8 +160,8 @@ class RecordingRun:
         """The last steps of the trajectory that ends here, and the whole of it, if there is one."""
         yield from self._steps()
         self._online.finish()
-        trajectory = self._online.trajectory()
+        trajectory, graph = self._online.trajectory(), self._online.planar_graph()
         self._local.reset()
         self._online.reset()
-        if trajectory is not None:
-            yield RecordedRun(trajectory, *truth.poses())
+        if trajectory is not None and graph is not None:
+            yield RecordedRun(trajectory, graph, *truth.poses())

@@ -11,11 +11,13 @@ from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, attributes_of, require, with_attributes
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.slam.bridge import bridged
+from ngo_estimator.slam.loop_report import LoopReport, loop_report
 from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.pose_graph import PoseGraph
 from ngo_estimator.slam.step_log import StepLog, TakenStep
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
+from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of_frames
 
 AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
 
@@ -233,6 +235,38 @@ class CorrectedTrajectory(ABC):
             self._optimized = True
         self._fault = self._graph.fault or self._fault
         return self._result(restarted=False, gap=False) if self._optimized else None
+
+    def remove_loops(self, first: int, second: int, stretch: bool = False) -> int:
+        """Take the loop between two frames out for good, or all that end in a stretch; returns how many there were.
+
+        All poses are optimised without them; ``newest`` tells what that gave.
+
+        Args:
+            first, second: the frames; with ``stretch`` the first and the last one of the stretch.
+        """
+        low, high = min(first, second), max(first, second)
+
+        def which(frames: np.ndarray) -> np.ndarray:
+            within = ((frames >= low) & (frames <= high)).any(axis=1)
+            exact = (np.sort(frames, axis=1) == (low, high)).all(axis=1)
+            return np.asarray(within if stretch else exact)
+
+        self._begin_result()
+        removed = self._graph.remove_loops(which)
+        self._optimized |= removed > 0 and not self._graph.fault
+        self._fault = self._graph.fault or self._fault
+        return removed
+
+    def planar_graph(self) -> PlanarGraph | None:
+        """The graph as it is now, with the belief in its loops, or None before the first step."""
+        trajectory = self.trajectory()
+        return None if trajectory is None else graph_of_frames(trajectory)
+
+    def loop_report(self) -> LoopReport:
+        """What the last optimisation thinks of the loops."""
+        graph, closed = self._graph, self._graph.closed
+        seen = closed.pairs, closed.relative, closed.weight, graph.waiting_loops
+        return loop_report(*seen, self._log.stamps_ns.values, graph.frame_poses())
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""

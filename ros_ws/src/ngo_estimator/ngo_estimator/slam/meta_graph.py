@@ -25,7 +25,7 @@ from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_varian
 from ngo_estimator.slam.block_intake import BlockIntake
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
-from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, require_sound
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
 from ngo_estimator.slam.step_log import StepLog
 
 _SHRUNK = 1e-5
@@ -243,6 +243,17 @@ class MetaGraph(PoseGraph):
         shrunk = shrunk_corrections(solution, odometry, summed_variances(blind, active), joined, ties[1])
         self._shrunk = bool(np.abs(shrunk - solution).max() > _SHRUNK)
         return shrunk
+
+    def _drop_loops(self, which: WhichLoops) -> int:
+        removed = 0 if self._loops is None else self._loops.drop(which)
+        if removed:
+            self._annealed, self._corrections = 0, NetworkCorrections.none()
+        return removed
+
+    @torch.inference_mode()
+    def remove_loops(self, which: WhichLoops) -> int:
+        """See ``PoseGraph.remove_loops``."""
+        return super().remove_loops(which)
 
     def places(self) -> PlaceMap:
         """The frames whose place codes are kept; raises ``ValueError`` where none are."""

@@ -14,6 +14,9 @@ from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.loops.loop_record import LoopRecord, rows
 from ngo_estimator.slam.trajectory_update import fault_of
 
+WhichLoops = Callable[[np.ndarray], np.ndarray]
+"""Chooses ``(n,)`` among loops, by the frames that they join ``(n, 2)``."""
+
 
 @dataclass(frozen=True)
 class ClosedLoops(LoopRecord):
@@ -88,6 +91,23 @@ class PoseGraph(ABC):
         """Optimise what is left when no more frames come; returns whether there was anything, and it worked."""
         self.fault = ""
         return False
+
+    def remove_loops(self, which: WhichLoops) -> int:
+        """Take loops out for good, and optimise without them; returns how many there were."""
+        self.fault = ""
+        removed = self._drop_loops(which)
+        if removed:
+            self._guarded("an optimisation", self._optimise)
+        return removed
+
+    @abstractmethod
+    def _drop_loops(self, which: WhichLoops) -> int:
+        """Forget the loops that ``which`` chooses; the next optimisation begins without what it knew of loops."""
+
+    @property
+    def waiting_loops(self) -> int:
+        """Loops that were found and that no optimisation has seen."""
+        return 0
 
     @property
     @abstractmethod

@@ -19,7 +19,7 @@ from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.map_origin import MapOrigin
-from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, require_sound
+from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
 from ngo_estimator.slam.scan_matcher import ScanMatcher
 
 _KEYS_PER_OPTIMISED = 20
@@ -51,6 +51,11 @@ class ScanGraph(PoseGraph):
     def keys(self) -> int:
         """Key scans so far."""
         return len(self._nodes)
+
+    @property
+    def key_frames(self) -> np.ndarray:
+        """The frames that are nodes ``(keys,)``."""
+        return self._nodes.frames.nodes
 
     def begin_at(self, step: RelativeStep) -> None:
         """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""
@@ -124,6 +129,22 @@ class ScanGraph(PoseGraph):
         loops = self.used_loops
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self._nodes.steps, measured
+
+    def _drop_loops(self, which: WhichLoops) -> int:
+        frames, found = self._nodes.frames.nodes, self._finder.loops
+        removed = self._selection.drop(lambda rows: which(frames[found.pairs[rows]]))
+        if removed:
+            self.closed, self._loops_from_nothing = ClosedLoops.none(), 0
+        return removed
+
+    @property
+    def waiting_loops(self) -> int:
+        """Loops that wait for an optimisation, or for others that agree."""
+        return len(self._selection) - len(self.closed) + len(self._selection.doubted)
+
+    def belief(self) -> np.ndarray:
+        """Of the last optimisation in each of ``measurements``' loops ``(n,)``; NaN in those that came since."""
+        return np.concatenate((self.closed.weight, np.full(len(self._selection) - len(self.closed), np.nan)))
 
     def _optimise(self) -> None:
         self._waiting = 0

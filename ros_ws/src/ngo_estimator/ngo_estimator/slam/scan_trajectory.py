@@ -16,6 +16,7 @@ from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_graph import ScanGraph
 from ngo_estimator.slam.step_log import TakenStep
+from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of
 
 
 class ScanTrajectory(CorrectedTrajectory):
@@ -46,6 +47,14 @@ class ScanTrajectory(CorrectedTrajectory):
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
         return self._graph.walls(most)
+
+    def planar_graph(self) -> PlanarGraph | None:
+        """The graph of key scans as it is now; see ``CorrectedTrajectory.planar_graph``."""
+        if self._log.steps == 0:
+            return None
+        graph, poses = self._graph, self._graph.frame_poses()
+        frames = graph.key_frames
+        return graph_of(self._log.stamps_ns.values[frames], poses[frames], *graph.measurements(), graph.belief())
 
     @property
     def identity(self) -> dict[str, Any]:

@@ -1,55 +1,32 @@
-"""Trajectories as text files that evo, GTSAM and others read: TUM, KITTI and g2o.
+"""Trajectories as text files that evo and others read: TUM and KITTI.
 
 | Ending | What a file holds |
 |---|---|
 | ``.tum``, ``.txt`` | a pose a line, ``timestamp tx ty tz qx qy qz qw`` (s, m) |
 | ``.kitti`` | a pose a line, the upper 3 x 4 of its matrix, row by row |
-| ``.g2o`` | ``VERTEX_SE2`` for each pose, ``EDGE_SE2`` for each measurement between two of them |
 
 The KITTI format has no place for stamps: they lie beside it in ``NAME.times.txt``, a line each, in seconds. Its poses
 are those of the robot's base (x forward, y left), as in the other formats; KITTI's own are of a camera.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ngo_common.files import read_file, write_together
 from ngo_estimator.trajectory.save_path import check_replaceable
 
-ENDINGS = (".tum", ".txt", ".kitti", ".g2o")
+ENDINGS = (".tum", ".txt", ".kitti")
 TUM_ENDINGS = (".tum", ".txt")
 
 _NS = 1_000_000_000
 _LONGEST_QUATERNION = 1e100  # the square of a longer one may overflow
 _END_OF_TIME_S = (2**63 - 1) // _NS  # nanoseconds of a later stamp do not fit into 64 bits
 _KITTI, _TIMES = ".kitti", ".times.txt"
-
-
-@dataclass(frozen=True)
-class PoseEdges:
-    """Measurements between the poses of a trajectory.
-
-    ``frames`` ``(edges, 2)`` index its poses; ``relative_xyyaw`` ``(edges, 3)`` is the second one in the frame of the
-    first, ``std`` ``(edges, 3)`` its standard deviations (m, m, rad).
-    """
-
-    frames: np.ndarray
-    relative_xyyaw: np.ndarray
-    std: np.ndarray
-
-    def __post_init__(self) -> None:
-        edges = len(self.frames)
-        given = self.frames.shape, self.relative_xyyaw.shape, self.std.shape
-        if given != ((edges, 2), (edges, 3), (edges, 3)):
-            raise ValueError(f"frames, relative_xyyaw, std are of shapes {given}; expected (n, 2), (n, 3), (n, 3)")
-        if not ((self.std > 0.0) & np.isfinite(self.std)).all():
-            raise ValueError("std has values that are not positive; expected the standard deviation of each edge")
 
 
 @dataclass(frozen=True)
@@ -80,16 +57,13 @@ class SpatialPoses:
         return np.column_stack((self.positions_xyz[:, :2], yaw))
 
 
-def write_trajectory(
-    path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges] = ()
-) -> list[Path]:
+def write_trajectory(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> list[Path]:
     """Write a trajectory in the format that the file's ending says, all at once or not at all.
 
     Args:
         path: a file that ends in one of ``ENDINGS``, in a folder that exists.
         stamps_ns: ``(frames,)`` int64.
         poses_xyyaw: ``(frames, 3)``.
-        edges: what g2o files hold beside the poses.
 
     Returns:
         The files written: ``path``, and for ``.kitti`` the one of the stamps.
@@ -106,10 +80,8 @@ def write_trajectory(
         raise ValueError(f"stamps are {len(stamps_ns)} and poses {len(poses_xyyaw)}; expected as many")
     if path.suffix == _KITTI:
         times = (seconds(stamp) for stamp in stamps_ns.tolist())
-        return _write_lines({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
-    if path.suffix in TUM_ENDINGS:
-        return _write_lines({path: _tum_lines(stamps_ns, poses_xyyaw)})
-    return _write_lines({path: _g2o_lines(poses_xyyaw, edges)})
+        return write_lines({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
+    return write_lines({path: tum_lines(stamps_ns, poses_xyyaw)})
 
 
 def seconds(stamp_ns: int) -> str:
@@ -123,23 +95,6 @@ def write_tum(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Non
     if path.suffix not in TUM_ENDINGS:
         raise ValueError(f"file is '{path}'; allowed: a name that ends in {' or '.join(TUM_ENDINGS)}")
     write_trajectory(path, stamps_ns, poses_xyyaw)
-
-
-def edges_of(trajectory: Any) -> list[PoseEdges]:
-    """The measurements that a ``Trajectory`` of ``OnlineTrajectory`` was made of: steps of the odometry, and loops.
-
-    Steps are as the local network measured them; what an optimizer makes of them (smoothing, adjustments, how far each
-    may bend) is in the poses alone.
-    """
-    import torch  # takes seconds, and the nodes import this module before they check their parameters
-
-    from ngo_estimator.geometry import se2
-
-    odometry = torch.tensor(trajectory.odometry_xyyaw)
-    relative = se2.between(odometry[:-1], odometry[1:]).numpy()
-    frames = np.arange(len(relative))
-    steps = PoseEdges(np.column_stack((frames, frames + 1)), relative, trajectory.odometry_std)
-    return [steps, PoseEdges(trajectory.loops, trajectory.loop_relative_xyyaw, trajectory.loop_std)]
 
 
 def read_tum(path: Path) -> SpatialPoses:
@@ -182,7 +137,8 @@ def read_tum(path: Path) -> SpatialPoses:
     return SpatialPoses(np.array(stamps, np.int64), values[:, :3], quaternions)
 
 
-def _tum_lines(stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Iterator[str]:
+def tum_lines(stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> Iterator[str]:
+    """The lines of a file in the TUM format, of poses ``(n, 3)``."""
     half_yaw = 0.5 * poses_xyyaw[:, 2]
     values = np.column_stack((poses_xyyaw[:, :2], np.sin(half_yaw), np.cos(half_yaw)))
     for stamp, (x, y, qz, qw) in zip(stamps_ns.tolist(), values.tolist(), strict=True):
@@ -195,22 +151,8 @@ def _kitti_lines(poses_xyyaw: np.ndarray) -> Iterator[str]:
         yield f"{cos!r} {-sin!r} 0 {x!r} {sin!r} {cos!r} 0 {y!r} 0 0 1 0"
 
 
-def _g2o_lines(poses_xyyaw: np.ndarray, edges: Sequence[PoseEdges]) -> Iterator[str]:
-    for index, (x, y, yaw) in enumerate(poses_xyyaw.tolist()):
-        yield f"VERTEX_SE2 {index} {x!r} {y!r} {yaw!r}"
-    for part in edges:
-        if part.frames.size and not 0 <= part.frames.min() <= part.frames.max() < len(poses_xyyaw):
-            raise ValueError(
-                f"edges join the frames {part.frames.min()} to {part.frames.max()}; "
-                f"expected 0 to {len(poses_xyyaw) - 1}"
-            )
-        information = part.std**-2.0
-        values = zip(part.frames.tolist(), part.relative_xyyaw.tolist(), information.tolist(), strict=True)
-        for (first, second), (x, y, yaw), (of_x, of_y, of_yaw) in values:
-            yield f"EDGE_SE2 {first} {second} {x!r} {y!r} {yaw!r} {of_x!r} 0 0 {of_y!r} 0 {of_yaw!r}"
-
-
-def _write_lines(contents: Mapping[Path, Iterable[str]]) -> list[Path]:
+def write_lines(contents: Mapping[Path, Iterable[str]]) -> list[Path]:
+    """Write files line by line, all of them or none; raises as ``write_trajectory`` does."""
     for path in contents:
         check_replaceable(path)
     return write_together({path: (f"{line}\n".encode() for line in lines) for path, lines in contents.items()})

@@ -14,9 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_common.files import write_whole
+from ngo_estimator.geometry.se2 import between
 from ngo_estimator.graph.relative_poses import RelativePoses
-from ngo_estimator.trajectory.save_path import check_replaceable
+from ngo_estimator.slam.trajectory_update import Trajectory
+from ngo_estimator.trajectory.files import write_lines
+
+GRAPH_ENDING = ".g2o"
+"""Of the files of this module."""
 
 UNSTAMPED = -1
 """Stamp of a vertex that has none."""
@@ -30,7 +34,6 @@ _UPPER = np.triu_indices(3)
 _EDGE_MARK = re.compile(r"(loop|step)(?: ([01](?:\.\d*)?|\d(?:\.\d*)?e-\d{1,3}))?$")
 _STAMP_MARK = re.compile(r"stamp (\d{1,10}(?:\.\d{1,9})?)$")
 _LEAST_EIGENVALUE = 1e-12  # of an information matrix whose diagonal is one
-_ENDING = ".g2o"
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,19 @@ def graph_of(
     )
 
 
+def graph_of_frames(trajectory: Trajectory) -> PlanarGraph:
+    """The graph of all frames: steps as the odometry measured them, and loops, in whose information the belief counts.
+
+    What an optimizer makes of a step (smoothing, adjustments, how far it may bend) is in the poses alone.
+    """
+    relative = between(trajectory.odometry_xyyaw[:-1], trajectory.odometry_xyyaw[1:])
+    frames = np.arange(len(relative))
+    ends = np.stack((frames, frames + 1), axis=1)
+    steps = RelativePoses.of_deviations(ends, relative, trajectory.odometry_std.astype(np.float64))
+    loops = RelativePoses.of_deviations(trajectory.loops, trajectory.loop_relative_xyyaw, trajectory.loop_std)
+    return graph_of(trajectory.stamps_ns, trajectory.poses_xyyaw, steps, loops, trajectory.loop_weights)
+
+
 def write_g2o(path: Path, graph: PlanarGraph) -> None:
     """Write a graph, all at once or not at all.
 
@@ -85,10 +101,9 @@ def write_g2o(path: Path, graph: PlanarGraph) -> None:
         ValueError: the file does not end in ``.g2o``, or something is at its place that is no regular file.
         OSError: it cannot be written; one that was there before still is.
     """
-    if path.suffix != _ENDING:
-        raise ValueError(f"file is '{path}'; expected a name that ends in {_ENDING}")
-    check_replaceable(path)
-    write_whole(path, (f"{line}\n".encode() for line in g2o_lines(graph)))
+    if path.suffix != GRAPH_ENDING:
+        raise ValueError(f"file is '{path}'; expected a name that ends in {GRAPH_ENDING}")
+    write_lines({path: g2o_lines(graph)})
 
 
 def g2o_lines(graph: PlanarGraph) -> Iterator[str]:

@@ -12,7 +12,7 @@ from ngo_estimator.view.shapes import Window
 TRUTH, ODOMETRY, CORRECTED = (31, 111, 214), (44, 160, 44), (255, 127, 14)
 """Colours of the demo's picture."""
 COLORS = {"truth": TRUTH, "odometry": ODOMETRY, "corrected": CORRECTED}
-_LOOP, _SCAN, _ROBOT = (26, 128, 230), (214, 39, 40), (0, 0, 0)
+_SCAN, _ROBOT = (214, 39, 40), (0, 0, 0)
 _EYE_HEIGHT = 1.95  # times half of the window: the default field of view sees it whole
 _TIMELINE = "time"
 
@@ -61,11 +61,11 @@ class RerunView:
         radius = rr.Radius.ui_points(2.0 if name == "corrected" else 1.3)
         self._stream.log(f"map/{name}", rr.LineStrips3D([_raised(xy, height)], colors=[COLORS[name]], radii=radius))
 
-    def loops(self, lines: np.ndarray, opacity: np.ndarray) -> None:
-        """Lines ``(n, 2, 2)`` between places that are the same, each with its opacity ``(n,)``."""
+    def loops(self, lines: np.ndarray, colors: np.ndarray) -> None:
+        """Lines ``(n, 2, 2)`` between places that are the same, with colors ``(n, 4)``; see ``LiveView.show_loops``."""
         # rerun draws lines opaque: a faint one is a pale one, and lies lower than the stronger ones.
-        share = np.clip(opacity, 0.0, 1.0)[:, None]
-        colors = np.round(255.0 - share * (255.0 - np.array(_LOOP))).astype(np.uint8)
+        share = np.clip(colors[:, 3:], 0.0, 1.0)
+        colors = np.round(255.0 * (1.0 - share * (1.0 - colors[:, :3]))).astype(np.uint8)
         raised = np.concatenate([lines, np.tile(0.01 * share[:, None], (1, 2, 1))], axis=2)
         self._stream.log("map/loops", rr.LineStrips3D(raised, colors=colors, radii=rr.Radius.ui_points(0.7)))
 
