@@ -16,7 +16,7 @@ WORKERS ?= 2
 export PYTHON ROS V
 
 TYPED := ros_ws/src/ngo_common/ngo_common ros_ws/src/ngo_recordings/ngo_recordings ros_ws/src/ngo_sim/ngo_sim \
-	ros_ws/src/ngo_estimator/ngo_estimator tools/ros2_stand_in training demo benchmarks
+	ros_ws/src/ngo_estimator/ngo_estimator ros_ws/src/ngo_explorer/ngo_explorer tools/ros2_stand_in training demo benchmarks
 
 OPEN := . ./env.sh
 

@@ -11,7 +11,7 @@ key="$(
     {
         cat "$VENV/ngo_key"
         find src wheels -type f \( -name package.xml -o -name 'setup.*' -o -name CMakeLists.txt -o -name '*.cmake' \
-            -o -name '*.msg' -o -name '*.srv' \) -print0 | sort -z | xargs -0 sha256sum
+            -o -name '*.msg' -o -name '*.srv' -o -name '*.action' \) -print0 | sort -z | xargs -0 sha256sum
         find src -type f -path '*/resource/*' -o -type f -path '*/launch/*' -o -type f -path '*/config/*' \
             -o -type f -path '*/weights/*' | grep -v __pycache__ | sort
     } | sha256sum

@@ -31,10 +31,12 @@ NODES = {
     "local_node": "ngo_estimator",
     "ngo_node": "ngo_estimator",
     "ngo_map": "ngo_estimator",
+    "explore": "ngo_explorer",
 }
 BEGIN = "<!-- Written by `python -m tests.ros.readme_tables`; a test compares it with the nodes. -->\n"
 END = "<!-- End of the parameters. -->\n"
 HEAD = ("| Parameter | Default | Meaning | Allowed |", "|---|---|---|---|")
+_OF_AN_ACTION = "/_action/"
 _OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
@@ -77,7 +79,7 @@ class NodeFacts:
             )
             by_topic = node.get_publishers_info_by_topic if publishes else node.get_subscriptions_info_by_topic
             for topic, types in by_node(self.name, "/"):
-                if topic in ("/rosout", "/parameter_events"):
+                if topic in ("/rosout", "/parameter_events") or _OF_AN_ACTION in topic:
                     continue
                 (info,) = (info for info in by_topic(topic) if info.node_name == self.name)
                 best_effort = info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
@@ -91,6 +93,7 @@ class NodeFacts:
             (name, types[0])
             for name, types in self._probe.node.get_service_names_and_types_by_node(self.name, "/")
             if not types[0].startswith(("rcl_interfaces/", "type_description_interfaces/"))
+            and _OF_AN_ACTION not in name
         }
 
     def _ask(self, service_type: Any, name: str, request: Any) -> Any:
@@ -109,12 +112,12 @@ def running_nodes() -> Iterator[dict[str, NodeFacts]]:
             facts[name] = NodeFacts(probe, name)
 
         def complete() -> bool:
-            """The mazes listen to the answers of both estimators, the building to those of ngo_node."""
+            """The mazes listen to both estimators, the building and the explorer to ngo_node."""
             for process in processes:
                 assert process.running, process.log
             ready = all("ready: " in process.log for process in processes)
             known = NODES.keys() <= set(probe.node.get_node_names())
-            listeners = {"/odom": 2, "/ngo/pose": 3}
+            listeners = {"/odom": 2, "/ngo/pose": 4}
             heard = all(probe.node.count_subscribers(topic) == count for topic, count in listeners.items())
             return ready and known and heard
 

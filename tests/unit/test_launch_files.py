@@ -8,6 +8,8 @@ import yaml
 
 from ngo_common.settings import Settings
 from ngo_estimator.nodes.settings import LocalNodeSettings, NgoNodeSettings
+from ngo_explorer.nodes.settings import ExploreNodeSettings
+from ngo_explorer.settings import DriveConfig, ExplorerConfig
 from ngo_sim.building_drivers import BuildingDriverConfig
 from ngo_sim.building_node_config import BuildingNodeConfig
 from ngo_sim.floor_plans import FloorPlanConfig
@@ -20,6 +22,7 @@ from tests.unit.launch_stand_in import SRC, FindPackageShare, Launched, PathJoin
 
 LAUNCH = SRC / "ngo_bringup/launch"
 GRAPH, MAZE, SLAM = LAUNCH / "graph.launch.py", LAUNCH / "maze.launch.py", LAUNCH / "slam_launch.py"
+EXPLORE = LAUNCH / "explore.launch.py"
 # The names by which the files were documented first.
 FORWARDED = {GRAPH: SRC / "ngo_estimator/launch/graph.launch.py", MAZE: SRC / "ngo_sim/launch/maze.launch.py"}
 ARGUMENTS = ["world", "parameters", "namespace", "seed", "record", "use_sim_time"]
@@ -40,7 +43,7 @@ def launch_stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_launch_file_is_tested() -> None:
-    assert sorted(SRC.glob("*/launch/*")) == sorted([*FORWARDED, *FORWARDED.values(), SLAM])
+    assert sorted(SRC.glob("*/launch/*")) == sorted([*FORWARDED, *FORWARDED.values(), EXPLORE, SLAM])
 
 
 @pytest.mark.parametrize("path", [*FORWARDED, *FORWARDED.values()], ids=lambda path: f"{path.parts[-3]}-{path.stem}")
@@ -116,6 +119,27 @@ def test_the_shipped_parameters_of_slam_leave_odom_to_the_robot() -> None:
     assert (local.world, local.robot_odometry, ngo.world) == ("scan", "tf", "scan")
     assert local.odom_frame == ngo.odom_frame
     assert ngo.tf_ahead_s >= 0.1, "a scanner of 10 Hz"
+
+
+@pytest.mark.parametrize("world", ["building2d", "maze2d", "none"])
+def test_exploration_starts_the_graph_and_the_explorer(world: str) -> None:
+    plan = {"plan": "/floor.yaml"} if world == "building2d" else {}
+    launched = Launched(EXPLORE, world=world, use_sim_time="true", drive="nav2" if world == "none" else "own", **plan)
+    text, simulator = launched.context.text, [] if world == "none" else [world]
+    assert [text(node.executable) for node in launched.nodes] == [*ESTIMATORS, "explore", *simulator]
+    explorer = launched.nodes[3]
+    assert explorer.parameters["drive"] == ("nav2" if world == "none" else "own") and explorer.parameters["autostart"]
+    (shipped,) = {text(parts) for node in launched.nodes for parts in node.files}
+    values = yaml.safe_load(Path(shipped).read_text())
+    own = values["/**/explore"]["ros__parameters"]
+    for settings_type in (ExploreNodeSettings, ExplorerConfig, DriveConfig):
+        names = {field.name for field in fields(settings_type)}
+        settings_type(**{key: own.pop(key) for key in names & own.keys()})
+    assert own == {}, "no part has these"
+    assert LocalNodeSettings(**values["/**/local_node"]["ros__parameters"]).world == "scan"
+    if simulator:
+        assert launched.nodes[-1].parameters == {"publish_clock": True, **plan}
+        assert values[f"/**/{world}"]["ros__parameters"]["driver"] == "cmd_vel"
 
 
 def test_what_is_not_allowed_is_refused() -> None:

@@ -12,6 +12,7 @@ PACKAGES = {
     "ngo_recordings": ROOT / "ros_ws/src/ngo_recordings/ngo_recordings",
     "ngo_sim": ROOT / "ros_ws/src/ngo_sim/ngo_sim",
     "ngo_estimator": ROOT / "ros_ws/src/ngo_estimator/ngo_estimator",
+    "ngo_explorer": ROOT / "ros_ws/src/ngo_explorer/ngo_explorer",
 }
 OUTSIDE = {name: ROOT / name for name in ("training", "benchmarks", "demo", "tests")}
 # These serve both packages and know of neither; they do not know each other.
@@ -59,6 +60,15 @@ LAYERS = {
         {"checkpoint"},
         {"frontend", "slam", "trajectory", "mapping"},
         {"offline", "view"},
+        {"nodes"},
+    ],
+    "ngo_explorer": [
+        {"settings", "known_map", "tours"},
+        {"frontiers", "planner", "boundary"},
+        {"put_aside", "rules", "path_follower"},
+        {"exploration"},
+        {"pilot"},
+        {"warm_up"},
         {"nodes"},
     ],
     "training": [{"common"}, {"data"}, {"recordings", "driver", "baselines"}, {"scoring"}, {"report"}],

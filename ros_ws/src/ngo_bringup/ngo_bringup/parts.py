@@ -7,6 +7,8 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 WORLDS = ["maze2d", "maze3d", "building2d"]
+EXPLORED = ["building2d", "maze2d", "none"]
+DRIVES = ["own", "nav2", "none"]
 TRUTH_VALUES = {"true": True, "false": False, "True": True, "False": False}  # Nav2 writes them with a capital letter
 _DESCRIPTIONS = {
     "world": "simulator",
@@ -16,7 +18,9 @@ _DESCRIPTIONS = {
     "seed": "seed of the simulator; empty: of parameters",
     "record": "new .mcap file or folder for what the simulator publishes",
     "use_sim_time": "follow /clock, which a simulator started here then publishes",
-    "autostart": "whether ngo_node begins by itself; else it waits for lifecycle transitions",
+    "autostart": "whether it begins by itself; else ngo_node waits for lifecycle transitions, explore for its action",
+    "plan": "YAML file of a map server's map, as the building of building2d; empty: a drawn one",
+    "drive": "who drives: explore itself, Nav2, or nobody here",
     "use_respawn": "whether a node that ends is started again, with an empty map",
     "log_level": "lowest severity that nodes print",
     "rviz": "show the graph in RViz",
@@ -34,13 +38,16 @@ def switch(name: str, default: str = "false") -> DeclareLaunchArgument:
     return argument(name, default, list(TRUTH_VALUES))
 
 
-def simulator_arguments(shipped: str) -> list[DeclareLaunchArgument]:
-    """The arguments of ``simulator``; the file of parameters is one of ``shipped``, a package and a prefix."""
+def simulator_arguments(shipped: str, worlds: list[str] | None = None) -> list[DeclareLaunchArgument]:
+    """The arguments of ``simulator``; the file of parameters is one of ``shipped``, a package and a prefix.
+
+    worlds: the choices, the first of which is the default.
+    """
     package, prefix = shipped.split("/", 1)
     # PathJoinSubstitution takes no nested lists before launch 3.4.5: texts side by side are concatenated instead.
     file = [FindPackageShare(package), f"/{prefix}", LaunchConfiguration("world"), ".yaml"]
     return [
-        argument("world", "maze3d", WORLDS),
+        argument("world", worlds[0] if worlds else "maze3d", worlds or WORLDS),
         argument("parameters", file),
         argument("namespace", ""),
         argument("seed", ""),
@@ -73,13 +80,19 @@ def node(package: str, executable: str, files: list[object], own: dict, **option
     )
 
 
-def simulator(context: LaunchContext, **options: object) -> Node:
-    """The simulator; arguments that are empty leave the file of parameters as it is."""
+def parameters() -> LaunchConfiguration:
+    """The file with the parameters of all nodes."""
+    return LaunchConfiguration("parameters")
+
+
+def simulator(context: LaunchContext, more: dict | None = None, **options: object) -> Node:
+    """The simulator; arguments that are empty leave the file of parameters as it is. more: other parameters."""
     seed, record = text(context, "seed"), text(context, "record")
     own = {"seed": int(seed)} if seed else {}
+    own |= more or {}
     own |= {"record": record} if record else {}
     own |= {"publish_clock": True} if is_on(context, "use_sim_time") else {}
-    return node("ngo_sim", text(context, "world"), [LaunchConfiguration("parameters")], own, **options)
+    return node("ngo_sim", text(context, "world"), [parameters()], own, **options)
 
 
 def viewers(context: LaunchContext) -> list[Node]:

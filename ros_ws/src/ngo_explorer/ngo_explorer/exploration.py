@@ -1,0 +1,206 @@
+"""One exploration: the map so far, the goal now, and when nothing is left. No clock and no ROS: times are given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ngo_explorer.boundary import Boundary
+from ngo_explorer.frontiers import Candidate, Frontier, FrontierFinder, viewpoint
+from ngo_explorer.known_map import Floats, KnownMap
+from ngo_explorer.planner import cost_field, plan_path
+from ngo_explorer.put_aside import PutAside
+from ngo_explorer.rules import Situation, make_rule
+from ngo_explorer.settings import ExplorerConfig
+
+_SAME_GOAL_M = 1.0  # a frontier that moves less than this from one decision to the next is the same
+_TRAIL_M = 1.0
+_PROGRESS_M = 0.2
+_OFF_PATH_M = 0.7
+_EXPLORE_LITE = (0.75, 30.0, 1.0 / 0.15)  # its smallest frontier, time without progress and time between decisions
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """Where to drive: ``pose_xyyaw`` ``(3,)``, along ``path`` ``(n, 2)``. candidate: what is to be seen, None: home."""
+
+    pose_xyyaw: Floats
+    path: Floats
+    candidate: Candidate | None
+
+
+@dataclass(frozen=True, eq=False)
+class Unreachable:
+    """A frontier that is left: where, and why."""
+
+    point_xy: Floats
+    reason: str
+
+
+class Exploration:
+    """Chooses goals while the map grows.
+
+    Its owner gives it maps (``known``), asks ``decide`` where to drive, and says how that went: ``arrived`` or
+    ``failed``. ``candidates`` and ``unreachable`` are the frontiers of the last decision.
+    """
+
+    def __init__(self, config: ExplorerConfig, boundary: Floats | None = None, seed: int = 0) -> None:
+        """boundary: ``(n, 2)`` corners of a polygon in the map's frame, outside of which nothing is explored."""
+        self._lite = config.rule == "explore_lite"
+        if self._lite:
+            least, progress, again = _EXPLORE_LITE
+            config = replace(config, frontier_m=least, progress_s=progress, replan_s=again)
+        self.config = config
+        self.known = KnownMap(config.radius_m, config.comfort_m)
+        self.goal: Goal | None = None
+        self.candidates: Sequence[Candidate] = ()
+        self.unreachable: Sequence[Unreachable] = ()
+        self._boundary = Boundary(boundary)
+        self._finder = FrontierFinder(config.frontier_m, math.inf if self._lite else 2.5)
+        self._rule = make_rule(config, np.random.default_rng(seed))
+        self._aside = PutAside()
+        self._trail: list[Floats] = []
+        self._decided_s = -math.inf
+        self._best_way_m, self._progress_s = math.inf, 0.0
+
+    @property
+    def need_m(self) -> float:
+        """Clearance that a cell needs for the robot's middle."""
+        # Two points in cells may be nearer than the cells' middles by a cell's diagonal; half of it is usual.
+        return self.config.radius_m + self.config.margin_m + 0.5 * self.known.resolution_m
+
+    @property
+    def area_m2(self) -> float:
+        """Known area within the boundary."""
+        return self._boundary.known_m2(self.known)
+
+    def due(self, robot_xyyaw: Floats, now_s: float) -> bool:
+        """Whether it is time for a decision: there is no goal, it shows nothing new any more, or time has passed."""
+        self._remember(robot_xyyaw[:2])
+        goal = self.goal
+        if goal is None or goal.candidate is None:
+            return goal is None
+        if self._watch_progress(robot_xyyaw[:2], now_s) or self._off_path(robot_xyyaw[:2]):
+            return True
+        return now_s - self._decided_s >= self.config.replan_s or not self._still_frontier(goal.candidate.frontier)
+
+    def decide(self, robot_xyyaw: Floats, now_s: float) -> Goal | None:
+        """Choose where to drive now; None where no frontier is left that can be reached."""
+        robot = robot_xyyaw[:2]
+        self._remember(robot)
+        self._decided_s = now_s
+        before = self.goal.candidate if self.goal is not None else None
+        field = cost_field(self.known, robot, self.need_m)
+        self._look(field)
+        while self.candidates:
+            present = self._present(before)
+            trail = np.array([*self._trail, robot])
+            seen = Situation(self.known, robot, self.candidates, present, trail, self.need_m)
+            chosen = self._rule(seen)
+            candidate = self.candidates[chosen]
+            path = plan_path(self.known, field, robot, candidate.viewpoint_xy, self.need_m)
+            if path is not None:
+                if chosen != present:
+                    self._best_way_m, self._progress_s = math.inf, now_s
+                self.goal = Goal(np.array((*candidate.viewpoint_xy, candidate.yaw)), path, candidate)
+                return self.goal
+            self._drop(candidate, "no path is wide enough")
+        self.goal = None
+        return None
+
+    def go_to(self, robot_xyyaw: Floats, pose_xyyaw: Floats) -> Goal | None:
+        """Drive to a place; None where no path leads there."""
+        field = cost_field(self.known, robot_xyyaw[:2], self.need_m)
+        path = plan_path(self.known, field, robot_xyyaw[:2], pose_xyyaw[:2], self.need_m)
+        self.goal = None if path is None else Goal(np.array(pose_xyyaw), path, None)
+        return self.goal
+
+    def arrived(self) -> None:
+        """The robot stands at the goal, and the map has what it sees: what is still unknown stays so from there."""
+        goal, self.goal = self.goal, None
+        if goal is not None and goal.candidate is not None and self._still_frontier(goal.candidate.frontier):
+            reason = "it was seen from a place nearby, and stays unknown"
+            self._aside.add(self.known, goal.candidate.frontier, goal.candidate.viewpoint_xy, reason, again=True)
+
+    def another_chance(self) -> bool:
+        """Before the end: whether something failed only once, which then may be tried again."""
+        return not self._lite and self._aside.another_chance()
+
+    def failed(self, reason: str) -> None:
+        """The robot could not get to the goal."""
+        goal, self.goal = self.goal, None
+        if goal is not None and goal.candidate is not None:
+            self._aside.add(self.known, goal.candidate.frontier, goal.candidate.viewpoint_xy, reason)
+
+    def _look(self, field: NDArray[np.int32]) -> None:
+        """Find the frontiers, those that can be seen and those that cannot."""
+        config, known = self.config, self.known
+        candidates, unreachable = [], []
+        for frontier in self._finder.find(known):
+            if not self._boundary.holds(frontier.point_xy):
+                continue
+            reason = self._aside.reason(known, frontier, for_ever=self._lite)
+            barred = self._aside.barred(frontier)
+            place = None if reason else self._viewpoint(frontier, field, barred)
+            if place is None:
+                reason = reason or (
+                    "it stays unknown from all places near it"
+                    if len(barred)
+                    else "no path leads to where it can be seen"
+                )
+                unreachable.append(Unreachable(frontier.point_xy, reason))
+                continue
+            if place[2] >= config.gain_m2:
+                candidates.append(Candidate(frontier, *place))
+        self.candidates, self.unreachable = candidates, unreachable
+
+    def _viewpoint(
+        self, frontier: Frontier, field: NDArray[np.int32], barred: Floats
+    ) -> tuple[Floats, float, float] | None:
+        config = self.config
+        return viewpoint(self.known, frontier, field, self.need_m, config.reach_m, config.gain_range_m, barred)
+
+    def _drop(self, candidate: Candidate, reason: str) -> None:
+        self._aside.add(self.known, candidate.frontier, candidate.viewpoint_xy, reason)
+        self.candidates = [other for other in self.candidates if other is not candidate]
+        self.unreachable = [*self.unreachable, Unreachable(candidate.frontier.point_xy, reason)]
+
+    def _present(self, before: Candidate | None) -> int:
+        """The index of the candidate that the robot drives to already, -1 where there is none."""
+        if before is None:
+            return -1
+        gaps = [np.hypot(*(other.frontier.point_xy - before.frontier.point_xy)) for other in self.candidates]
+        nearest = int(np.argmin(gaps))
+        return nearest if gaps[nearest] < _SAME_GOAL_M else -1
+
+    def _still_frontier(self, frontier: Frontier) -> bool:
+        """Whether something of a frontier is one still."""
+        row, column = self.known.cell(frontier.point_xy)
+        reach = max(1, int(0.5 * self.config.frontier_m / self.known.resolution_m) + 2)
+        part = self.known.frontier[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
+        return int(np.count_nonzero(part)) * self.known.resolution_m >= 0.5 * self.config.frontier_m
+
+    def _remember(self, robot_xy: Floats) -> None:
+        if not self._trail or np.hypot(*(self._trail[-1] - robot_xy)) >= _TRAIL_M:
+            self._trail.append(np.array(robot_xy))
+
+    def _off_path(self, robot_xy: Floats) -> bool:
+        """Whether the path is elsewhere: the map has jumped, or somebody has carried the robot."""
+        assert self.goal is not None
+        return bool(np.sum((self.goal.path - robot_xy) ** 2, axis=1).min() > _OFF_PATH_M**2)
+
+    def _watch_progress(self, robot_xy: Floats, now_s: float) -> bool:
+        """Put the goal aside where the robot has come no nearer for too long; returns whether it did."""
+        assert self.goal is not None
+        nearest = int(np.argmin(np.sum((self.goal.path - robot_xy) ** 2, axis=1)))
+        left_m = (len(self.goal.path) - nearest) * self.known.resolution_m
+        if left_m < self._best_way_m - _PROGRESS_M:
+            self._best_way_m, self._progress_s = left_m, now_s
+        if now_s - self._progress_s < self.config.progress_s:
+            return False
+        self.failed(f"no progress for {self.config.progress_s:g} s")
+        return True

@@ -1,0 +1,220 @@
+"""Frontiers: connected edges of the unknown (Yamauchi 1997), where each is seen from, and what it shows there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ngo_explorer.known_map import Cells, Floats, KnownMap
+
+_DIRECTIONS = 48
+_SAMPLES = 5  # cells of a frontier from which viewpoints are looked for
+_NEAR_M = 0.7  # a viewpoint nearer than this to its frontier is no better
+_VIEWPOINTS, _APART_M = 8, 0.5  # that are compared by their gain, and how far they are apart
+_BARRED_M = 0.4
+_FAR_COST = 2.0  # metres of path that a metre more between viewpoint and frontier is worth
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Frontier:
+    """An edge of the unknown. ``cells`` ``(n,)`` are flat indices, ``point_xy`` ``(2,)`` is its middle cell (m)."""
+
+    cells: Ints
+    point_xy: Floats
+    size_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A frontier that can be seen from where the robot can go.
+
+    ``viewpoint_xy`` ``(2,)`` is the middle of a cell, ``way_m`` the cost of the path there in metres of easy path, and
+    ``gain_m2`` the unknown area that may be seen from there.
+    """
+
+    frontier: Frontier
+    viewpoint_xy: Floats
+    way_m: float
+    gain_m2: float
+
+    @property
+    def yaw(self) -> float:
+        """Direction from the viewpoint to the frontier."""
+        x, y = self.frontier.point_xy - self.viewpoint_xy
+        return math.atan2(y, x)
+
+
+class FrontierFinder:
+    """Finds connected frontiers; ``piece_m`` is the length of the longest, which longer ones are cut to."""
+
+    def __init__(self, least_m: float, piece_m: float) -> None:
+        self._least_m, self._piece_m = least_m, piece_m
+        self._labels = np.zeros(0, np.int32)
+
+    def find(self, known: KnownMap) -> list[Frontier]:
+        """All frontiers of a map."""
+        cells = known.frontier_cells()
+        if len(self._labels) != known.frontier.size:
+            self._labels = np.zeros(known.frontier.size, np.int32)
+        longest = int(min(self._piece_m / known.resolution_m, 2**31 - 1))
+        order, starts = _connected(cells, known.frontier, self._labels, max(1, longest))
+        found = []
+        columns = known.frontier.shape[1]
+        for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+            size_m = (end - begin) * known.resolution_m
+            if size_m < self._least_m:
+                continue
+            own = order[begin:end]
+            at = np.stack((own // columns, own % columns), axis=1)
+            middle = at[np.argmin(np.sum((at - at.mean(axis=0)) ** 2, axis=1))]
+            found.append(Frontier(own, known.points(middle[None])[0], size_m))
+        return found
+
+
+def viewpoint(
+    known: KnownMap,
+    frontier: Frontier,
+    field: NDArray[np.int32],
+    need_m: float,
+    reach_m: float,
+    range_m: float,
+    barred: Floats,
+) -> tuple[Floats, float, float] | None:
+    """Where a frontier is best seen from: the point ``(2,)``, the cost of the way there in m, and the gain in m^2.
+
+    Of places that show at least half of the largest gain it is the one with the shortest way. None where no place is.
+    field: costs of the blocks from `planner.cost_field`. barred: ``(n, 2)`` points that are no viewpoints any more.
+    """
+    picks = np.linspace(0, len(frontier.cells) - 1, min(_SAMPLES, len(frontier.cells))).astype(np.int64)
+    cells = np.array([known.cell(point) for point in barred], np.int64).reshape(-1, 2)
+    found, costs = _viewpoints(
+        known.state,
+        known.clearance_m,
+        field,
+        known.block,
+        frontier.cells[picks],
+        need_m,
+        known.resolution_m,
+        reach_m,
+        cells,
+    )
+    if not len(found):
+        return None
+    points = known.points(found)
+    gains = np.array([gain_m2(known, point, range_m) for point in points])
+    best = int(np.flatnonzero(gains >= 0.5 * gains.max())[0])
+    return points[best], float(costs[best]), float(gains[best])
+
+
+def gain_m2(known: KnownMap, point_xy: Floats, range_m: float) -> float:
+    """Unknown area that rays from a point may see: they pass the unknown, and end at obstacles and at the range."""
+    row, column = known.cell(point_xy)
+    return float(_gain(known.state, row, column, known.resolution_m, range_m))
+
+
+@njit(cache=True)
+def _connected(cells: Ints, frontier: NDArray[np.bool_], labels: NDArray[np.int32], longest: int) -> tuple[Ints, Ints]:
+    """Cells by frontier, and where each begins. ``labels`` is zero, and is so afterwards."""
+    rows, columns = frontier.shape
+    order = np.empty(len(cells), np.int64)
+    starts = [0]
+    filled = 0
+    for first in cells:
+        if labels[first] != 0:
+            continue
+        begin = filled
+        labels[first] = 1
+        order[filled] = first
+        filled += 1
+        head = begin
+        while head < filled and filled - begin < longest:
+            cell = order[head]
+            head += 1
+            row, column = cell // columns, cell % columns
+            for r in range(max(0, row - 1), min(rows, row + 2)):
+                for c in range(max(0, column - 1), min(columns, column + 2)):
+                    other = r * columns + c
+                    if frontier[r, c] and labels[other] == 0 and filled - begin < longest:
+                        labels[other] = 1
+                        order[filled] = other
+                        filled += 1
+        starts.append(filled)
+    for cell in cells:
+        labels[cell] = 0
+    return order, np.array(starts)
+
+
+@njit(cache=True)
+def _viewpoints(
+    state: Cells,
+    clearance: NDArray[np.float32],
+    field: NDArray[np.int32],
+    block: int,
+    cells: Ints,
+    need: float,
+    resolution: float,
+    reach: float,
+    barred: Ints,
+) -> tuple[Ints, Floats]:
+    """Cells ``(n, 2)`` that see one of ``cells``, the best first and some way apart, and the costs to get there."""
+    rows, columns = state.shape
+    unit = block * resolution / 10.0
+    most = len(cells) * _DIRECTIONS * int(reach / resolution)
+    places = np.empty((most, 2), np.int64)
+    scores, ways = np.empty(most), np.empty(most)
+    count = 0
+    for cell in cells:
+        row, column = cell // columns, cell % columns
+        for direction in range(_DIRECTIONS):
+            dy, dx = math.sin(direction * math.tau / _DIRECTIONS), math.cos(direction * math.tau / _DIRECTIONS)
+            for step in range(int(reach / resolution)):
+                r, c = math.floor(row + 0.5 + step * dy), math.floor(column + 0.5 + step * dx)
+                if r < 0 or c < 0 or r >= rows or c >= columns or state[r, c] != 0:
+                    break
+                cost = field[r // block, c // block]
+                if clearance[r, c] < need or cost < 0:
+                    continue
+                places[count, 0], places[count, 1], ways[count] = r, c, cost * unit
+                scores[count] = cost * unit + _FAR_COST * max(0.0, step * resolution - _NEAR_M)
+                count += 1
+    for index in range(count):
+        for other in range(len(barred)):
+            away = (places[index, 0] - barred[other, 0]) ** 2 + (places[index, 1] - barred[other, 1]) ** 2
+            if away * resolution * resolution < _BARRED_M**2:
+                scores[index] = np.inf
+    chosen = np.empty(_VIEWPOINTS, np.int64)
+    filled = 0
+    while filled < _VIEWPOINTS and count > 0:
+        best = int(np.argmin(scores[:count]))
+        if scores[best] == np.inf:
+            break
+        chosen[filled] = best
+        filled += 1
+        for index in range(count):
+            away = (places[index, 0] - places[best, 0]) ** 2 + (places[index, 1] - places[best, 1]) ** 2
+            if away * resolution * resolution < _APART_M**2:
+                scores[index] = np.inf
+    return places[chosen[:filled]], ways[chosen[:filled]]
+
+
+@njit(cache=True)
+def _gain(state: Cells, row: int, column: int, resolution: float, reach: float) -> float:
+    rows, columns = state.shape
+    rays = 2 * _DIRECTIONS
+    area = 0.0
+    for ray in range(rays):
+        dy, dx = math.sin(ray * math.tau / rays), math.cos(ray * math.tau / rays)
+        for step in range(1, int(reach / resolution)):
+            r, c = math.floor(row + 0.5 + step * dy), math.floor(column + 0.5 + step * dx)
+            inside = 0 <= r < rows and 0 <= c < columns
+            if inside and state[r, c] == 1:
+                break
+            if not inside or state[r, c] == -1:
+                area += step * resolution * resolution * math.tau / rays
+    return area

@@ -1,0 +1,285 @@
+"""The occupancy grid as an explorer keeps it: clearance, frontier cells and blocks, updated where it changed.
+
+All arrays cover whole tiles. What follows from the cells of a tile is computed anew when one of its cells changes, so
+an update costs what changed, and one comparison of the cells.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 1
+
+Floats = NDArray[np.float64]
+Cells = NDArray[np.int8]
+
+_TILE = 64  # cells along the side of a tile, at least
+
+
+class KnownMap:
+    """What is known of a place.
+
+    ``state`` int8 ``(rows, columns)`` is UNKNOWN, FREE or OCCUPIED; row 0 is the lowest in y. ``clearance_m`` float32
+    is the distance to the nearest occupied cell, at most ``comfort_m``, in tiles that something is known of.
+    ``frontier`` bool are free cells beside unknown ones. ``roomy_m`` float32 ``(rows / block, columns / block)`` is the
+    largest clearance of a free cell in each block, 0 without one. A block is no longer than the robot's radius, so none
+    joins two sides of a wall.
+
+    Raises ValueError where the resolution changes.
+    """
+
+    def __init__(self, radius_m: float, comfort_m: float) -> None:
+        if not 0.0 < radius_m < math.inf:
+            raise ValueError(f"radius_m is {radius_m}; expected a positive length")
+        self.radius_m, self.comfort_m = radius_m, max(comfort_m, radius_m)
+        self.resolution_m = 0.0
+        self.changes = 0
+        """Counts the updates that changed anything."""
+
+    @property
+    def empty(self) -> bool:
+        """Whether no map has come yet."""
+        return self.resolution_m == 0.0
+
+    def update(self, values: NDArray[np.int8], resolution_m: float, origin_xy: Floats) -> bool:
+        """Take a whole map; returns whether a cell changed.
+
+        values: ``(rows, columns)`` percent, -1 where nothing is known. Cells up to 25 are free, from 65 on occupied,
+        and the rest unknown. origin_xy: ``(2,)`` lower left corner of cell [0, 0]. Extent and origin may be others than
+        before; cells that the map does not hold become unknown.
+        """
+        self._begin(resolution_m, origin_xy)
+        row, column = self._offset(origin_xy)
+        self._cover(row, column, *values.shape)
+        whole = _states(values)
+        inside = slice(row - self._low[0], row - self._low[0] + values.shape[0])
+        across = slice(column - self._low[1], column - self._low[1] + values.shape[1])
+        placed = np.full_like(self.state, UNKNOWN)
+        placed[inside, across] = whole
+        return self._take(placed, slice(0, placed.shape[0]), slice(0, placed.shape[1]))
+
+    def update_part(self, values: NDArray[np.int8], row: int, column: int, origin_xy: Floats) -> bool:
+        """Take a part of the last whole map, whose cell [0, 0] there is [row, column]; returns whether a cell changed.
+
+        Raises ValueError for a part that the map does not hold.
+        """
+        if self.empty:
+            raise ValueError("a part of a map came before any map")
+        own = self._offset(origin_xy)
+        low_row, low_column = row + own[0] - self._low[0], column + own[1] - self._low[1]
+        rows, columns = slice(low_row, low_row + values.shape[0]), slice(low_column, low_column + values.shape[1])
+        if low_row < 0 or low_column < 0 or rows.stop > self.state.shape[0] or columns.stop > self.state.shape[1]:
+            raise ValueError(f"a part of {values.shape} cells at row {row}, column {column} is outside of the map")
+        return self._take(_states(values), rows, columns)
+
+    def points(self, cells: NDArray[np.int64]) -> Floats:
+        """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
+        return self._corner + (cells[:, ::-1] + 0.5) * self.resolution_m
+
+    def cell(self, point_xy: Floats) -> tuple[int, int]:
+        """Row and column of the cell that holds a point; it may be outside of the map."""
+        column, row = np.floor((point_xy[:2] - self._corner) / self.resolution_m).astype(int).tolist()
+        return row, column
+
+    @property
+    def known_m2(self) -> float:
+        """Known area."""
+        return float(self._known.sum()) * self.resolution_m**2
+
+    @property
+    def corner_xy(self) -> Floats:
+        """``(2,)`` the lower left corner of cell [0, 0] (m)."""
+        return self._corner
+
+    def frontier_cells(self) -> NDArray[np.int64]:
+        """``(n,)`` flat indices of all frontier cells."""
+        return np.asarray(_gather(self.frontier, self._frontiers, self._tile))
+
+    def _begin(self, resolution_m: float, origin_xy: Floats) -> None:
+        if not self.empty and not math.isclose(resolution_m, self.resolution_m, rel_tol=1e-4):
+            raise ValueError(f"the map's resolution is {resolution_m} m; expected {self.resolution_m} m as before")
+        if not self.empty:
+            return
+        if not 0.0 < resolution_m < math.inf:
+            raise ValueError(f"the map's resolution is {resolution_m} m; expected a positive length")
+        self.resolution_m = resolution_m
+        self.block = max(1, int(self.radius_m / resolution_m))
+        self._tile = self.block * math.ceil(_TILE / self.block)
+        self._anchor = np.array(origin_xy, np.float64)
+        self._low = (0, 0)
+        self._corner = self._anchor
+        self.state = np.zeros((0, 0), np.int8)
+        self.clearance_m = np.zeros((0, 0), np.float32)
+        self.frontier = np.zeros((0, 0), np.bool_)
+        self.roomy_m = np.zeros((0, 0), np.float32)
+        self._known = np.zeros((0, 0), np.int64)
+        self._frontiers = np.zeros((0, 0), np.int64)
+
+    def _offset(self, origin_xy: Floats) -> tuple[int, int]:
+        column, row = np.rint((np.asarray(origin_xy) - self._anchor) / self.resolution_m).astype(int).tolist()
+        return row, column
+
+    def _cover(self, row: int, column: int, rows: int, columns: int) -> None:
+        """Let the arrays cover these cells, counted from the anchor."""
+        tile = self._tile
+        low = [math.floor(value / tile) * tile for value in (row, column)]
+        high = [math.ceil(value / tile) * tile for value in (row + rows, column + columns)]
+        if self.state.size:
+            low = [min(a, b) for a, b in zip(low, self._low, strict=True)]
+            high = [max(a, b + size) for a, b, size in zip(high, self._low, self.state.shape, strict=True)]
+        shape = (high[0] - low[0], high[1] - low[1])
+        if shape == self.state.shape:
+            return
+        shift = (self._low[0] - low[0], self._low[1] - low[1]) if self.state.size else (0, 0)
+        self.state = _grown(self.state, shape, shift, 1, UNKNOWN)
+        self.clearance_m = _grown(self.clearance_m, shape, shift, 1, self.comfort_m)
+        self.frontier = _grown(self.frontier, shape, shift, 1, False)
+        self.roomy_m = _grown(self.roomy_m, shape, shift, self.block, 0.0)
+        self._known = _grown(self._known, shape, shift, tile, 0)
+        self._frontiers = _grown(self._frontiers, shape, shift, tile, 0)
+        self._low = (low[0], low[1])
+        self._corner = self._anchor + np.array((low[1], low[0])) * self.resolution_m
+
+    def _take(self, states: Cells, rows: slice, columns: slice) -> bool:
+        tile, changed = self._tile, np.zeros(self._known.shape, np.bool_)
+        _write(self.state, states, rows.start, columns.start, tile, changed)
+        if not changed.any():
+            return False
+        self.changes += 1
+        for row, column in np.argwhere(changed).tolist():
+            area = self.state[row * tile : (row + 1) * tile, column * tile : (column + 1) * tile]
+            self._known[row, column] = np.count_nonzero(area != UNKNOWN)
+        # What lies beside a changed tile may be nearer to an obstacle now, or at the edge of the unknown.
+        for row, column in np.argwhere(_beside(changed)).tolist():
+            self._follow(row, column)
+        return True
+
+    def _follow(self, tile_row: int, tile_column: int) -> None:
+        """Compute anew what follows from the cells in and around a tile."""
+        tile = self._tile
+        row, column = tile_row * tile, tile_column * tile
+        _clear(self.state, self.clearance_m, row, column, tile, self.resolution_m, self.comfort_m)
+        _roomy(self.state, self.clearance_m, self.roomy_m, row, column, tile, self.block)
+        self._frontiers[tile_row, tile_column] = _edge(self.state, self.frontier, row, column, tile)
+
+
+def _states(values: NDArray[np.int8]) -> Cells:
+    return np.select([values < 0, values <= 25, values >= 65], [UNKNOWN, FREE, OCCUPIED], UNKNOWN).astype(np.int8)
+
+
+def _grown(before: NDArray, shape: tuple[int, int], shift: tuple[int, int], unit: int, fill: float) -> NDArray:
+    """An array of ``shape`` in cells, one entry a square of ``unit`` cells, that holds ``before`` at ``shift``."""
+    grown = np.full((shape[0] // unit, shape[1] // unit), fill, before.dtype)
+    row, column = shift[0] // unit, shift[1] // unit
+    grown[row : row + before.shape[0], column : column + before.shape[1]] = before
+    return grown
+
+
+def _beside(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    padded = np.pad(changed, 1)
+    rows, columns = changed.shape
+    parts = [padded[row : row + rows, column : column + columns] for row in range(3) for column in range(3)]
+    return np.logical_or.reduce(parts)
+
+
+@njit(cache=True)
+def _write(state: Cells, states: Cells, row0: int, column0: int, tile: int, changed: NDArray[np.bool_]) -> None:
+    for row in range(states.shape[0]):
+        for column in range(states.shape[1]):
+            if state[row0 + row, column0 + column] != states[row, column]:
+                state[row0 + row, column0 + column] = states[row, column]
+                changed[(row0 + row) // tile, (column0 + column) // tile] = True
+
+
+@njit(cache=True)
+def _clear(
+    state: Cells, clearance: NDArray[np.float32], row0: int, column0: int, tile: int, resolution: float, most: float
+) -> None:
+    """Distances within a tile, by a disc around each occupied cell in and around it that has a side that is not."""
+    rows, columns = state.shape
+    reach = int(most / resolution)
+    clearance[row0 : row0 + tile, column0 : column0 + tile] = most
+    for row in range(max(0, row0 - reach), min(rows, row0 + tile + reach)):
+        for column in range(max(0, column0 - reach), min(columns, column0 + tile + reach)):
+            if state[row, column] != 1:
+                continue
+            clearance_here = row0 <= row < row0 + tile and column0 <= column < column0 + tile
+            if clearance_here:
+                clearance[row, column] = 0.0
+            if (
+                0 < row < rows - 1
+                and 0 < column < columns - 1
+                and state[row - 1, column] == 1
+                and state[row + 1, column] == 1
+                and state[row, column - 1] == 1
+                and state[row, column + 1] == 1
+            ):
+                continue
+            for r in range(max(row0, row - reach), min(row0 + tile, row + reach + 1)):
+                for c in range(max(column0, column - reach), min(column0 + tile, column + reach + 1)):
+                    distance = np.float32(resolution * math.sqrt((r - row) ** 2 + (c - column) ** 2))
+                    if distance < clearance[r, c]:
+                        clearance[r, c] = distance
+
+
+@njit(cache=True)
+def _roomy(
+    state: Cells,
+    clearance: NDArray[np.float32],
+    roomy: NDArray[np.float32],
+    row0: int,
+    column0: int,
+    tile: int,
+    block: int,
+) -> None:
+    for row in range(row0, row0 + tile, block):
+        for column in range(column0, column0 + tile, block):
+            best = np.float32(0.0)
+            for r in range(row, row + block):
+                for c in range(column, column + block):
+                    if state[r, c] == 0 and clearance[r, c] > best:
+                        best = clearance[r, c]
+            roomy[row // block, column // block] = best
+
+
+@njit(cache=True)
+def _edge(state: Cells, frontier: NDArray[np.bool_], row0: int, column0: int, tile: int) -> int:
+    rows, columns = state.shape
+    count = 0
+    for row in range(row0, row0 + tile):
+        for column in range(column0, column0 + tile):
+            # Beyond the array nothing is known either.
+            edge = state[row, column] == 0 and (
+                row == 0
+                or row == rows - 1
+                or column == 0
+                or column == columns - 1
+                or state[row - 1, column] == -1
+                or state[row + 1, column] == -1
+                or state[row, column - 1] == -1
+                or state[row, column + 1] == -1
+            )
+            frontier[row, column] = edge
+            count += edge
+    return count
+
+
+@njit(cache=True)
+def _gather(frontier: NDArray[np.bool_], counts: NDArray[np.int64], tile: int) -> NDArray[np.int64]:
+    found = np.empty(counts.sum(), np.int64)
+    filled = 0
+    columns = frontier.shape[1]
+    for tile_row in range(counts.shape[0]):
+        for tile_column in range(counts.shape[1]):
+            if counts[tile_row, tile_column] == 0:
+                continue
+            for row in range(tile_row * tile, (tile_row + 1) * tile):
+                for column in range(tile_column * tile, (tile_column + 1) * tile):
+                    if frontier[row, column]:
+                        found[filled] = row * columns + column
+                        filled += 1
+    return found

@@ -1,0 +1,161 @@
+"""Follows a path with limited speed and acceleration, turns to the goal's direction, and backs up where it is stuck."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ngo_explorer.known_map import Floats, KnownMap
+from ngo_explorer.planner import line_is_free
+from ngo_explorer.settings import DriveConfig
+
+_LOOKAHEAD_M = (0.35, 0.8)  # at rest and at 1 m/s
+_TURN_ON_THE_SPOT_RAD = 0.8
+_FACES_RAD = 0.3  # near enough to the goal's direction
+_BACK_M, _BACK_MPS = 0.3, 0.1
+_MOVED_M, _MOVED_RAD = 0.03, 0.1
+_MOST_TRIES = 3  # to come free, before the goal is given up
+
+DRIVING, ARRIVED, STUCK = "driving", "arrived", "stuck"
+
+
+class PathFollower:
+    """Turns a path, the robot's pose and the newest map into velocities.
+
+    ``state`` is DRIVING, ARRIVED at the goal, or STUCK: it backed up several times in vain.
+    """
+
+    def __init__(self, config: DriveConfig, need_m: float) -> None:
+        """need_m: clearance that the robot's middle needs."""
+        self.config, self._need_m = config, need_m
+        self.state = ARRIVED
+        self._path, self._goal_yaw = np.zeros((0, 2)), 0.0
+        self._speed = self._turn_rate = 0.0
+        self._along = 0
+        self._tries, self._back_left_m = 0, 0.0
+        self._moved_at: tuple[Floats, float] | None = None
+        self._last_s: float | None = None
+
+    def follow(self, path: Floats, yaw: float, new: bool = True) -> None:
+        """Drive along ``path`` ``(n, 2)``, and look along ``yaw`` at its end; ``new``: not the goal of before."""
+        self._path, self._goal_yaw, self._along, self.state = path, yaw, 0, DRIVING
+        if new:
+            self._tries, self._moved_at = 0, None
+
+    def stop(self) -> None:
+        """Give the path up; the robot brakes."""
+        self._path, self.state = np.zeros((0, 2)), ARRIVED
+
+    def step(self, known: KnownMap, robot_xyyaw: Floats, now_s: float) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) from now on; call it at a steady pace."""
+        period_s = 0.0 if self._last_s is None else min(0.5, max(0.0, now_s - self._last_s))
+        self._last_s = now_s
+        speed, turn_rate = 0.0, 0.0
+        if self.state == DRIVING:
+            speed, turn_rate = self._wanted(known, robot_xyyaw, now_s, period_s)
+        config = self.config
+        change = config.acceleration_mps2 * period_s
+        # Braking is not limited: the base does that, and a softer stop would run into what is ahead.
+        self._speed = speed if abs(speed) < abs(self._speed) else _towards(speed, self._speed, change)
+        turning = config.turn_acceleration_rps2 * period_s
+        self._turn_rate = turn_rate if turn_rate == 0.0 else _towards(turn_rate, self._turn_rate, turning)
+        return self._speed, self._turn_rate
+
+    def _wanted(self, known: KnownMap, robot: Floats, now_s: float, period_s: float) -> tuple[float, float]:
+        if self._back_left_m > 0.0:
+            return self._back(known, robot, period_s)
+        gaps = np.hypot(*(self._path[self._along :] - robot[:2]).T)
+        self._along += int(np.argmin(gaps[:200]))
+        end_gap = float(np.hypot(*(self._path[-1] - robot[:2])))
+        if end_gap < self.config.arrived_m:
+            return self._face(robot)
+        if self._is_stuck(robot, now_s):
+            return self._back(known, robot, period_s) if self._back_left_m > 0.0 else (0.0, 0.0)
+        target = self._target(known, robot)
+        if target is None:
+            return 0.0, 0.0
+        return self._pursue(known, robot, target, end_gap)
+
+    def _target(self, known: KnownMap, robot: Floats) -> Floats | None:
+        """The farthest point within the look ahead that a straight free line leads to; None where there is none."""
+        low, high = _LOOKAHEAD_M
+        reach = low + (high - low) * min(1.0, self._speed)
+        ahead = self._path[self._along :]
+        count = int(np.searchsorted(np.cumsum(np.hypot(*np.diff(ahead, axis=0).T)), reach)) + 1
+        row, column = known.cell(robot)
+        inside = 0 <= row < known.state.shape[0] and 0 <= column < known.state.shape[1]
+        # Where it stands too near to something already, it may go on as long as it comes no nearer.
+        need = min(self._need_m, float(known.clearance_m[row, column]) - known.resolution_m) if inside else self._need_m
+        for index in range(min(count, len(ahead) - 1), -1, -max(1, count // 8)):
+            if line_is_free(known, robot, ahead[index], need):
+                return np.asarray(ahead[index])
+        return None
+
+    def _pursue(self, known: KnownMap, robot: Floats, target: Floats, end_gap: float) -> tuple[float, float]:
+        config = self.config
+        dx, dy = target - robot[:2]
+        bearing = math.remainder(math.atan2(dy, dx) - robot[2], math.tau)
+        if abs(bearing) > _TURN_ON_THE_SPOT_RAD:
+            return 0.0, math.copysign(min(config.turn_rate_rps, 2.5 * abs(bearing)), bearing)
+        curvature = 2.0 * math.sin(bearing) / max(math.hypot(dx, dy), 0.1)
+        speed = min(config.speed_mps, math.sqrt(2.0 * config.acceleration_mps2 * max(end_gap - 0.05, 0.0)) + 0.05)
+        speed = min(speed, config.turn_rate_rps / max(abs(curvature), 1e-6)) * max(0.25, 1.0 - abs(bearing))
+        if not self._arc_is_free(known, robot, speed, speed * curvature):
+            # The line to the target is free, so turn until it is what lies ahead.
+            if abs(bearing) > 0.05:
+                return 0.0, math.copysign(min(config.turn_rate_rps, max(0.2, 2.5 * abs(bearing))), bearing)
+            return min(0.15, speed), speed * curvature
+        return speed, speed * curvature
+
+    def _arc_is_free(self, known: KnownMap, robot: Floats, speed: float, turn_rate: float) -> bool:
+        """Whether the way until it could stop is free, half a second on."""
+        stop_s = 0.5 + speed / (2.0 * self.config.acceleration_mps2)
+        x, y, yaw = robot.tolist()
+        need = self._need_m - 0.5 * known.resolution_m
+        before = np.array((x, y))
+        for step in range(1, 5):
+            turn, way = turn_rate * stop_s * step / 4, speed * stop_s * step / 4
+            heading = yaw + turn / 2
+            there = np.array((x + way * math.cos(heading), y + way * math.sin(heading)))
+            if not line_is_free(known, before, there, need):
+                return False
+            before = there
+        return True
+
+    def _face(self, robot: Floats) -> tuple[float, float]:
+        off = math.remainder(self._goal_yaw - robot[2], math.tau)
+        if abs(off) < _FACES_RAD:
+            self.state = ARRIVED
+            return 0.0, 0.0
+        return 0.0, math.copysign(min(self.config.turn_rate_rps, 2.5 * abs(off)), off)
+
+    def _is_stuck(self, robot: Floats, now_s: float) -> bool:
+        if self._moved_at is not None:
+            pose, since_s = self._moved_at
+            moved = float(np.hypot(*(pose[:2] - robot[:2])))
+            turned = abs(math.remainder(pose[2] - robot[2], math.tau))
+            if moved < _MOVED_M and turned < _MOVED_RAD:
+                if now_s - since_s < self.config.stuck_s:
+                    return False
+                self._tries += 1
+                self._back_left_m, self._moved_at = _BACK_M, None
+                if self._tries >= _MOST_TRIES:
+                    self._back_left_m, self.state = 0.0, STUCK
+                return True
+        self._moved_at = np.array(robot), now_s
+        return False
+
+    def _back(self, known: KnownMap, robot: Floats, period_s: float) -> tuple[float, float]:
+        """Back up as far as what is known to be free lets it."""
+        x, y, yaw = robot.tolist()
+        behind = np.array((x - 0.15 * math.cos(yaw), y - 0.15 * math.sin(yaw)))
+        self._back_left_m -= max(_BACK_MPS * period_s, 1e-3)
+        if not line_is_free(known, robot, behind, self._need_m - 2.0 * known.resolution_m):
+            self._back_left_m = 0.0
+            return 0.0, 0.0
+        return -_BACK_MPS, 0.0
+
+
+def _towards(wanted: float, now: float, change: float) -> float:
+    return min(max(wanted, now - change), now + change)

@@ -1,0 +1,100 @@
+"""Tours over frontiers: nearest insertion, then 2-opt and or-opt on the sum of gains by the way to each.
+
+The cost of an open tour from the robot is ``sum(weight[i] * way to i)``: what is worth much is reached early, and what
+lies together is visited together (the minimum latency problem). With ``last`` above 0 the whole way counts as well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ngo_explorer.known_map import Floats
+
+Ints = NDArray[np.int64]
+
+
+def tour(first_m: Floats, between_m: Floats, weights: Floats, last: float = 1.0, start: int = -1) -> tuple[Ints, float]:
+    """The order ``(n,)`` in which to visit n places, and its cost.
+
+    first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places. weights: ``(n,)`` what each is
+    worth. last: worth of ending early, in sums of all weights. start: the place to visit first; -1: any.
+    """
+    order = _inserted(first_m, between_m, start)
+    cost = _improved(order, first_m, between_m, weights, last * float(weights.sum()), 1 if start >= 0 else 0)
+    return order, float(cost)
+
+
+@njit(cache=True)
+def _inserted(first: Floats, between: Floats, start: int) -> Ints:
+    """Nearest insertion: the place nearest to the tour so far enters where it costs least."""
+    count = len(first)
+    order = np.empty(count, np.int64)
+    order[0] = start if start >= 0 else int(np.argmin(first))
+    inside = np.zeros(count, np.bool_)
+    inside[order[0]] = True
+    gaps = between[order[0]].copy()
+    for filled in range(1, count):
+        chosen = -1
+        for place in range(count):
+            if not inside[place] and (chosen < 0 or gaps[place] < gaps[chosen]):
+                chosen = place
+        best, position = np.inf, filled
+        for at in range(1 if start >= 0 else 0, filled + 1):
+            before = first[chosen] if at == 0 else between[order[at - 1], chosen]
+            if at == filled:
+                more = before
+            else:
+                after = order[at]
+                more = before + between[chosen, after] - (first[after] if at == 0 else between[order[at - 1], after])
+            if more < best:
+                best, position = more, at
+        order[position + 1 : filled + 1] = order[position:filled].copy()
+        order[position] = chosen
+        inside[chosen] = True
+        gaps = np.minimum(gaps, between[chosen])
+    return order
+
+
+@njit(cache=True)
+def _cost(order: Ints, first: Floats, between: Floats, weights: Floats, last: float) -> float:
+    way = first[order[0]]
+    total = weights[order[0]] * way
+    for index in range(1, len(order)):
+        way += between[order[index - 1], order[index]]
+        total += weights[order[index]] * way
+    return total + last * way
+
+
+@njit(cache=True)
+def _improved(order: Ints, first: Floats, between: Floats, weights: Floats, last: float, fixed: int) -> float:
+    """Reverse and move parts of the tour while that makes it cheaper; the first ``fixed`` places stay."""
+    count = len(order)
+    best = _cost(order, first, between, weights, last)
+    changed = True
+    rounds = 0
+    while changed and rounds < 50:
+        changed = False
+        rounds += 1
+        for begin in range(fixed, count - 1):
+            for end in range(begin + 1, count):
+                tried = order.copy()
+                tried[begin : end + 1] = order[begin : end + 1][::-1]
+                cost = _cost(tried, first, between, weights, last)
+                if cost < best - 1e-9:
+                    order[:] = tried
+                    best, changed = cost, True
+        for length in range(1, min(4, count - fixed)):
+            for begin in range(fixed, count - length + 1):
+                for target in range(fixed, count - length + 1):
+                    if target == begin:
+                        continue
+                    part = order[begin : begin + length].copy()
+                    rest = np.concatenate((order[:begin], order[begin + length :]))
+                    tried = np.concatenate((rest[:target], part, rest[target:]))
+                    cost = _cost(tried, first, between, weights, last)
+                    if cost < best - 1e-9:
+                        order[:] = tried
+                        best, changed = cost, True
+    return best

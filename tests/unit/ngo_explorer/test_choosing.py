@@ -1,0 +1,117 @@
+"""Frontiers, paths and tours of maps drawn by hand."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from ngo_explorer.frontiers import FrontierFinder, gain_m2
+from ngo_explorer.known_map import KnownMap
+from ngo_explorer.planner import cost_field, line_is_free, plan_path
+from ngo_explorer.tours import tour
+
+from .drawn_maps import drawn
+
+NEED_M = 0.3
+ROOM = (
+    "??????????????",
+    "?######?#####?",
+    "?#....#?#...#?",
+    "?#....#?#...#?",
+    "?#..........#?",
+    "?#....#?#...#?",
+    "?###.##?#####?",
+    "????.?????????",
+)
+
+
+def known_of(values: np.ndarray) -> KnownMap:
+    known = KnownMap(0.2, 0.6)
+    known.update(values, 0.1, np.zeros(2))
+    return known
+
+
+def test_the_frontiers_of_a_room_are_its_open_door_and_its_open_passage() -> None:
+    known = known_of(drawn(*ROOM, cells=10))
+    found = FrontierFinder(0.3, 10.0).find(known)
+    # Below the room the corridor ends in the unknown, below and at both sides; the passage has no wall at two sides.
+    assert len(found) == 3
+    corridor = min(found, key=lambda frontier: frontier.point_xy[1])
+    assert corridor.size_m == pytest.approx(2 * 1.0 + 1.0 - 0.2, abs=0.25)
+    assert sorted(frontier.size_m for frontier in found)[:2] == pytest.approx([1.0, 1.0], abs=0.11)
+
+
+def test_a_long_frontier_is_cut_into_connected_pieces() -> None:
+    values = np.full((60, 60), -1, np.int8)
+    values[10:20, 5:55] = 0
+    pieces = FrontierFinder(0.3, 1.0).find(known_of(values))
+    assert max(piece.size_m for piece in pieces) <= 1.0 + 1e-9
+    assert sum(piece.size_m for piece in pieces) == pytest.approx(0.1 * (2 * 50 + 2 * 10 - 4), abs=0.6)
+
+
+def test_gain_is_the_unknown_area_that_rays_reach() -> None:
+    values = np.zeros((101, 101), np.int8)
+    values[:, 51:] = -1
+    half_circle = gain_m2(known_of(values), np.array((5.05, 5.05)), 4.0)
+    assert half_circle == pytest.approx(0.5 * np.pi * 4.0**2, rel=0.05)
+    values[:, 51] = 100
+    assert gain_m2(known_of(values), np.array((4.05, 5.05)), 3.0) == 0.0, "a wall hides it"
+
+
+def test_a_path_leads_through_the_door_and_keeps_its_clearance() -> None:
+    known = known_of(drawn(*ROOM, cells=10))
+    start, goal = np.array((2.5, 4.5)), np.array((11.5, 4.5))
+    field = cost_field(known, start, NEED_M)
+    path = plan_path(known, field, start, goal, NEED_M)
+    assert path is not None
+    np.testing.assert_allclose(path[[0, -1]], (start, goal), atol=0.06)
+    cells = np.array([known.cell(point) for point in path])
+    assert (known.clearance_m[cells[:, 0], cells[:, 1]] >= NEED_M).all()
+    length = np.hypot(*np.diff(path, axis=0).T).sum()
+    straight = 9.0
+    assert straight <= length < 1.15 * straight + 1.5, "the door is nearly on the line"
+
+
+def test_no_path_leads_through_a_gap_that_is_too_narrow() -> None:
+    narrow = drawn("#########", "#...#...#", "#.......#", "#...#...#", "#########", cells=5)
+    start, goal = np.array((1.0, 1.25)), np.array((3.5, 1.25))
+    wide = known_of(narrow)
+    assert plan_path(wide, cost_field(wide, start, 0.2), start, goal, 0.2) is not None
+    assert plan_path(wide, cost_field(wide, start, 0.35), start, goal, 0.35) is None
+    assert not line_is_free(wide, start, goal, 0.35)
+
+
+def brute_force(first: np.ndarray, between: np.ndarray, weights: np.ndarray, last: float) -> float:
+    best = np.inf
+    for order in permutations(range(len(first))):
+        ways = np.cumsum([first[order[0]], *(between[a, b] for a, b in zip(order[:-1], order[1:], strict=True))])
+        best = min(best, float(weights[list(order)] @ ways + last * weights.sum() * ways[-1]))
+    return best
+
+
+@pytest.mark.parametrize("last", [0.0, 1.0, 20.0])
+def test_a_tour_over_seven_places_is_the_best_or_nearly(last: float) -> None:
+    rng = np.random.default_rng(1)
+    ratios = []
+    for _ in range(4):
+        points = rng.uniform(0.0, 10.0, (8, 2))
+        gaps = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
+        weights = rng.uniform(0.5, 4.0, 7)
+        order, cost = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), weights, last)
+        assert sorted(order) == list(range(7))
+        ratios.append(cost / brute_force(gaps[0, 1:], gaps[1:, 1:], weights, last))
+    assert min(ratios) >= 1.0 - 1e-9 and np.mean(ratios) < 1.02 and max(ratios) < 1.1
+
+
+def test_a_tour_visits_the_near_dead_end_before_it_goes_far() -> None:
+    """Greedy by gain it would go right; the two on the left together are worth the way."""
+    points = np.array(((0.0, 0.0), (-2.0, 0.0), (-2.5, 0.0), (12.0, 0.0)))
+    gaps = np.abs(points[:, None, 0] - points[None, :, 0])
+    order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), np.array((1.0, 1.0, 2.0)), 1.0)
+    assert order.tolist() == [0, 1, 2]
+
+
+def test_a_given_first_place_stays_first() -> None:
+    gaps = np.abs(np.arange(5.0)[:, None] - np.arange(5.0)[None])
+    order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), np.ones(4), 1.0, start=2)
+    assert order[0] == 2

@@ -1,0 +1,143 @@
+"""Whole explorations of maps drawn by hand, by a robot that sees without errors."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ngo_explorer.exploration import Exploration
+from ngo_explorer.path_follower import ARRIVED, STUCK, PathFollower
+from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
+
+from .drawn_maps import RESOLUTION_M, drawn, explore, seen_from
+
+ROOMS = drawn(
+    "#############",
+    "#....#......#",
+    "#....#.####.#",
+    "#......#..#.#",
+    "#....#.##.#.#",
+    "######.#..#.#",
+    "#......#..#.#",
+    "#############",
+    cells=10,
+)
+"""Two joined rooms; the chamber in the middle is closed all around."""
+
+START = (2.5, 4.5)
+
+
+def reachable() -> np.ndarray:
+    free = ROOMS == 0
+    free[10:50, 80:100] = False
+    return free
+
+
+def test_it_ends_when_all_that_can_be_reached_is_known_and_touches_nothing() -> None:
+    exploration, known, way = explore(ROOMS, START)
+    assert (known[reachable()] == 0).mean() > 0.99
+    assert not exploration.unreachable
+    cells = np.floor(np.array(way)[:, 1::-1] / RESOLUTION_M).astype(int)
+    assert (exploration.known.clearance_m[cells[:, 0], cells[:, 1]] >= 0.2).all()
+
+
+@pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "tour"])
+def test_every_rule_comes_to_an_end(rule: str) -> None:
+    small = ROOMS[10:, :70].copy()
+    small[:, 69] = small[0] = 100
+    _, known, _ = explore(small, (2.5, 3.5), ExplorerConfig(rule=rule, radius_m=0.2))
+    assert (known[small == 0] == 0).mean() > 0.95
+
+
+def test_nothing_outside_of_the_boundary_is_explored() -> None:
+    boundary = np.array(((0.0, 0.0), (5.5, 0.0), (5.5, 8.0), (0.0, 8.0)))
+    exploration, _, way = explore(ROOMS, START, boundary=boundary)
+    assert np.array(way)[:, 0].max() < 6.5
+    assert 16.0 < exploration.area_m2 < 5.6 * 8.0
+
+
+def test_a_room_behind_a_gap_too_narrow_is_named_with_the_reason() -> None:
+    narrow = drawn("#########", "#...#...#", "#...#...#", "#.......#", "#...###.#", "#...#...#", "#########", cells=4)
+    exploration, _, _ = explore(narrow, (1.0, 1.4), ExplorerConfig(radius_m=0.2, frontier_m=0.2, reach_m=1.0))
+    assert exploration.unreachable
+    assert all(left.point_xy[0] > 1.6 and left.reason for left in exploration.unreachable)
+
+
+def looking(config: ExplorerConfig) -> tuple[Exploration, np.ndarray, np.ndarray]:
+    exploration, known, robot = Exploration(config), np.full_like(ROOMS, -1), np.array((*START, 0.0))
+    seen_from(ROOMS, known, *START)
+    exploration.known.update(known, RESOLUTION_M, np.zeros(2))
+    return exploration, known, robot
+
+
+def test_a_goal_that_failed_is_put_aside_and_tried_again_when_the_map_there_changes() -> None:
+    exploration, known, robot = looking(ExplorerConfig(radius_m=0.2))
+    goal = exploration.decide(robot, 0.0)
+    assert goal is not None and goal.candidate is not None
+    place = goal.candidate.frontier.point_xy
+    exploration.failed("the way was blocked")
+    exploration.decide(robot, 1.0)
+    assert exploration.another_chance() and not exploration.another_chance(), "what failed once is tried before the end"
+    exploration.goal = goal
+    exploration.failed("the way was blocked")
+    exploration.decide(robot, 1.5)
+    assert not exploration.another_chance()
+    assert "the way was blocked" in [left.reason for left in exploration.unreachable]
+    row, column = (place[::-1] / RESOLUTION_M).astype(int)
+    known[row - 8 : row + 8, column - 8 : column + 8] = np.where(
+        known[row - 8 : row + 8, column - 8 : column + 8] == -1, 0, known[row - 8 : row + 8, column - 8 : column + 8]
+    )
+    known[row, column + 3] = -1
+    exploration.known.update(known, RESOLUTION_M, np.zeros(2))
+    exploration.decide(robot, 2.0)
+    assert "the way was blocked" not in [left.reason for left in exploration.unreachable]
+
+
+def test_explore_lite_never_tries_again() -> None:
+    exploration, known, robot = looking(ExplorerConfig(rule="explore_lite", radius_m=0.2))
+    assert exploration.decide(robot, 0.0) is not None
+    exploration.failed("blacklisted")
+    known[known == -1] = ROOMS[known == -1]
+    known[:3] = -1
+    exploration.decide(robot, 1.0)
+    assert "blacklisted" in [left.reason for left in exploration.unreachable]
+
+
+def test_a_goal_without_progress_is_put_aside() -> None:
+    exploration, _, robot = looking(ExplorerConfig(radius_m=0.2, progress_s=5.0, replan_s=100.0))
+    exploration.decide(robot, 0.0)
+    assert not exploration.due(robot, 0.1) and not exploration.due(robot, 4.0)
+    assert exploration.due(robot, 5.1)
+    exploration.decide(robot, 5.1)
+    assert any("no progress" in left.reason for left in exploration.unreachable)
+
+
+def test_a_robot_that_is_carried_away_decides_anew() -> None:
+    exploration, _, robot = looking(ExplorerConfig(radius_m=0.2, replan_s=100.0))
+    exploration.decide(robot, 0.0)
+    assert not exploration.due(robot, 0.1)
+    assert exploration.due(robot + (0.0, 2.0, 0.0), 0.2)
+
+
+def test_the_same_map_and_seed_give_the_same_goals() -> None:
+    small = ROOMS[10:, :70].copy()
+    small[:, 69] = small[0] = 100
+    ways = [np.array(explore(small, (2.5, 3.5))[2]) for _ in range(2)]
+    np.testing.assert_array_equal(*ways)
+
+
+def test_a_robot_that_does_not_move_backs_up_and_is_stuck_at_last() -> None:
+    exploration, _, robot = looking(ExplorerConfig(radius_m=0.2))
+    goal = exploration.decide(robot, 0.0)
+    assert goal is not None
+    follower = PathFollower(DriveConfig(stuck_s=1.0), exploration.need_m)
+    follower.follow(goal.path, 0.0)
+    robot[2] = math.atan2(*(goal.path[5] - goal.path[0])[::-1])
+    speeds = []
+    for step in range(400):
+        speeds.append(follower.step(exploration.known, robot, 0.1 * step)[0])
+        if follower.state == STUCK:
+            break
+    assert follower.state == STUCK and min(speeds) < 0.0 < max(speeds)
+    follower.stop()
+    assert follower.state == ARRIVED and follower.step(exploration.known, robot, 99.0)[0] == 0.0

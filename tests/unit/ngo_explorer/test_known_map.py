@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from ngo_explorer.known_map import KnownMap
+
+RADIUS_M, COMFORT_M = 0.22, 0.6
+
+
+def known() -> KnownMap:
+    return KnownMap(RADIUS_M, COMFORT_M)
+
+
+def random_map(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
+    values = np.full((rows, columns), -1, np.int8)
+    for _ in range(12):
+        row, column = rng.integers(rows - 10), rng.integers(columns - 10)
+        values[row : row + rng.integers(5, 60), column : column + rng.integers(5, 60)] = rng.choice((0, 0, 0, 100))
+    return values
+
+
+def placed(found: KnownMap, array: np.ndarray, shape: tuple[int, int], origin: np.ndarray) -> np.ndarray:
+    """The part of an array of cells that a map of this shape and origin covers."""
+    row, column = found.cell(origin + 0.5 * found.resolution_m)
+    return array[row : row + shape[0], column : column + shape[1]]
+
+
+def test_what_follows_from_the_cells_is_the_same_after_many_updates_as_after_one() -> None:
+    rng = np.random.default_rng(3)
+    followed, origin = known(), np.array((2.0, -1.0))
+    values = random_map(rng, 150, 210)
+    for _ in range(8):
+        row, column = rng.integers(100), rng.integers(150)
+        part = values[row : row + 40, column : column + 50]
+        part[:] = rng.choice((-1, 0, 100), part.shape, p=(0.1, 0.85, 0.05))
+        followed.update(values, 0.05, origin)
+    # The map grows to the lower left, as when a robot comes to a new wing.
+    grown = np.pad(values, ((70, 0), (90, 30)), constant_values=-1)
+    grown[:30, :40] = 0
+    origin = origin - 0.05 * np.array((90, 70))
+    followed.update(grown, 0.05, origin)
+    fresh = known()
+    fresh.update(grown, 0.05, origin)
+    for name in ("state", "clearance_m", "frontier"):
+        one, other = (placed(each, getattr(each, name), grown.shape, origin) for each in (followed, fresh))
+        seen = grown != -1  # the clearance of a tile that nothing is known of does not matter
+        np.testing.assert_array_equal(one[seen], other[seen], err_msg=name)
+    assert followed.known_m2 == pytest.approx(fresh.known_m2) == np.count_nonzero(grown != -1) * 0.05**2
+    assert len(followed.frontier_cells()) == np.count_nonzero(followed.frontier)
+
+
+def test_clearance_is_the_distance_to_the_nearest_occupied_cell() -> None:
+    values = random_map(np.random.default_rng(5), 120, 130)
+    found = known()
+    found.update(values, 0.05, np.zeros(2))
+    exact = np.minimum(0.05 * distance_transform_edt(values != 100), COMFORT_M)
+    np.testing.assert_allclose(placed(found, found.clearance_m, values.shape, np.zeros(2)), exact, atol=1e-6)
+
+
+def test_a_part_gives_what_the_whole_gives() -> None:
+    values = random_map(np.random.default_rng(6), 140, 140)
+    whole, parts = known(), known()
+    parts.update(values, 0.05, np.zeros(2))
+    values[20:50, 30:90] = 100
+    assert parts.update_part(values[20:50, 30:90], 20, 30, np.zeros(2))
+    whole.update(values, 0.05, np.zeros(2))
+    np.testing.assert_array_equal(whole.frontier, parts.frontier)
+    np.testing.assert_array_equal(whole.clearance_m, parts.clearance_m)
+    assert not parts.update_part(values[20:50, 30:90], 20, 30, np.zeros(2)), "nothing changed"
+
+
+def test_cells_that_a_smaller_map_does_not_hold_are_unknown() -> None:
+    found = known()
+    found.update(np.zeros((100, 100), np.int8), 0.05, np.zeros(2))
+    found.update(np.zeros((50, 50), np.int8), 0.05, np.zeros(2))
+    assert found.known_m2 == pytest.approx(50 * 50 * 0.05**2)
+
+
+def test_a_frontier_is_free_and_beside_the_unknown() -> None:
+    values = np.full((9, 9), -1, np.int8)
+    values[2:7, 2:7] = 0
+    values[2, 2:7] = 100
+    found = known()
+    found.update(values, 0.1, np.zeros(2))
+    expected = np.zeros((9, 9), bool)
+    expected[3:7, [2, 6]] = expected[6, 2:7] = True
+    np.testing.assert_array_equal(found.frontier[:9, :9], expected)
+
+
+def test_another_resolution_is_refused_and_a_part_needs_a_whole() -> None:
+    found = known()
+    with pytest.raises(ValueError, match="before any map"):
+        found.update_part(np.zeros((2, 2), np.int8), 0, 0, np.zeros(2))
+    found.update(np.zeros((9, 9), np.int8), 0.1, np.zeros(2))
+    with pytest.raises(ValueError, match="resolution"):
+        found.update(np.zeros((9, 9), np.int8), 0.05, np.zeros(2))
+    with pytest.raises(ValueError, match="outside"):
+        found.update_part(np.zeros((900, 2), np.int8), 0, 0, np.zeros(2))
