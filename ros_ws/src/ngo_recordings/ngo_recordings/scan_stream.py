@@ -24,6 +24,8 @@ BAD_WHEELS = "wheel pose that is no number"
 # How late a message may be recorded after one with a later stamp, and still come in order.
 _WAIT_NS = 1_000_000_000
 _FULL_TURN = 2.0 * math.pi
+# Between the stamps of scans and wheels that were recorded at once: of one clock they are not so far apart.
+_OTHER_CLOCK_NS = 10_000_000_000
 # Rad; scanners have 50 times this, and a message with a finer one could cost its reader without bound.
 _LEAST_INCREMENT = 1e-5
 # Rad; a scan of more than a turn with a wider one is no scan of a scanner that turns on.
@@ -149,6 +151,7 @@ def scan_stream(
     topics: RecordingTopics,
     angle_increment: float | None = None,
     skipped: Counter[str] | None = None,
+    wheels_ahead_s: float | None = None,
 ) -> Iterator[LidarScan | WheelPose]:
     """Scans of topics.scans and poses of topics.wheels in order of their stamps; at equal stamps wheels come first.
 
@@ -157,6 +160,8 @@ def scan_stream(
 
     Args:
         angle_increment: rad, instead of that of the messages; None: see `scan_angles`.
+        wheels_ahead_s: how far the stamps of the wheels are ahead, which come in the order of the scans' clock then.
+            None: not known; clocks that are far apart are told by when the first messages were recorded.
         skipped: counts what gave no record, by the reason (BAD_SCAN, BAD_WHEELS). None: a damaged scan is an error, and
             poses that are no numbers are left out.
 
@@ -173,6 +178,8 @@ def scan_stream(
     lost: Counter[str] = Counter() if skipped is None else skipped
     waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose]] = []
     newest: dict[str, int] = {}
+    late: dict[bool, int] = {}
+    ahead_ns = 0 if wheels_ahead_s is None else round(wheels_ahead_s * 1e9)
     for order, message in enumerate(recording.messages(names)):
         is_scan = message.topic in topics.scans
         try:
@@ -197,7 +204,12 @@ def scan_stream(
                     yield heapq.heappop(waiting)[-1]
                 newest.clear()
             newest[message.topic] = max(record.stamp_ns, newest.get(message.topic, 0))
-            heapq.heappush(waiting, (record.stamp_ns, is_scan, order, message.log_time_ns, record))
+            late.setdefault(is_scan, record.stamp_ns - message.log_time_ns)
+            apart_ns = late[False] - late[True] if len(late) == 2 else 0
+            if wheels_ahead_s is None and abs(apart_ns) > _OTHER_CLOCK_NS:
+                ahead_ns = apart_ns
+            key_ns = record.stamp_ns if is_scan else record.stamp_ns - ahead_ns
+            heapq.heappush(waiting, (key_ns, is_scan, order, message.log_time_ns, record))
         while waiting and message.log_time_ns - waiting[0][3] > _WAIT_NS:
             yield heapq.heappop(waiting)[-1]
     while waiting:

@@ -16,10 +16,11 @@ import json
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -285,6 +286,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
         console.print(line, soft_wrap=True, highlight=False)
     first_frame = described.scan_frame
 
+    @cache
     def mounting_of(frame: str) -> Mounting | None:
         found = described.mounting if frame == first_frame else find_mounting(recording, topics, frame)
         if frame != first_frame and found is not None:
@@ -298,7 +300,10 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     with compiling(partial(console.print, highlight=False)):
         warm_up_scans()
     core = LidarRun(odometry, online, mounting_of, arguments.min_range)
-    return LIDAR_WORLD, topics, core, core.run(scan_stream(recording, topics, skipped=core.rejected), truth)
+    known = core.learn(scan_stream(recording, topics, skipped=Counter()))
+    ahead_s = known.offset_s if known.offset_s else None
+    records = scan_stream(recording, topics, skipped=core.rejected, wheels_ahead_s=ahead_s)
+    return LIDAR_WORLD, topics, core, core.run(records, truth)
 
 
 def _for_weights(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:

@@ -3,9 +3,11 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake, MountingOf
+from ngo_estimator.frontend.intake.wheel_clock import WheelTruth
 from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.geometry.scan_points import Mounting
@@ -20,6 +22,9 @@ _REASONS: dict[type[ValueError], str] = {
     LateFrame: "older than the scan before",
 }
 _MOST_WALL_POINTS = 400_000
+_LEARNED_SCANS = 600
+_LEARNED_M, _LEARNED_RAD = 6.0, 6.0
+"""Way and turn after which faults of scanners and wheels are known."""
 
 
 class LidarRun:
@@ -83,6 +88,28 @@ class LidarRun:
         if self.faults:
             lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
         return lines
+
+    def learn(self, records: Iterable[LidarScan | WheelPose]) -> WheelTruth:
+        """Look at the beginning of a recording for what is to be known of scanners and wheels, before a run.
+
+        Returns what is wrong with the wheels. Live, it is learned on the way.
+        """
+        scans, way_m, turn_rad = 0, 0.0, 0.0
+        for record in records:
+            with suppress(ValueError):
+                if isinstance(record, WheelPose):
+                    self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+                else:
+                    scans += 1
+                    self._odometry.add_scan(record)
+                for step in self._odometry.ready():
+                    way_m += math.hypot(step.relative_xyyaw[0], step.relative_xyyaw[1])
+                    turn_rad += abs(float(step.relative_xyyaw[2]))
+            if scans > _LEARNED_SCANS or (way_m > _LEARNED_M and turn_rad > _LEARNED_RAD):
+                break
+        known = self._odometry.keep_lag()
+        self._odometry.reset()
+        return known
 
     def run(
         self, records: Iterable[LidarScan | WheelPose], truth: Truth | None = None

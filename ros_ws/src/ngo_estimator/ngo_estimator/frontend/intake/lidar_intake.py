@@ -3,9 +3,14 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
+from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
 from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.own_returns import OwnReturns
+from ngo_estimator.frontend.intake.sweep import MeasuredSweep
 from ngo_estimator.frontend.intake.turns import Part, Turns
+from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
 from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
 from ngo_estimator.geometry.planar_motion import Array
@@ -33,15 +38,23 @@ class LidarIntake:
 
     def __init__(self, front_end: LidarFrontEnd, mounting_of: MountingOf, min_range_m: float = 0.0) -> None:
         self.front_end, self._mounting_of, self._min_range_m = front_end, mounting_of, min_range_m
+        self._no_return: dict[str, NoReturnValues] = {}
+        self._own: dict[str, OwnReturns] = {}
+        self._sweeps: dict[str, MeasuredSweep] = {}
+        self._clock = WheelClock()
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next scan is the new origin of ``odom``."""
+        """Begin anew: the next scan is the new origin of ``odom``. What was learned of the scanners stays."""
         self.front_end.reset()
         self._turns = Turns()
         self._mountings: dict[str, Mounting | None] = {}
-        self._no_return: dict[str, NoReturnValues] = {}
-        self._own: dict[str, OwnReturns] = {}
+        for sweep in self._sweeps.values():
+            sweep.interrupt()
+        self._wheels = CorrectedWheels()
+        clock = WheelClock()
+        clock.truth = self._clock.truth
+        self._clock = clock
         self._steps = 0
         self._said: set[str] = set()
 
@@ -58,7 +71,7 @@ class LidarIntake:
     @property
     def lag_s(self) -> float:
         """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
-        return self.front_end.lag_s
+        return self.front_end.lag_s + self._clock.truth.age_s
 
     @property
     def mounting_yaw_rad(self) -> float:
@@ -72,7 +85,11 @@ class LidarIntake:
 
     def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
         """Take the wheels' pose ``(3,)``; raises ``ValueError`` as the front end does."""
-        self.front_end.add_wheels(stamp_ns, pose_xyyaw)
+        if pose_xyyaw.shape == (3,) and (np.abs(pose_xyyaw) <= LARGEST_ODOMETRY).all():
+            self._clock.add_wheels(stamp_ns, pose_xyyaw)
+            stamp_ns, pose_xyyaw = self._wheels.add(stamp_ns, pose_xyyaw, self._clock.truth)
+        if not self._clock.truth.useless:
+            self.front_end.add_wheels(stamp_ns, pose_xyyaw)
 
     def add_scan(self, scan: LidarScan) -> None:
         """Take a scan of any scanner; raises ``ValueError`` as the front end does."""
@@ -88,6 +105,7 @@ class LidarIntake:
         ranges = self._own[scanner].clean(scan)
         if ranges is not scan.ranges:
             scan = replace(scan, ranges=ranges)
+        scan = self._sweeps[scanner].correct(scan)
         self._hand_on(self._turns.add(Part(scan, mounting, scanner)))
 
     def remount(self) -> None:
@@ -113,6 +131,7 @@ class LidarIntake:
         self._mountings[scanner] = mounting
         self._no_return.setdefault(scanner, NoReturnValues())
         self._own.setdefault(scanner, OwnReturns())
+        self._sweeps.setdefault(scanner, MeasuredSweep())
 
     def ready(self, at_end: bool = False) -> Iterator[LidarStep]:
         """The steps to all scans whose wheels are known by now; ``at_end`` nothing more comes.
@@ -124,9 +143,27 @@ class LidarIntake:
             self._hand_on(self._turns.flush())
         for step in self.front_end.ready(at_end):
             self._steps += 1
-            for own in self._own.values():
-                own.moved(step.relative_xyyaw)
+            self._observe(step)
             yield step
+
+    def _observe(self, step: LidarStep) -> None:
+        for own in self._own.values():
+            own.moved(step.relative_xyyaw)
+        late_ns = round(self.front_end.lag_s * 1e9)
+        motion = self._wheels.motion(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
+        elapsed_s = (step.stamp_ns - step.from_stamp_ns) * 1e-9
+        for scanner, sweep in self._sweeps.items():
+            if (mounting := self._mountings.get(scanner)) is not None:
+                sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
+        if not step.unsure and self._clock.add_step(step.from_stamp_ns, step.stamp_ns, step.relative_xyyaw):
+            for stamp_ns, pose in self._wheels.again(self._clock.truth):
+                if not self._clock.truth.useless:
+                    self.front_end.add_wheels(stamp_ns, pose)
+
+    def keep_lag(self) -> WheelTruth:
+        """Take the age of scans that is known by now for what comes after a reset; returns all of the wheels."""
+        self._clock.truth = replace(self._clock.truth, age_s=self.lag_s)
+        return self._clock.truth
 
     def remarks(self) -> list[str]:
         """What a person should know of the scans and wheels, a line each."""
@@ -135,6 +172,8 @@ class LidarIntake:
             if found.values:
                 values = ", ".join(f"{value:g}" for value in found.values)
                 lines.append(f"{name} says {values} m where nothing came back: taken so")
+        lines += [f"{name}: {line}" for name, sweep in self._sweeps.items() if (line := sweep.remark())]
+        lines += self._clock.truth.remarks()
         for name, own in self._own.items():
             if own.rays:
                 lines.append(f"{own.rays} rays of {name} see the robot itself: left out")

@@ -1,0 +1,264 @@
+"""How long a scanner sweeps and which way, measured: drivers turn arrays round, and give times in other units.
+
+Two scans that were taken at different velocities are bent differently. Both are registered to each other with the time
+of a sweep as a fourth unknown beside their relative pose. What is measured stands against what the driver says, which
+counts as long as nothing contradicts it.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ngo_estimator.geometry.planar_motion import Array, between, compose, transformed
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_recordings.scan_stream import LidarScan
+
+_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+"""Drivers give the time from ray to ray in s, ms, us or ns."""
+
+_LONGEST = 1.2
+_SHORTEST = 0.02
+"""A sweep, in times from scan to scan."""
+
+_KEPT = 12
+"""Scans among which the second one of a pair is looked for."""
+
+_FAR_M, _FAR_RAD = 0.6, 1.0
+_LEAST_BEND_M = 0.015
+"""By which the sweep's time bends two scans of a pair differently at 3 m, if it were the time from scan to scan."""
+
+_FEWEST = 12
+_PAIRS = 120
+_DEVIATIONS = 5.0
+_OFF = 0.35
+"""What is measured is another sweep where it is off by so many deviations, and by this share of the scans' period."""
+
+_NEAR = 0.2
+"""Share of the period within which a measured sweep is one of those that drivers make."""
+
+_ONCE_KNOWN = 8
+"""One scan in so many is measured where the sweep is known."""
+
+_KERNEL_M = 0.03
+_GATES_M = (0.4, 0.4, 0.25, 0.15, 0.15, 0.1)
+_SOURCES, _TARGETS = 160, 480
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    stamp_ns: int
+    pose: Array  # in odom
+    points: Array  # in the base frame, as if the robot stood
+    share: Array  # of the sweep at which each point was measured
+    normals: Array
+    twist: Array | None = None
+
+
+class MeasuredSweep:
+    """Measures the sweep of one scanner by its scans and the robot's motion, and corrects the scans' times."""
+
+    def __init__(self) -> None:
+        self.reversed = False
+        """Whether the rays are in the other order than the driver says."""
+        self.known_s: float | None = None
+        """The time of a sweep (s) where what the driver says of it is of no use; negative against the rays' order."""
+        self.unit = 1.0
+        """Factor on the driver's times."""
+        self._last_ns: int | None = None
+        self._gaps: deque[float] = deque(maxlen=30)
+        self._scans: dict[int, LidarScan] = {}
+        self._taken: deque[_Taken] = deque(maxlen=_KEPT + 2)
+        self._pose = np.zeros(3)
+        self._found: deque[tuple[float, float]] = deque(maxlen=_PAIRS)
+        self._count = 0
+
+    @property
+    def period_s(self) -> float:
+        """From scan to scan (s); 0 where it is not known."""
+        return float(np.median(self._gaps)) if len(self._gaps) > 2 else 0.0
+
+    def interrupt(self) -> None:
+        """What comes is not measured against what came; what was learned stays."""
+        self._scans.clear()
+        self._taken.clear()
+        self._last_ns = None
+
+    def correct(self, scan: LidarScan) -> LidarScan:
+        """The scan with its rays in the order in which they were measured, and with their time."""
+        if self._last_ns is not None and scan.stamp_ns > self._last_ns:
+            self._gaps.append((scan.stamp_ns - self._last_ns) * 1e-9)
+        self._last_ns = scan.stamp_ns
+        self._scans[scan.stamp_ns] = scan
+        while len(self._scans) > 4 * _KEPT:
+            self._scans.pop(next(iter(self._scans)))
+        time_s = self._time_s(scan)
+        count = len(scan.ranges)
+        if time_s == scan.time_increment * count:
+            return scan
+        if time_s >= 0.0:
+            return replace(scan, time_increment=time_s / count)
+        return replace(
+            scan,
+            angle_min=scan.angle_min + scan.angle_increment * (count - 1),
+            angle_increment=-scan.angle_increment,
+            ranges=scan.ranges[::-1],
+            time_increment=-time_s / count,
+        )
+
+    def _time_s(self, scan: LidarScan) -> float:
+        """The time of the sweep (s) as it is believed."""
+        if self.known_s is not None:
+            return self.known_s
+        return -self._given_s(scan) if self.reversed else self._given_s(scan)
+
+    def _given_s(self, scan: LidarScan) -> float:
+        """The time of the sweep as the driver says it, in a unit in which it can be; else 0."""
+        given_s, period_s = scan.time_increment * len(scan.ranges), self.period_s
+        if given_s == 0.0 or period_s == 0.0:
+            return given_s
+        for unit in _UNITS:
+            if _SHORTEST * period_s <= abs(given_s * unit) <= _LONGEST * period_s:
+                self.unit = unit
+                return given_s * unit
+        return given_s if abs(given_s) < period_s else 0.0
+
+    def observe(self, stamp_ns: int, step: Array, motion: Array | None, elapsed_s: float, mounting: Mounting) -> None:
+        """Take the motion ``(3,)`` that led to a scan: by the scans, and by the wheels where there are any."""
+        self._pose = compose(self._pose, step)
+        scan = self._scans.get(stamp_ns)
+        if scan is None or elapsed_s <= 0.0:
+            self._taken.clear()
+            return
+        velocity = (step if motion is None else motion) / elapsed_s
+        if self._taken:  # the robot moved so before and after the scan before
+            last = self._taken.pop()
+            before = velocity if last.twist is None else last.twist
+            self._taken.append(replace(last, twist=0.5 * (before + velocity)))
+            self._count += 1
+            if self._count % (_ONCE_KNOWN if len(self._found) >= 3 * _FEWEST else 2) == 0:
+                self._measure()
+        self._taken.append(_taken(scan, self._pose, mounting, velocity))
+
+    def remark(self) -> str:
+        """What the driver says wrongly of the sweep, in words; nothing where it is right."""
+        if self.reversed:
+            return "its rays were measured in the other order than the driver says: corrected"
+        if self.known_s is not None:
+            way = "against the order of its rays" if self.known_s < 0.0 else "in the order of its rays"
+            return f"its sweep lasts {abs(self.known_s):.3f} s {way}, the driver says something else: corrected"
+        return f"its times from ray to ray are taken times {self.unit:g}" if self.unit != 1.0 else ""
+
+    def _measure(self) -> None:
+        newest, period_s = self._taken[-1], self.period_s
+        best, bend = None, _LEAST_BEND_M
+        for other in list(self._taken)[:-1]:
+            off = between(other.pose, newest.pose)
+            if (
+                math.hypot(off[0], off[1]) > _FAR_M
+                or abs(off[2]) > _FAR_RAD
+                or other.twist is None
+                or newest.twist is None
+            ):
+                continue
+            change = np.abs(newest.twist - other.twist)
+            size = period_s * (math.hypot(change[0], change[1]) + 3.0 * change[2])
+            if size > bend:
+                best, bend = other, size
+        if best is None:
+            return
+        start_s = abs(self._given_s(self._scans[newest.stamp_ns])) or period_s
+        fits = [fit for sign in (1.0, -1.0) if (fit := _fit(best, newest, sign * start_s)) is not None]
+        if fits:
+            cost, time_s, deviation_s = min(fits)
+            if math.isfinite(cost) and abs(time_s) < 2.0 * period_s:
+                self._found.append((time_s, deviation_s))
+        self._decide()
+
+    def _decide(self) -> None:
+        if len(self._found) < _FEWEST:
+            return
+        times, deviations = np.array(self._found).T
+        weights = 1.0 / (deviations**2 + (0.1 * self.period_s) ** 2)
+        order = np.argsort(times)
+        share = np.cumsum(weights[order]) / weights.sum()
+        low, measured, high = np.interp((0.25, 0.5, 0.75), share, times[order])
+        spread = max(0.74 * (high - low), float(1.0 / math.sqrt(weights.sum() / len(times)))) / math.sqrt(len(times))
+        scan = self._scans[self._taken[-1].stamp_ns]
+        if abs(measured - self._time_s(scan)) < max(_DEVIATIONS * spread, _OFF * self.period_s):
+            return
+        given_s = self._given_s(scan)
+        full_s = self.period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
+        near = [t for t in (given_s, -given_s, full_s, -full_s, 0.0) if abs(t - measured) < _NEAR * self.period_s]
+        known_s = near[0] if near else float(measured)
+        self.reversed = known_s == -given_s
+        self.known_s = None if abs(known_s) == abs(given_s) else known_s
+
+
+def _taken(scan: LidarScan, pose: Array, mounting: Mounting, twist: Array) -> _Taken:
+    angles, ranges = scan.angles, scan.ranges.astype(np.float64)
+    largest = scan.range_max if 0.0 < scan.range_max < math.inf else 1000.0
+    seen = np.flatnonzero((ranges > max(scan.range_min, 0.0)) & (ranges < largest))
+    angles, ranges = angles[seen], ranges[seen]
+    turned = -angles if mounting.upside_down else angles
+    points = transformed(mounting.sensor_xyyaw, np.stack((ranges * np.cos(turned), ranges * np.sin(turned)), axis=-1))
+    normals = np.zeros_like(points)
+    if len(points) > 4:
+        along = points[4:] - points[:-4]
+        length = np.linalg.norm(along, axis=1)
+        close = (length > 1e-3) & (length < 0.1 + 0.1 * ranges[2:-2]) & (np.diff(seen)[1:-2] == 1)
+        unit = along / np.maximum(length, 1e-9)[:, None]
+        middle = points[2:-2] - 0.5 * (points[4:] + points[:-4])
+        across = np.stack((-unit[:, 1], unit[:, 0]), axis=-1)
+        flat = close & (np.abs((middle * across).sum(axis=1)) < 0.03)
+        normals[2:-2][flat] = across[flat]
+    return _Taken(scan.stamp_ns, pose, points, seen / max(len(scan.ranges), 1), normals, twist)
+
+
+def _fit(first: _Taken, second: _Taken, time_s: float) -> tuple[float, float, float] | None:
+    """Mean cost of the registration, the time of the sweep (s) and its deviation, from a first guess of it."""
+    assert first.twist is not None and second.twist is not None
+    on_line = np.flatnonzero(first.normals.any(axis=1))
+    on_line = on_line[:: max(1, len(on_line) // _TARGETS)]
+    chosen = np.arange(0, len(second.points), max(1, len(second.points) // _SOURCES))
+    if len(on_line) < 30 or len(chosen) < 30:
+        return None
+    target, normal = first.points[on_line], first.normals[on_line]
+    source = second.points[chosen]
+    target_rate = first.share[on_line, None] * _velocities(first.twist, target)
+    source_rate = second.share[chosen, None] * _velocities(second.twist, source)
+    pose, cost, information, noise = between(first.pose, second.pose), math.inf, 0.0, 1.0
+    for gate in _GATES_M:
+        there, here = target + time_s * target_rate, source + time_s * source_rate
+        moved = transformed(pose, here)
+        distance, nearest = cKDTree(there).query(moved, distance_upper_bound=gate)
+        hit = np.isfinite(distance)
+        if hit.sum() < 25:
+            return None
+        index = nearest[hit]
+        n = normal[index]
+        residual = ((moved[hit] - there[index]) * n).sum(axis=1)
+        turned = transformed(np.array((0.0, 0.0, pose[2])), source_rate[hit])
+        lever = moved[hit] - pose[:2]
+        jacobian = np.column_stack(
+            (n, n[:, 1] * lever[:, 0] - n[:, 0] * lever[:, 1], ((turned - target_rate[index]) * n).sum(axis=1))
+        )
+        weight = 1.0 / (1.0 + (residual / _KERNEL_M) ** 2)
+        normal_matrix = (jacobian * weight[:, None]).T @ jacobian + np.diag((1e-6, 1e-6, 1e-6, 1e-9))
+        change = -np.linalg.solve(normal_matrix, (jacobian * weight[:, None]).T @ residual)
+        pose = pose + change[:3]
+        time_s += float(change[3])
+        noise = max(1.48 * float(np.median(np.abs(residual))), 0.002)
+        marginal = normal_matrix[3, 3] - normal_matrix[3, :3] @ np.linalg.solve(
+            normal_matrix[:3, :3], normal_matrix[:3, 3]
+        )
+        information = max(float(marginal), 1e-12)
+        cost = float(np.log1p((residual / _KERNEL_M) ** 2).mean()) + float((~hit).mean())
+    return cost, time_s, noise / math.sqrt(information)
+
+
+def _velocities(twist: Array, points: Array) -> Array:
+    """Velocities ``(n, 2)`` of points that move with the robot."""
+    return np.stack((twist[0] - twist[2] * points[:, 1], twist[1] + twist[2] * points[:, 0]), axis=-1)

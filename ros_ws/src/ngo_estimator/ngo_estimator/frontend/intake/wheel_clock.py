@@ -1,0 +1,262 @@
+"""The wheels by the scans: how far their clock is off, over any distance, and how far their scale is.
+
+A robot turns by its scans when it turns by its wheels. The rates of both are correlated at all offsets between what was
+heard last of each, so that no clock need be right.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
+
+_CELL_S = 0.05
+_KEPT_S = 120.0
+_EVERY_S = 2.0
+_MOST_POSES = 20_000
+
+_LEAST_S = 8.0
+_LEAST_TURN_RAD = 2.0
+"""Time and turn that both must have in common."""
+
+_SURE = 0.8
+_BETTER = 0.15
+_OTHERS_S = 1.0
+"""A correlation counts that is so high, and higher by so much than with no offset and than any so far away."""
+
+_NEAR_S = 0.4
+"""Offsets up to here are the age of scans, which the front end finds."""
+
+_CONTRADICTS = 0.3
+_MUCH_RAD = 6.0
+"""Wheels that correlate less at any offset, while both turned so much, tell nothing."""
+
+_SCALES = (0.7, 1.4)
+"""Wheels within these are the front end's to judge."""
+
+_LEAST_WAY_M = 2.0
+
+
+@dataclass(frozen=True)
+class WheelTruth:
+    """What the scans say of the wheels.
+
+    offset_s: how far their stamps are ahead of the scans'. turn_scale, way_scale: what their turns and ways must be
+    multiplied by. useless: they say nothing about the robot's motion. age_s: how much older scans are than their
+    stamps, by the wheels' clock, where it was learned before.
+    """
+
+    offset_s: float = 0.0
+    turn_scale: float = 1.0
+    way_scale: float = 1.0
+    useless: bool = False
+    age_s: float = 0.0
+
+    def remarks(self) -> list[str]:
+        """What is wrong with the wheels, a line each."""
+        if self.useless:
+            return ["the wheels turn when the scans do not, at any offset of their clocks: they are left out"]
+        lines = []
+        if self.offset_s:
+            side = "ahead of" if self.offset_s > 0.0 else "behind"
+            lines.append(f"the wheels' clock is {abs(self.offset_s):.2f} s {side} the scans': corrected")
+        if self.turn_scale != 1.0:
+            lines.append(f"the wheels' turns are taken times {self.turn_scale:.2f}, as the scans say")
+        if self.way_scale != 1.0:
+            lines.append(f"the wheels' ways are taken times {self.way_scale:.2f}, as the scans say")
+        return lines
+
+
+class WheelClock:
+    """Takes wheels and the motion by scans, and finds out about the wheels."""
+
+    def __init__(self) -> None:
+        self.truth = WheelTruth()
+        self._scans: deque[tuple[int, int, float, float]] = deque()  # from, to (ns), turn, way
+        self._wheels: deque[tuple[int, float, float]] = deque(maxlen=_MOST_POSES)  # ns, unwrapped yaw, way forward
+        self._last: Array | None = None
+        self._looked_ns = 0
+        self._offset_s: float | None = None
+
+    def add_wheels(self, stamp_ns: int, pose: Array) -> None:
+        """Take a pose ``(3,)`` as the wheels say it."""
+        yaw = way = 0.0
+        if self._wheels:
+            newest_ns, yaw, way = self._wheels[-1]
+            if stamp_ns <= newest_ns:
+                if stamp_ns > newest_ns - 1_000_000_000:
+                    return
+                self._wheels.clear()
+        if self._last is not None:
+            step = between(self._last, pose)
+            yaw, way = yaw + wrap(float(step[2])), way + float(step[0])
+        self._last = pose
+        self._wheels.append((stamp_ns, yaw, way))
+
+    def add_step(self, from_ns: int, to_ns: int, step: Array) -> bool:
+        """Take the motion ``(3,)`` between two scans by the scans; returns whether something new is known."""
+        if self._scans and to_ns <= self._scans[-1][1]:
+            self._scans.clear()
+            self._looked_ns = 0
+        self._scans.append((from_ns, to_ns, float(step[2]), float(step[0])))
+        while self._scans[0][1] < to_ns - _KEPT_S * 1e9:
+            self._scans.popleft()
+        if to_ns < self._looked_ns + _EVERY_S * 1e9 or len(self._wheels) < 10:
+            return False
+        self._looked_ns = to_ns
+        before = self.truth
+        self._look()
+        return self.truth != before
+
+    def _look(self) -> None:
+        scans, wheels = self._signals()
+        if min(len(scans), len(wheels)) < _LEAST_S / _CELL_S:
+            return
+        lags, correlation, turns = _correlation(scans[:, 0], wheels[:, 0])
+        if not len(lags):
+            return
+        # The offset of a lag: the signals begin at stamps of their own.
+        begin_s = (self._wheels[0][0] - self._scans[0][0]) * 1e-9
+        offsets = begin_s + lags * _CELL_S
+        best = int(np.argmax(correlation))
+        if correlation.max() < _CONTRADICTS and -correlation.min() < _CONTRADICTS and turns.max() > _MUCH_RAD:
+            self.truth = replace(self.truth, useless=True)
+            return
+        if correlation[best] < _SURE:
+            return
+        self._judge_clock(offsets, correlation, best)
+        near = np.abs(offsets - self.truth.offset_s) < _NEAR_S + _CELL_S
+        if near.any():
+            lag = int(lags[near][np.argmax(correlation[near])])
+            self._judge_scale(*_aligned(scans, wheels, lag))
+
+    def _judge_clock(self, offsets: Array, correlation: Array, best: int) -> None:
+        here = np.abs(offsets - self.truth.offset_s) <= _NEAR_S
+        others = np.abs(offsets - offsets[best]) > _OTHERS_S
+        known = correlation[here].max(initial=0.0)
+        if here[best] or correlation[best] < max(known, correlation[others].max(initial=0.0)) + _BETTER:
+            return
+        found_s = float(offsets[best])
+        # Once is chance: the next look must say the same.
+        if self._offset_s is not None and abs(self._offset_s - found_s) < 2.0 * _CELL_S:
+            self.truth = replace(self.truth, offset_s=found_s)
+        self._offset_s = found_s
+
+    def _judge_scale(self, scans: Array, wheels: Array) -> None:
+        energy = (scans**2).sum(axis=0), (wheels**2).sum(axis=0)
+        product = (scans * wheels).sum(axis=0)
+        turned, gone = np.abs(wheels).sum(axis=0) * _CELL_S
+        turn_scale, way_scale = self.truth.turn_scale, self.truth.way_scale
+        if turned > 0.5 * _LEAST_TURN_RAD and product[0] > _SURE * math.sqrt(energy[0][0] * energy[1][0]):
+            turn_scale = _far_off(math.sqrt(energy[0][0] / energy[1][0]))
+        if gone > 0.5 * _LEAST_WAY_M and product[1] > _SURE * math.sqrt(energy[0][1] * energy[1][1]):
+            way_scale = _far_off(math.sqrt(energy[0][1] / energy[1][1]))
+        old = self.truth
+        if abs(turn_scale - old.turn_scale) > 0.1 or abs(way_scale - old.way_scale) > 0.1:
+            self.truth = replace(old, turn_scale=turn_scale, way_scale=way_scale)
+
+    def _signals(self) -> tuple[Array, Array]:
+        """Rates of turn and way ``(cells, 2)``, by scans and by wheels, each from its first stamp on."""
+        first_ns = self._scans[0][0]
+        ends = np.array([(begin - first_ns, end - first_ns) for begin, end, *_ in self._scans]) * 1e-9
+        moved = np.cumsum([step[2:] for step in self._scans], axis=0)
+        stamps = np.concatenate((ends[:1, 0], ends[:, 1]))
+        scans = _rates(stamps, np.concatenate((np.zeros((1, 2)), moved)), 0.0)
+        while self._wheels[-1][0] - self._wheels[0][0] > (_KEPT_S + 20.0) * 1e9:
+            self._wheels.popleft()
+        stamps_ns = np.array([stamp_ns for stamp_ns, *_ in self._wheels])
+        wheels = np.array([values for _, *values in self._wheels])
+        period_s = float(np.median(np.diff(ends[:, 1]))) if len(ends) > 1 else 0.0
+        return scans, _rates((stamps_ns - stamps_ns[0]) * 1e-9, wheels, period_s)
+
+
+def _rates(stamps: Array, values: Array, over_s: float) -> Array:
+    """Rates ``(cells, columns)`` of what was summed up, as means over so long."""
+    times = np.arange(0.0, stamps[-1], _CELL_S)
+    half = 0.5 * max(over_s, _CELL_S)
+    columns = [
+        (np.interp(times + half, stamps, column) - np.interp(times - half, stamps, column)) / (2.0 * half)
+        for column in values.T
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def _correlation(scans: Array, wheels: Array) -> tuple[Array, Array, Array]:
+    """Lags ``(n,)`` (cells by which the wheels' signal begins later), the correlation at each, and the scans' turn
+    (rad) in what both have in common there."""
+    size = 1 << (len(scans) + len(wheels)).bit_length()
+
+    def products(one: Array, other: Array) -> Array:
+        both = np.fft.irfft(np.conj(np.fft.rfft(one, size)) * np.fft.rfft(other, size), size)
+        return np.concatenate((both[size - len(scans) + 1 :], both[: len(wheels)]))
+
+    lags = np.arange(-len(scans) + 1, len(wheels)).astype(np.float64)
+    ones = np.ones_like(scans), np.ones_like(wheels)
+    common = products(*ones)
+    energies = products(scans**2, ones[1]) * products(ones[0], wheels**2)
+    turned = products(np.abs(scans), ones[1]) * _CELL_S, products(ones[0], np.abs(wheels)) * _CELL_S
+    enough = (common > _LEAST_S / _CELL_S) & (np.minimum(*turned) > 0.5 * _LEAST_TURN_RAD)
+    enough &= np.maximum(*turned) > _LEAST_TURN_RAD
+    correlation = products(scans, wheels)[enough] / np.sqrt(np.maximum(energies[enough], 1e-12))
+    return lags[enough], correlation, turned[0][enough]
+
+
+def _aligned(scans: Array, wheels: Array, lag: int) -> tuple[Array, Array]:
+    begin, end = max(0, -lag), min(len(scans), len(wheels) - lag)
+    return scans[begin:end], wheels[begin + lag : end + lag]
+
+
+def _far_off(scale: float) -> float:
+    return 1.0 if _SCALES[0] < scale < _SCALES[1] else scale
+
+
+class CorrectedWheels:
+    """The wheels with what is known of them: their poses by the scans' clock, and by the scans' scale."""
+
+    def __init__(self) -> None:
+        self._raw: deque[tuple[int, Array]] = deque(maxlen=2000)
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=2000)
+
+    def add(self, stamp_ns: int, pose: Array, truth: WheelTruth) -> tuple[int, Array]:
+        """Take a pose ``(3,)`` as the wheels say it; returns it as it should be."""
+        if self._raw and stamp_ns <= self._raw[-1][0] - 1_000_000_000:
+            self._raw.clear()
+            self._poses.clear()
+        scaled = pose
+        if self._raw and (truth.turn_scale, truth.way_scale) != (1.0, 1.0):
+            step = between(self._raw[-1][1], pose) * (truth.way_scale, truth.way_scale, truth.turn_scale)
+            scaled = compose(self._poses[-1][1], step)
+        made = stamp_ns + round((truth.age_s - truth.offset_s) * 1e9), scaled
+        if not self._raw or stamp_ns > self._raw[-1][0]:
+            self._raw.append((stamp_ns, pose))
+            self._poses.append(made)
+        return made
+
+    def again(self, truth: WheelTruth) -> list[tuple[int, Array]]:
+        """The last poses with what is known by now."""
+        raw = list(self._raw)
+        self._raw.clear()
+        self._poses.clear()
+        return [self.add(stamp_ns, pose, truth) for stamp_ns, pose in raw]
+
+    def motion(self, from_ns: int, to_ns: int) -> Array | None:
+        """The motion ``(3,)`` between two stamps; None where it is not known."""
+        begin, end = self._at(from_ns), self._at(to_ns)
+        return None if begin is None or end is None else between(begin, end)
+
+    def _at(self, stamp_ns: int) -> Array | None:
+        index = len(self._poses) - 1
+        while index >= 0 and self._poses[index][0] > stamp_ns:  # the newest are asked for
+            index -= 1
+        if index < 0 or (index == len(self._poses) - 1 and self._poses[index][0] < stamp_ns):
+            return None
+        before_ns, before = self._poses[index]
+        if before_ns == stamp_ns:
+            return before
+        after_ns, after = self._poses[index + 1]
+        off = after - before
+        off[2] = wrap(off[2])
+        pose: Array = before + (stamp_ns - before_ns) / (after_ns - before_ns) * off
+        return pose

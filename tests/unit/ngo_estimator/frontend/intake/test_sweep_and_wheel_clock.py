@@ -1,0 +1,134 @@
+"""What drivers say of times is measured: the sweep by the fit of scans, the wheels' clock and scale by turns."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.geometry.planar_motion import Array, between, compose
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_estimator.offline.lidar_run import LidarRun
+from ngo_estimator.offline.recorded import RecordedRun
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_recordings.scan_stream import LidarScan, WheelPose
+from tests.unit.ngo_estimator.ray_casting import ROOM, cast
+
+STEP_NS = 100_000_000
+RAYS = 180
+SENSOR = np.array((0.1, 0.0, 0.5))
+BEGIN_NS = 10**12
+
+
+def drive(count: int) -> Array:
+    """Poses of a robot that turns to and fro at rates of its own, and drives ahead and back."""
+    noise, poses, rate = np.random.default_rng(1), [np.array((1.2, 1.0, 0.6))], 0.0
+    for k in range(count):
+        if k % 6 == 0:
+            rate = float(noise.uniform(-0.09, 0.09)) - 0.04 * (float(poses[-1][2]) - 0.6)
+        poses.append(compose(poses[-1], np.array((0.04 if k // 40 % 2 == 0 else -0.04, 0.0, rate))))
+    return np.array(poses)
+
+
+def records(poses: Array, wheel_scale: float = 1.0, ahead_s: float = 0.0, sweeps: bool = False) -> list[Any]:
+    """Scans, which sweep from one stamp to the next or are taken at once, and wheels between them."""
+    noise, made = np.random.default_rng(0), []
+    angles = np.linspace(-math.pi, math.pi, RAYS, endpoint=False)
+    wheels = np.zeros(3)
+    for k, (pose, following) in enumerate(zip(poses[:-1], poses[1:], strict=True)):
+        step = between(pose, following)
+        for half in (0.0, 0.5):
+            stamp_ns = BEGIN_NS + round((k + half) * STEP_NS + ahead_s * 1e9)
+            made.append(WheelPose(stamp_ns, compose(wheels, half * step * wheel_scale)))
+        wheels = compose(wheels, step * wheel_scale)
+        if sweeps:
+            sensors = [compose(compose(pose, step * ray / RAYS), SENSOR) for ray in range(RAYS)]
+            seen = np.array([cast(ROOM, at, angle[None])[0] for at, angle in zip(sensors, angles, strict=True)])
+        else:
+            seen = cast(ROOM, compose(pose, SENSOR), angles)
+        ranges = (seen + noise.normal(0.0, 0.005, RAYS)).astype(np.float32)
+        time_increment = STEP_NS * 1e-9 / RAYS if sweeps else 0.0
+        stamp_ns = BEGIN_NS + k * STEP_NS
+        made.append(LidarScan(stamp_ns, -math.pi, math.tau / RAYS, ranges, 0.05, 30.0, time_increment, "laser"))
+    apart_ns = round(ahead_s * 1e9) if abs(ahead_s) > 10.0 else 0  # then a recording keeps the order of arrival
+    return sorted(made, key=lambda record: record.stamp_ns - apart_ns * isinstance(record, WheelPose))
+
+
+def run_over(made: list[Any], poses: Array) -> tuple[float, LidarRun]:
+    """The largest error of a path (m) that was learned about first, and its run."""
+    run = LidarRun(LidarOdometry(), ScanTrajectory(iterations_per_step=1), Mounting(SENSOR))
+    run.learn(made)
+    whole = next(event for event in run.run(made) if isinstance(event, RecordedRun)).trajectory
+    expected = np.array([between(poses[0], pose) for pose in poses[: len(whole.poses_xyyaw)]])
+    return float(np.linalg.norm((whole.poses_xyyaw - expected)[:, :2], axis=1).max()), run
+
+
+def turned_round(scan: LidarScan) -> LidarScan:
+    last = scan.angle_min + scan.angle_increment * (RAYS - 1)
+    return replace(scan, angle_min=last, angle_increment=-scan.angle_increment, ranges=scan.ranges[::-1])
+
+
+SWEPT = records(drive(90), sweeps=True)
+
+
+@pytest.mark.parametrize(
+    ("factor", "turn_round", "said"),
+    [
+        (1.0, False, ""),
+        (1.0, True, "in the other order than the driver says"),
+        (-1.0, False, "in the other order than the driver says"),
+        (1e9, False, "times from ray to ray are taken times 1e-09"),
+        (1e3, True, "in the other order than the driver says"),
+        (77.0, False, "its sweep lasts 0.100 s in the order of its rays"),
+    ],
+)
+def test_the_direction_and_the_time_of_a_sweep_are_measured(factor: float, turn_round: bool, said: str) -> None:
+    made = []
+    for record in SWEPT:
+        if isinstance(record, LidarScan):
+            changed = replace(record, time_increment=factor * record.time_increment)
+            made.append(turned_round(changed) if turn_round else changed)
+        else:
+            made.append(record)
+    off_m, run = run_over(made, drive(90))
+    assert off_m < 0.03
+    remarks = [line for line in run.remarks() if "older than their stamps" not in line]
+    assert [said in line for line in remarks] == [True] if said else not remarks
+
+
+STILL = drive(240)
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 2.0, -1.3, 1.7e9])
+def test_the_wheels_clock_is_found_at_any_distance(ahead_s: float) -> None:
+    made = records(STILL, ahead_s=ahead_s)
+    off_m, run = run_over(made, STILL)
+    assert off_m < 0.03
+    if ahead_s:
+        side = "ahead of" if ahead_s > 0.0 else "behind"
+        (line,) = [line for line in run.remarks() if side in line]
+        assert float(line.split(" is ")[1].split(" s ")[0]) == pytest.approx(abs(ahead_s), abs=0.15)
+    else:
+        assert run.remarks() == []
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_wheels_of_another_scale_are_scaled(scale: float) -> None:
+    off_m, run = run_over(records(STILL, wheel_scale=scale), STILL)
+    assert off_m < 0.03
+    assert [f"turns are taken times {1.0 / scale:.1f}"[:-2] in line for line in run.remarks()[:1]] == [True] * (
+        scale != 1.0
+    )
+
+
+def test_wheels_that_have_nothing_to_do_with_the_scans_are_left_out() -> None:
+    made, other = records(STILL), records(drive(240)[::-1].copy())
+    wheels = [record for record in other if isinstance(record, WheelPose)]
+    turned = np.random.default_rng(3).normal(0.0, 0.1, len(wheels)).cumsum()
+    mixed = [WheelPose(record.stamp_ns, np.array((0.0, 0.0, turned[k]))) for k, record in enumerate(wheels)] + [
+        record for record in made if isinstance(record, LidarScan)
+    ]
+    off_m, run = run_over(sorted(mixed, key=lambda record: record.stamp_ns), STILL)
+    assert off_m < 0.03 and "they are left out" in run.remarks()[0]
