@@ -1,6 +1,8 @@
 """Recordings of every kind are read the same, whole or cut; what cannot be read says so in one line."""
 
 import shutil
+import sqlite3
+import struct
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -359,3 +361,76 @@ def test_the_first_message_is_there_or_its_lack_is_said(tmp_path: Path) -> None:
         assert recording.first("/action").log_time_ns == 3
         with pytest.raises(RecordingError, match=r"topic /empty has no message in .*a.mcap"):
             recording.first("/empty")
+
+
+def odometries(count: int) -> list[m.Entry]:
+    stamps = [k * 10**8 for k in range(count)]
+    return [("/odom", t, m.odometry(t, m.pose(1e-9 * t, 0, 0), m.twist(0, 0, 0))) for t in stamps]
+
+
+def killed_recorder(folder: Path, count: int = 400) -> Path:
+    """A sqlite3 file whose end is in its log alone, as a killed recorder leaves it."""
+    entries = odometries(count)
+    bag = m.write_rosbag(folder / "whole", entries)
+    (source,) = bag.glob("*.db3")
+    path = folder / "killed" / "bag_0.db3"
+    path.parent.mkdir()
+    shutil.copyfile(source, path)
+    database = sqlite3.connect(path)
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("PRAGMA wal_autocheckpoint=0")
+    rows = database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+    database.execute("DELETE FROM messages WHERE id > ?", (count // 2,))
+    database.commit()
+    database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows[count // 2 :])
+    database.commit()
+    for name in ("", "-wal"):
+        shutil.copyfile(f"{path}{name}", folder / f"kept{name}")
+    database.close()
+    for name in ("", "-wal"):
+        shutil.move(folder / f"kept{name}", f"{path}{name}")
+    return path
+
+
+def test_what_a_killed_recorder_had_in_its_log_is_read(tmp_path: Path) -> None:
+    path = killed_recorder(tmp_path)
+    before = path.read_bytes()
+    for opened in (path, path.parent):
+        with open_recording([opened]) as recording:
+            assert len(list(recording.messages())) == recording.topics["/odom"].count == 400
+            assert "bag_0.db3-wal holds its end" in recording.notes[0]
+    assert path.read_bytes() == before
+
+
+def test_packed_files_without_their_metadata_are_read(tmp_path: Path) -> None:
+    entries = odometries(9)
+    for mode in (CompressionMode.FILE, CompressionMode.MESSAGE):
+        bag = m.write_rosbag(tmp_path / mode.name, entries, compression=mode)
+        (bag / "metadata.yaml").unlink()
+        for opened in (bag, next(bag.iterdir())):
+            with open_recording([opened]) as recording:
+                found = [each.value.pose.pose.position.x for each in recording.messages()]
+                assert found == pytest.approx([0.1 * k for k in range(9)])
+
+
+def test_a_topic_in_another_encoding_is_left_out_and_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        text = "float64 data\n"
+        good = writer.register_channel(
+            "/good", "cdr", writer.register_schema("std_msgs/msg/Float64", "ros2msg", text.encode())
+        )
+        other = writer.register_channel("/other", "json", writer.register_schema("thing", "jsonschema", b"{}"))
+        for k in range(4):
+            writer.add_message(other, k, b"{}", k)
+            writer.add_message(good, k, b"\0\1\0\0" + struct.pack("<d", 0.5 * k), k)
+        writer.finish()
+    with open_recording([path]) as recording:
+        assert [each.value.data for each in recording.messages()] == [0.5 * k for k in range(4)]
+        assert set(recording.topics) == {"/good"}
+        assert recording.notes == (
+            "a.mcap: messages of /other are in json encoding; expected CDR with one, as ROS 2 records: left out",
+        )

@@ -2,6 +2,7 @@
 
 import bz2
 import shutil
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -119,11 +120,64 @@ def test_mounting_and_wheels_are_found_in_transforms_of_either_name(tmp_path: Pa
         np.testing.assert_allclose(poses[-1], [1.9, -0.95, 0.19], atol=1e-9)
 
 
-def test_a_cut_bag_says_how_to_mend_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compression", [None, "BZ2"])
+def test_a_bag_that_was_cut_off_is_read_to_its_last_whole_record(tmp_path: Path, compression: str | None) -> None:
+    path = write_bag(tmp_path / "a.bag", compression=compression)
+    with open_recording([path]) as recording:
+        whole = [(each.topic, each.log_time_ns) for each in recording.messages()]
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with open_recording([path]) as recording:
+        found = [(each.topic, each.log_time_ns) for each in recording.messages()]
+        assert recording.unfinished == (path,) and "read record by record" in recording.notes[0]
+    assert 5 < len(found) < len(whole) and set(found) <= set(whole)
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_index_records_of_2010_that_say_a_wrong_length_do_no_harm(tmp_path: Path, padded: bool) -> None:
+    """They say 20 bytes a message, and hold 12."""
     path = write_bag(tmp_path / "a.bag")
-    path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(RecordingError, match="rosbag reindex"):
-        open_recording([path])
+    with open_recording([path]) as recording:
+        whole = [(each.topic, each.log_time_ns) for each in recording.messages()]
+    content = path.read_bytes()
+    made, at = content[:13], 13
+    while at < len(content):
+        head = struct.unpack_from("<I", content, at)[0]
+        header = content[at + 4 : at + 4 + head]
+        size = struct.unpack_from("<I", content, at + 4 + head)[0]
+        data = content[at + 8 + head : at + 8 + head + size]
+        if b"op=\x04" in header:
+            made += struct.pack("<I", head) + header + struct.pack("<I", size // 12 * 20) + data
+            made += bytes(size // 12 * 8) if padded else b""
+        else:
+            made += content[at : at + 8 + head + size]
+        at += 8 + head + size
+    path.write_bytes(made)
+    with open_recording([path]) as recording:
+        assert [(each.topic, each.log_time_ns) for each in recording.messages()] == whole
+
+
+def test_format_1_2_is_read(tmp_path: Path) -> None:
+    """Messages beside their definitions, which name the header as packages did then."""
+    text = "Header header\nfloat32 x\n" + "=" * 80 + "\nMSG: roslib/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+
+    def record(data: bytes, **fields: bytes) -> bytes:
+        parts = [name.encode() + b"=" + value for name, value in fields.items()]
+        head = b"".join(struct.pack("<I", len(part)) + part for part in parts)
+        return struct.pack("<I", len(head)) + head + struct.pack("<I", len(data)) + data
+
+    content = b"#ROSRECORD V1.2\n"
+    named = {"topic": b"/old", "md5": b"*", "type": b"pkg/Old"}
+    content += record(b"", op=b"\x01", **named, **{"def": text.encode()})
+    for k in range(3):
+        data = struct.pack("<III", k, 100 + k, 5) + struct.pack("<I", 4) + b"base" + struct.pack("<f", 0.5 * k)
+        content += record(data, op=b"\x02", **named, sec=struct.pack("<I", 100 + k), nsec=struct.pack("<I", 5))
+    path = tmp_path / "old.bag"
+    path.write_bytes(content)
+    with open_recording([path]) as recording:
+        found = list(recording.messages())
+    assert [(each.log_time_ns, each.value.x) for each in found] == [((100 + k) * S + 5, 0.5 * k) for k in range(3)]
+    assert found[1].value.header.frame_id == "base" and found[1].value.header.stamp.sec == 101
 
 
 def test_a_chunk_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,16 +75,17 @@ class McapFile:
     """
 
     stamps_made = False
-    notes: tuple[str, ...] = ()
 
     def __init__(self, path: Path, max_chunk_bytes: int = MAX_CHUNK_BYTES) -> None:
         check_regular(path)
         self.path = path
+        self.notes: tuple[str, ...] = ()
         self._most = max_chunk_bytes
         self._stream = path.open("rb")
         self.unfinished = False
         self._chunked = True
         self.topics: dict[str, Stored] = {}
+        self._foreign: dict[int, str] = {}  # by channel, why its messages cannot be read
         try:
             read_magic(ReadDataStream(self._stream))
             self._size = os.fstat(self._stream.fileno()).st_size
@@ -116,7 +117,7 @@ class McapFile:
                     if opcode == Opcode.MESSAGE:
                         channel_id, log_time_ns, data = _message(self._record(stream, position, length))
                         topic = self._summary.channels[channel_id].topic
-                        if topic in names:
+                        if topic in names and channel_id not in self._foreign:
                             yield topic, log_time_ns, bytes(data)
             except BROKEN as error:
                 raise RecordingError(
@@ -126,7 +127,7 @@ class McapFile:
     def _from_chunks(self, stream: IO[bytes], names: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
         """Messages by the index of chunks, in order of log time; of equal times, as they were written."""
         topics = {number: channel.topic for number, channel in self._summary.channels.items()}
-        wanted = {number for number, topic in topics.items() if topic in names}
+        wanted = {number for number, topic in topics.items() if topic in names and number not in self._foreign}
         chunks = sorted(
             (chunk for chunk in self._summary.chunk_indexes if _may_hold(chunk, wanted)),
             key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset),
@@ -253,7 +254,8 @@ class McapFile:
         """Take one record into an index; messages are counted."""
         if opcode == Opcode.MESSAGE:
             channel_id, log_time_ns, _ = _message(record)
-            self._stored(summary, channel_id).add(log_time_ns)
+            if (stored := self._stored(summary, channel_id)) is not None:
+                stored.add(log_time_ns)
             return
         stream = ReadDataStream(BytesIO(record))
         if opcode == Opcode.SCHEMA:
@@ -284,13 +286,16 @@ class McapFile:
         if not self.topics and summary.statistics is not None:
             counts = summary.statistics.channel_message_counts
             for channel_id in summary.channels:
-                if counts.get(channel_id, 0):
-                    stored = self._stored(summary, channel_id)
+                if counts.get(channel_id, 0) and (stored := self._stored(summary, channel_id)) is not None:
                     stored.count += counts[channel_id]
                     first_ns, last_ns = self._extent(channel_id)
                     stored.first_ns, stored.last_ns = min(stored.first_ns, first_ns), max(stored.last_ns, last_ns)
         for channel_id in summary.channels:  # topics without a message
             self._stored(summary, channel_id)
+        if self._foreign and not self.topics:
+            raise RecordingError(f"{self.path}: {next(iter(self._foreign.values()))}")
+        # A topic that nobody uses is no reason to refuse the others.
+        self.notes = tuple(f"{self.path.name}: {reason}: left out" for reason in dict.fromkeys(self._foreign.values()))
 
     def _extent(self, channel_id: int) -> tuple[int, int]:
         """First and last log time of a channel, from as few of the message indexes as that takes."""
@@ -315,15 +320,17 @@ class McapFile:
         record = self._record(self._stream, position, length + _RECORD_HEAD_SIZE)
         return [log_time for log_time, _ in MessageIndex.read(ReadDataStream(BytesIO(record))).records]
 
-    def _stored(self, summary: Summary, channel_id: int) -> Stored:
+    def _stored(self, summary: Summary, channel_id: int) -> Stored | None:
+        """The topic of a channel; None where its messages are in an encoding that ROS 2 does not record."""
         channel = summary.channels[channel_id]
+        schema = summary.schemas.get(channel.schema_id)
+        if channel.message_encoding != "cdr" or schema is None:
+            self._foreign[channel_id] = (
+                f"messages of {channel.topic} are in {channel.message_encoding or 'no'} encoding"
+                f"{'' if schema else ' without a definition'}; expected CDR with one, as ROS 2 records"
+            )
+            return None
         if channel.topic not in self.topics:
-            schema = summary.schemas.get(channel.schema_id)
-            if channel.message_encoding != "cdr" or schema is None:
-                raise RecordingError(
-                    f"{self.path}: messages of {channel.topic} are in {channel.message_encoding or 'no'} encoding"
-                    f"{'' if schema else ' without a definition'}; expected CDR with one, as ROS 2 records"
-                )
             self.topics[channel.topic] = Stored(schema.name, schema.data.decode(), schema.encoding)
         return self.topics[channel.topic]
 

@@ -12,15 +12,18 @@ from typing import Any
 
 import yaml
 
-from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular
+from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular, unpacked
 from ngo_recordings.carmen_log import CarmenLog
+from ngo_recordings.copied_file import PACKED, CopiedFile, database_with_log, has_log, packed_file
 from ngo_recordings.decoding import Decoder
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import McapFile
 from ngo_recordings.ros1_bag import Ros1Bag
+from ngo_recordings.ros1_records import Ros1Records
 from ngo_recordings.rosbag_folder import RosbagFolder
 
-Source = McapFile | RosbagFolder | Ros1Bag | CarmenLog
+Source = McapFile | RosbagFolder | Ros1Bag | Ros1Records | CarmenLog | CopiedFile
+_PACKED_MESSAGE = b"\x28\xb5\x2f\xfd"  # begins no message in CDR
 
 _CARMEN = (".log", ".clf", ".log.gz", ".clf.gz")
 _KINDS = "a .mcap, .db3 or .bag file, a CARMEN log (.log, .clf, either with .gz), or the folder of a rosbag2"
@@ -146,25 +149,42 @@ def _open_sources(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
     if path.suffix == ".mcap":
         yield McapFile(path, max_chunk_bytes)
     elif path.suffix == ".db3":
-        yield RosbagFolder(path)
+        yield _database(path, max_chunk_bytes)
     elif path.suffix == ".bag":
-        yield Ros1Bag(path, max_chunk_bytes)
+        yield _ros1_bag(path, max_chunk_bytes)
+    elif path.name.endswith((".db3" + PACKED, ".mcap" + PACKED)):
+        yield packed_file(path, max_chunk_bytes)
     elif path.name.lower().endswith(_CARMEN):
         yield CarmenLog(path)
     else:
         raise RecordingError(f"{path} is no recording: expected {_KINDS}")
 
 
+def _database(path: Path, max_chunk_bytes: int) -> Source:
+    return database_with_log(path, max_chunk_bytes) if has_log(path) else RosbagFolder(path)
+
+
+def _ros1_bag(path: Path, max_chunk_bytes: int) -> Source:
+    """By its index, where it has one that can be used."""
+    try:
+        return Ros1Bag(path, max_chunk_bytes)
+    except RecordingError as error:
+        try:
+            return Ros1Records(path, max_chunk_bytes)
+        except RecordingError:
+            raise error from None
+
+
 def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
     """A folder whose recorder was killed has no metadata.yaml, and then its files are taken as they are."""
     metadata = path / "metadata.yaml"
     if not metadata.exists():
-        files = sorted(path.glob("*.mcap")) or sorted(path.glob("*.db3"))
+        patterns = "*.mcap", "*.db3", "*.mcap" + PACKED, "*.db3" + PACKED
+        files = next((found for pattern in patterns if (found := sorted(path.glob(pattern)))), [])
         if not files:
             raise RecordingError(f"{path} is no recording: it has neither metadata.yaml nor .mcap or .db3 files")
         for file in files:
-            check_regular(file)
-            yield McapFile(file, max_chunk_bytes) if file.suffix == ".mcap" else RosbagFolder(file)
+            yield from _open_sources(file, max_chunk_bytes)
         return
     check_regular(metadata)
     try:
@@ -179,6 +199,10 @@ def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
         for name in names:
             if (path / name).exists():  # what is missing is told by the library
                 check_regular(path / name)
+        if any(has_log(path / name) for name in names):
+            for name in names:
+                yield _database(path / name, max_chunk_bytes)
+            return
         yield RosbagFolder(path)
         return
     for name in names:
@@ -188,7 +212,13 @@ def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
 
 
 def _decoded(source: Source, decoder: Decoder, names: set[str]) -> Iterator[Message]:
-    for topic, log_time_ns, data in source.messages(names & source.topics.keys()):
+    for topic, log_time_ns, stored in source.messages(names & source.topics.keys()):
+        # A recording that packs each message says so in its metadata.yaml alone, which may be lost.
+        packed = isinstance(stored, bytes) and stored[:4] == _PACKED_MESSAGE
+        try:
+            data = unpacked(stored, "zstd", MAX_CHUNK_BYTES) if packed else stored
+        except ValueError as error:
+            raise RecordingError(f"{source.path} is damaged ({error}): copy it again") from None
         yield Message(topic, log_time_ns, decoder.decode(topic, log_time_ns, data))
 
 

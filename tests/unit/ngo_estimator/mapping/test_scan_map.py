@@ -182,6 +182,19 @@ def test_a_scan_far_outside_is_left_out_and_the_others_move() -> None:
     assert update.left >= 1
 
 
+def test_a_map_too_large_for_its_cells_gets_larger_ones_by_itself() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(FRAMES))
+    scan_map.update(stamps(), path())
+    poses = path(0.01)
+    poses[30:, :2] += 1500.0
+    update = scan_map.update(stamps(), poses)
+    cells = scan_map.cells()
+    assert not update.too_large and update.left == 0 and len(scan_map) == FRAMES
+    assert cells.resolution_m == scan_map.resolution_m == 8.0 * EVERY.resolution_m
+    assert cells.values.size <= 40_000_000
+
+
 def test_a_restored_map_is_drawn_again_and_goes_on() -> None:
     scan_map, again = ScanMap(EVERY), ScanMap(replace(EVERY, most_waiting=5))
     take(scan_map, range(40))

@@ -72,7 +72,14 @@ class OccupancyMap:
 
 
 class MapTooLarge(ValueError):
-    """Scans lie so far apart that no map of them fits into memory; the map is as it was before."""
+    """Scans lie so far apart that no map of them fits into memory; the map is as it was before.
+
+    With cells ``coarser`` times as large, a power of 2, it would fit.
+    """
+
+    def __init__(self, message: str, coarser: float = math.inf) -> None:
+        super().__init__(message)
+        self.coarser = coarser
 
 
 class OccupancyGrid:
@@ -134,8 +141,11 @@ class OccupancyGrid:
         width, height = high - low
         if not width * height <= _MOST_CELLS:
             size = f"{width * self.resolution_m:.0f} m x {height * self.resolution_m:.0f} m"
+            # Twice as many: the extent grows in chunks of cells.
+            excess = 2.0 * width * height / _MOST_CELLS
+            coarser = 2.0 ** math.ceil(0.5 * math.log2(excess)) if math.isfinite(excess) else math.inf
             raise MapTooLarge(
-                f"the map would be {size}; expected at most {_MOST_CELLS} cells: use a coarser resolution"
+                f"the map would be {size}; expected at most {_MOST_CELLS} cells: use a coarser resolution", coarser
             )
         if self._hits.shape == (height, width):
             return

@@ -3,8 +3,9 @@
 import math
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, O
 from ngo_estimator.mapping.range_scan import Array, RangeScan, range_scan
 
 _RAYS_AT_ONCE, _SCANS_AT_ONCE = 10_000, 256  # between two looks at the clock
+_COARSEST = 32.0
+"""Times the cells that were asked for: a map that is still too large then has scans at absurd poses."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,6 @@ class ScanMap:
 
     def __init__(self, config: ScanMapConfig | None = None) -> None:
         self.config = config or ScanMapConfig()
-        self._grid = OccupancyGrid(self.config.resolution_m)
         self._source: tuple[int, int] | None = None  # origin and newest stamp of the steps
         self._run = 0  # counts the starts of the source
         self._last_odom: Array | None = None  # of the frame whose scan was taken last
@@ -90,7 +92,7 @@ class ScanMap:
         return len(self._waiting)
 
     def _forget(self) -> None:
-        self._grid.clear()
+        self._grid = OccupancyGrid(self.config.resolution_m)
         self._span: tuple[int, int] | None = None  # first and last stamp of the trajectory
         self._map_run = self._run
         self._stamps = np.zeros(0, np.int64)
@@ -172,23 +174,36 @@ class ScanMap:
         deadline = time.monotonic() + budget_s
         restarted = self._begin_anew_for(stamps_ns)
         stamps, scans, poses = self._placed(stamps_ns, poses_xyyaw)
-        entered, too_large = len(scans), ""
-        try:
-            self._enter(stamps, scans, poses)
-        except MapTooLarge as error:
-            entered, too_large = 0, str(error)
+        entered, too_large = len(scans), self._fitting(lambda: self._enter(stamps, scans, poses))
+        entered = 0 if too_large else entered
         now = poses_xyyaw[np.searchsorted(stamps_ns, self._stamps)]
         order, done, moved = self._moved_most_first(now), 0, 0
         while done < len(order) and time.monotonic() < deadline:
             rays = np.cumsum([len(self._scans[slot].ends) for slot in order[done : done + _SCANS_AT_ONCE]])
             some = order[done : done + max(1, int(np.searchsorted(rays, _RAYS_AT_ONCE)))]
             done += len(some)
-            try:
-                self._move(some, now[some])
-                moved += len(some)
-            except MapTooLarge as error:
-                too_large = str(error)
+            refused = self._fitting(partial(self._move, some, now[some]))
+            moved += 0 if refused else len(some)
+            too_large = refused or too_large
         return MapUpdate(entered, moved, len(order) - moved, restarted, too_large)
+
+    @property
+    def resolution_m(self) -> float:
+        """Side of the map's cells: coarser than it was asked for where the map would be too large."""
+        return self._grid.resolution_m
+
+    def _fitting(self, change: Callable[[], None]) -> str:
+        """Do a change, in a coarser map if it does not fit; returns why it could not be done, or nothing."""
+        while True:
+            try:
+                change()
+                return ""
+            except MapTooLarge as error:
+                resolution_m = max(error.coarser, 2.0) * self._grid.resolution_m
+                if resolution_m > _COARSEST * self.config.resolution_m:
+                    return str(error)
+                self._grid = OccupancyGrid(resolution_m)
+                self._grid.add(self._scans, self._poses)
 
     def _moved_most_first(self, now: Array) -> np.ndarray:
         """Slots of the scans that have moved, by their poses now ``(scans, 3)``."""
@@ -196,7 +211,7 @@ class ScanMap:
         turned = np.abs(np.remainder(away[:, 2] + math.pi, 2.0 * math.pi) - math.pi)
         moved_m = np.hypot(away[:, 0], away[:, 1]) + turned * self._reach
         order = np.argsort(-moved_m, kind="stable")
-        return order[: np.count_nonzero(moved_m > self.config.moved_cells * self.config.resolution_m)]
+        return order[: np.count_nonzero(moved_m > self.config.moved_cells * self._grid.resolution_m)]
 
     def cells(self) -> OccupancyMap:
         """The probabilities of the map's cells."""

@@ -89,7 +89,8 @@ class MapPublisher:
 
 def changed_part(before: "OccupancyMap", after: "OccupancyMap") -> tuple[slice, slice] | None:
     """Rows and columns of the part that differs, empty where none does; None where the extent is another."""
-    if before.values.shape != after.values.shape or not np.array_equal(before.origin_xy, after.origin_xy):
+    extents = [(each.resolution_m, *each.values.shape, *each.origin_xy.tolist()) for each in (before, after)]
+    if extents[0] != extents[1]:
         return None
     differs = before.values != after.values
     rows, columns = (np.flatnonzero(differs.any(axis=axis)) for axis in (1, 0))

@@ -47,6 +47,7 @@ class NgoMap(Node):
         self._source = self._open_source(settings)
         warm_up()
         self._map = ScanMap(ScanMapConfig(resolution_m=settings.resolution))
+        self._said_m = settings.resolution
         self._identity = {"map": settings.world, "max_range": settings.max_range}
         if settings.state:
             self._load(Path(settings.save_directory).expanduser() / Path(settings.state).expanduser())
@@ -151,6 +152,9 @@ class NgoMap(Node):
         if update.restarted:
             self._missed = ""
             self.get_logger().info("the trajectory began anew, and so does the map")
+        if self._map.resolution_m > self._said_m:
+            self._said_m = self._map.resolution_m
+            self.get_logger().warning(f"the map is too large for smaller cells: they are {self._said_m:g} m now")
         if update.too_large:
             self._status.dropped("scans", update.too_large)
 

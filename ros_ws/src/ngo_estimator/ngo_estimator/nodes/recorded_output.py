@@ -72,6 +72,8 @@ class RecordedOutput:
         self._source, self._map = source, ScanMap()
         self.left_out = ""
         """Why scans are not in the map, where any were left out."""
+        self.coarser = ""
+        """Why the map's cells are larger than usual, where they are."""
         self._writer = RecordingWriter(folder / "trajectories.mcap", flush_s=None, library="ngo_estimator")
         for topic, type_name in TYPES.items():
             self._writer.add_topic(topic, type_name)
@@ -100,7 +102,11 @@ class RecordedOutput:
 
     def follow(self, trajectory: Trajectory) -> None:
         """Let the map follow the trajectory as it is now."""
+        asked_m = self._map.config.resolution_m
         self.left_out = self._map.update(trajectory.stamps_ns, trajectory.poses_xyyaw).too_large or self.left_out
+        if self._map.resolution_m > asked_m:
+            made_m = self._map.resolution_m
+            self.coarser = f"the map is too large for cells of {asked_m:g} m: it has cells of {made_m:g} m"
 
     def finish(self, run: RecordedRun, title: str, settings: ReportSettings) -> dict[str, Report]:
         """Write everything about the whole trajectory; returns the errors of each estimate, none without truth.

@@ -224,6 +224,8 @@ def _write(
             except ValueError as error:
                 console.print(f"no errors were measured: {error}", soft_wrap=True, highlight=False)
                 reports = {}
+            if output.coarser:
+                console.print(output.coarser, soft_wrap=True, highlight=False)
             if output.left_out:
                 console.print(f"scans are not in the map: {output.left_out}", soft_wrap=True, highlight=False)
             stack.pop_all().close()

@@ -1,0 +1,90 @@
+"""Files that must be made whole before they are read: packed ones, and databases whose writer was killed."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import zstandard
+
+from ngo_recordings.bounds import check_regular
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.mcap_file import McapFile
+from ngo_recordings.rosbag_folder import RosbagFolder
+
+PACKED = ".zstd"
+
+
+class CopiedFile:
+    """A recording that is read from a copy in a temporary folder, which goes with it.
+
+    Raises RecordingError where the copy cannot be made or read.
+    """
+
+    def __init__(self, path: Path, name: str, fill: Callable[[Path], object], max_chunk_bytes: int, note: str) -> None:
+        self.path = path
+        self._folder = TemporaryDirectory(prefix="ngo_recording_")
+        copy = Path(self._folder.name, name)
+        try:
+            fill(copy)
+            self._file = McapFile(copy, max_chunk_bytes) if copy.suffix == ".mcap" else RosbagFolder(copy)
+        except (OSError, sqlite3.Error, zstandard.ZstdError, RecordingError) as error:
+            self._folder.cleanup()
+            reason = " ".join(str(error).replace(str(copy), str(path)).split())
+            raise RecordingError(f"{path} cannot be read: {reason}") from None
+        self.topics = self._file.topics
+        self.unfinished, self.stamps_made = self._file.unfinished, self._file.stamps_made
+        self.notes = (*self._file.notes, note) if note else self._file.notes
+
+    def close(self) -> None:
+        """Close the copy, and remove it."""
+        self._file.close()
+        self._folder.cleanup()
+
+    def messages(self, names: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, log time and CDR bytes of the messages of these topics, in order of log time."""
+        yield from self._file.messages(names)
+
+
+def packed_file(path: Path, max_chunk_bytes: int) -> CopiedFile:
+    """A .db3.zstd or .mcap.zstd file without its metadata.yaml."""
+    check_regular(path)
+
+    def unpack(copy: Path) -> None:
+        with path.open("rb") as packed, copy.open("wb") as whole:
+            zstandard.ZstdDecompressor().copy_stream(packed, whole)
+
+    return CopiedFile(path, path.stem, unpack, max_chunk_bytes, "")
+
+
+def log_of(path: Path) -> Path:
+    """The file beside a database that holds what its writer had not put into it yet."""
+    return path.with_name(path.name + "-wal")
+
+
+def has_log(path: Path) -> bool:
+    """Whether a database has such a file, and there is something in it."""
+    log = log_of(path)
+    return log.is_file() and log.stat().st_size > 0
+
+
+def database_with_log(path: Path, max_chunk_bytes: int) -> CopiedFile:
+    """A .db3 file of a recorder that was killed, with what is in its log. The file itself stays as it is."""
+    for each in (path, log_of(path)):
+        check_regular(each)
+
+    def merge(copy: Path) -> None:
+        shutil.copyfile(path, copy)
+        shutil.copyfile(log_of(path), log_of(copy))
+        database = sqlite3.connect(copy)
+        try:
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            database.execute("PRAGMA journal_mode=DELETE")
+        finally:
+            database.close()
+
+    note = f"{path.name} was not closed by its recorder: {log_of(path).name} holds its end, which is read, too"
+    return CopiedFile(path, path.name, merge, max_chunk_bytes, note)
