@@ -27,7 +27,7 @@ from demo.graph import NodeSpec
 # Ample for a machine of its own; one that is shared may need more, and `--timeout` of pytest as well.
 TIMEOUT_S = float(os.environ.get("NGO_TEST_TIMEOUT_S", "60"))
 
-_ASK_AGAIN_S = 2.0
+_ASK_AGAIN_S = 0.3  # an answer to who is not known yet never comes
 
 Result = TypeVar("Result")
 
