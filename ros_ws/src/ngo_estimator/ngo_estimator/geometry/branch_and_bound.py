@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.spatial import KDTree
 
 from ngo_estimator.geometry.planar_motion import transformed
 
 _REACH = 3.0
 """Deviations around a point that have a likelihood."""
+_NEAR_DEPTH = 4  # of the blocks where a search near places begins: 1.3 m a side where a cell is 8 cm
 _WIDEST_CELLS = 4096  # side of a grid: 117 MB, and 205 m where a cell is 5 cm
 
 
@@ -116,11 +118,18 @@ def pooled_grid(config: SearchConfig, points: np.ndarray) -> PooledGrid:
 
 
 def search(
-    config: SearchConfig, grid: PooledGrid, points: np.ndarray, centre: np.ndarray, window: np.ndarray
+    config: SearchConfig,
+    grid: PooledGrid,
+    points: np.ndarray,
+    centre: np.ndarray,
+    window: np.ndarray,
+    near: tuple[np.ndarray, float] | None = None,
 ) -> SearchMatch | None:
     """Best pose of points ``(n, 2)`` (m) within ``window`` to each side of ``centre``, both ``(3,)`` (m, m, rad).
 
     Positions and headings are taken on a lattice around ``centre``. A window of pi and more in heading is a full turn.
+    With ``near``, places ``(k, 2)`` in the map and a distance (m), positions farther than that from all of the places
+    are left out, to a block.
     Returns ``None`` where no response reaches ``least_response``, or the search was cut short before it found the best.
     """
     if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
@@ -134,8 +143,16 @@ def search(
     cells = np.floor(np.stack((x, y), axis=-1) / grid.resolution_m).astype(np.int32)
     half_x, half_y = (math.floor(w / grid.resolution_m + 1e-9) for w in window[:2])
     apart = config.separation_m / grid.resolution_m
+    depth = len(grid.levels) - 1
+    while depth > 0 and (1 << depth) > 2 * max(half_x, half_y) + 1:
+        depth -= 1
+    begin = np.ones([-(-(2 * half + 1) // (1 << depth)) for half in (half_x, half_y)], np.bool_)
+    if near is not None:
+        depth = min(depth, _NEAR_DEPTH)
+        offsets = (near[0] - centre[:2]) / grid.resolution_m + (half_x, half_y)
+        begin = _blocks_near(offsets, near[1] / grid.resolution_m, 1 << depth, 2 * half_x + 1, 2 * half_y + 1)
     found = _best_first(
-        grid.levels, cells, headings, half_x, half_y, apart, math.radians(config.separation_deg),
+        grid.levels[: depth + 1], cells, headings, half_x, half_y, begin, apart, math.radians(config.separation_deg),
         config.least_response, config.least_second, config.most_blocks,
     )  # fmt: skip
     response, second, best, other = found
@@ -179,6 +196,38 @@ def _stamp(grid: np.ndarray, points: np.ndarray, resolution: float, deviation: f
                 grid[i, j] = max(grid[i, j], value)
 
 
+def _blocks_near(offsets: np.ndarray, reach: float, step: int, columns: int, rows: int) -> np.ndarray:
+    """Which blocks of a lattice have a cell within a reach of one of the offsets ``(k, 2)`` from its corner, bool."""
+    shape = np.array((-(-columns // step), -(-rows // step)))
+    around = math.ceil(reach / step) + 1
+    i, j = np.mgrid[-around : around + 1, -around : around + 1]
+    block = np.unique(np.floor(offsets / step).astype(np.int64), axis=0)
+    blocks = (block[:, None] + np.stack((i.ravel(), j.ravel()), axis=1)).reshape(-1, 2)
+    blocks = np.unique(blocks[((blocks >= 0) & (blocks < shape)).all(axis=1)], axis=0)
+    away = KDTree(offsets).query((blocks + 0.5) * step)[0]
+    blocks = blocks[away <= reach + step * math.sqrt(0.5)]
+    begin = np.zeros(shape, np.bool_)
+    begin[tuple(blocks.T)] = True
+    return begin
+
+
+@njit(cache=True)
+def _bound(level: np.ndarray, cells: np.ndarray, across: int, up: int, least: float) -> int:
+    """The sum of ``_sum``, or -1 where it is below ``least``."""
+    rows, columns = level.shape
+    total, missing = 0, 255 * len(cells) - least
+    for k in range(len(cells)):
+        column, row = cells[k, 0] + across, cells[k, 1] + up
+        value = 0
+        if 0 <= column < columns and 0 <= row < rows:
+            value = level[row, column]
+        total += value
+        missing -= 255 - value
+        if missing < 0.0:
+            return -1
+    return total
+
+
 @njit(cache=True)
 def _sum(level: np.ndarray, cells: np.ndarray, across: int, up: int) -> int:
     """Sum of the likelihoods at cells ``(n, 2)`` moved by ``across`` columns and ``up`` rows."""
@@ -193,25 +242,25 @@ def _sum(level: np.ndarray, cells: np.ndarray, across: int, up: int) -> int:
 
 @njit(cache=True)
 def _best_first(
-    levels: np.ndarray, cells: np.ndarray, headings: np.ndarray, half_x: int, half_y: int, apart: float,
-    apart_rad: float, least_response: float, least_second: float, most_blocks: int,
+    levels: np.ndarray, cells: np.ndarray, headings: np.ndarray, half_x: int, half_y: int, begin: np.ndarray,
+    apart: float, apart_rad: float, least_response: float, least_second: float, most_blocks: int,
 ) -> tuple[float, float, tuple[int, int, int], tuple[int, int, int]]:  # fmt: skip
     """Response, second response, and heading, column and row of both; -1 for what was not found."""
     nowhere = (-1, 0, 0)
     depth = len(levels) - 1
-    while depth > 0 and (1 << depth) > 2 * max(half_x, half_y) + 1:
-        depth -= 1
     full = 255.0 * cells.shape[1]
     step = 1 << depth
     least = least_response * full
     # A heap of the smallest: sums are negated. Heading, column, row and level make the order of equals definite.
     heap = [(0, 0, 0, 0, 0) for _ in range(0)]
     for angle in range(len(headings)):
-        for across in range(-half_x, half_x + 1, step):
-            for up in range(-half_y, half_y + 1, step):
-                bound = _sum(levels[depth], cells[angle], across, up)
-                if bound >= least:
-                    heap.append((-bound, depth, angle, across, up))
+        for i in range(begin.shape[0]):
+            for j in range(begin.shape[1]):
+                if begin[i, j]:
+                    across, up = i * step - half_x, j * step - half_y
+                    bound = _bound(levels[depth], cells[angle], across, up, least)
+                    if bound >= 0:
+                        heap.append((-bound, depth, angle, across, up))
     heapq.heapify(heap)
     best, best_angle, best_across, best_up = -1.0, 0, 0, 0
     blocks = 0
@@ -243,8 +292,8 @@ def _best_first(
             for j in range(2):
                 column, row = across + i * size, up + j * size
                 if column <= half_x and row <= half_y:
-                    bound = _sum(levels[level - 1], cells[angle], column, row)
-                    if bound >= least:
+                    bound = _bound(levels[level - 1], cells[angle], column, row, least)
+                    if bound >= 0:
                         heapq.heappush(heap, (-bound, level - 1, angle, column, row))
     if best < 0.0:
         return -1.0, 0.0, nowhere, nowhere

@@ -1,14 +1,23 @@
 """The chain of key scans: nodes by motion, and the steps between them. A robot that stands adds no node."""
 
+import math
+
 import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import require
+from ngo_estimator.data.state_arrays import require, require_ascending
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.sparsification import largest_variances
+
+OPEN = np.diag((1e4, 1e4, math.pi**2))
+"""Covariance of a step that nobody measured: the robot may be anywhere, as far as a planar covariance reaches."""
+
+_LEAST_PLACE_M = 5.0
+"""Extent at least of the place where a robot may be after such a step."""
 
 
 class KeyScanChain(NodeChain):
@@ -21,7 +30,21 @@ class KeyScanChain(NodeChain):
         self._step_covariance = GrowingRows((3, 3), np.float64)  # for the optimisation
         self._published_covariance = GrowingRows((3, 3), np.float64)
         self._step_variance = GrowingRows((), np.float64)  # the largest of each
+        self._segments = GrowingRows((), np.int64)
+        self._segments.append(0)
+        self._opens = 0  # whether a segment begins at the next node
         self._key_stamp_ns = 0
+
+    @property
+    def segments(self) -> np.ndarray:
+        """The nodes ``(segments,)`` with which a segment begins: nobody measured the step to it."""
+        return self._segments.values
+
+    @property
+    def last_step(self) -> np.ndarray:
+        """The step ``(3,)`` to the last node."""
+        step: np.ndarray = self._steps.values[-1]
+        return step
 
     @property
     def edges(self) -> np.ndarray:
@@ -41,8 +64,20 @@ class KeyScanChain(NodeChain):
 
     @property
     def steps(self) -> RelativePoses:
-        """The steps from each node to the next."""
-        return RelativePoses.of_covariances(self.edges, self._steps.values, self._step_covariance.values)
+        """The steps from each node to the next; those that nobody measured lead anywhere in the place."""
+        return self.steps_at(self.poses)
+
+    def steps_at(self, poses: np.ndarray) -> RelativePoses:
+        """The same where the nodes are at other poses ``(keys, 3)``: from there steps that nobody measured go on."""
+        opens = self.segments[1:] - 1
+        if len(opens) == 0:
+            return RelativePoses.of_covariances(self.edges, self._steps.values, self._step_covariance.values)
+        relative, covariance = self._steps.values.copy(), self._step_covariance.values.copy()
+        relative[opens] = se2.between(poses[opens], poses[opens + 1])
+        # The Gaussian that is as high as an even density over the square around all poses.
+        extent = max(float(np.ptp(poses[:, :2], axis=0).max()), _LEAST_PLACE_M)
+        covariance[opens] = np.diag((extent**2 / math.tau, extent**2 / math.tau, math.tau))
+        return RelativePoses.of_covariances(self.edges, relative, covariance)
 
     @property
     def published_steps(self) -> RelativePoses:
@@ -53,6 +88,10 @@ class KeyScanChain(NodeChain):
         """Take the stamp of the first frame, which is a node."""
         self._key_stamp_ns = stamp_ns
 
+    def open_segment(self) -> None:
+        """Begin a segment with the next node."""
+        self._opens = 1
+
     def add_key(self, key: KeyScanStep, joins: bool) -> None:
         """Make the newest frame, which ends at a key scan, a node."""
         if key.from_key_stamp_ns == self._key_stamp_ns and not joins:
@@ -62,6 +101,10 @@ class KeyScanChain(NodeChain):
         else:
             covariance = published = bounded(self.since_covariance)
         covariance, published = covariance + self._floor, published + self._floor
+        if self._opens:
+            covariance = published = OPEN
+            self._segments.append(len(self))
+            self._opens = 0
         self._steps.append(self.add_node(published))
         self._step_covariance.append(covariance)
         self._step_variance.append(largest_variances(covariance[None])[0])
@@ -69,7 +112,8 @@ class KeyScanChain(NodeChain):
         self._key_stamp_ns = key.scan.stamp_ns
 
     SAVED = (
-        *NodeChain.SAVED, "_steps", "_step_covariance", "_published_covariance", "_step_variance", "_key_stamp_ns",
+        *NodeChain.SAVED, "_steps", "_step_covariance", "_published_covariance", "_step_variance", "_segments",
+        "_opens", "_key_stamp_ns",
     )  # fmt: skip
 
     def check_state(self) -> None:
@@ -78,3 +122,5 @@ class KeyScanChain(NodeChain):
         keys = len(self)
         of_steps = (self._steps, self._step_covariance, self._published_covariance, self._step_variance)
         require({len(rows) for rows in of_steps} == {keys - 1}, f"there are not {keys} key scans, and a step less")
+        require_ascending(self.segments, "_segments", keys)
+        require(len(self.segments) > 0 and self.segments[0] == 0, "no segment begins at the first key scan")

@@ -55,6 +55,12 @@ class KeyScanViews:
         other._forgotten = set(self._forgotten)
         return other
 
+    def of_keys(self, keys: Sequence[int]) -> "KeyScanViews":
+        """Those of some key scans, none of them forgotten."""
+        other = KeyScanViews()
+        other._profiles = [self._profiles[key] for key in keys]
+        return other
+
     def at(self, poses: np.ndarray) -> np.ndarray:
         """Where the robot looks at poses ``(keys, 3)`` of all key scans: their middles ``(keys, 2)``, in the map."""
         return _placed(self._middles.values, poses)

@@ -23,24 +23,34 @@ class LoopCandidate:
     likely: np.ndarray
 
 
-def graph_distances(poses: np.ndarray, loops: np.ndarray, key: int) -> np.ndarray:
-    """Length ``(keys,)`` of the shortest path through the graph from a key to each other (m).
+def graph_distances(
+    poses: np.ndarray, loops: np.ndarray, key: int, segments: Sequence[int] | np.ndarray = ()
+) -> np.ndarray:
+    """Length ``(keys,)`` of the shortest path through the graph from a key to each other (m); infinite without one.
 
-    The paths lead along the chain of poses ``(keys, 3)``, and over loops ``(e, 2)`` between their keys.
+    The paths lead along the chain of poses ``(keys, 3)``, but not over the steps to the first keys of ``segments``,
+    and over loops ``(e, 2)`` between their keys.
     """
     chain = np.arange(len(poses) - 1)
     nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), loops))
     lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
+    begin = np.asarray(segments, np.int64)
+    lengths[begin[begin > 0] - 1] = math.inf
     # A millimetre more: a loop between keys in one place has a length, too.
     distances: np.ndarray = shortest_paths(nodes, lengths + 1e-3, len(poses), key)
     return distances
 
 
 def distance_windows(config: WindowConfig, distances: np.ndarray) -> np.ndarray:
-    """Half widths ``(keys, 3)`` of the search (m, m, rad) after distances through the graph ``(keys,)``."""
+    """Half widths ``(keys, 3)`` of the search (m, m, rad) after distances through the graph ``(keys,)``.
+
+    They are infinite where the distance is.
+    """
     metres = np.minimum(config.least_m + config.share * distances, config.most_m)
     degrees = np.minimum(config.least_deg + config.deg_per_m * distances, config.most_deg)
-    return np.stack((metres, metres, np.radians(degrees)), axis=-1)
+    windows = np.stack((metres, metres, np.radians(degrees)), axis=-1)
+    windows[np.isinf(distances)] = math.inf
+    return windows
 
 
 def loop_candidates(
@@ -52,7 +62,7 @@ def loop_candidates(
     last = int(np.searchsorted(path, path[-1] - config.least_gap_m)) - config.submap_keys // 2
     last = min(last, key - config.source_keys - config.submap_keys // 2)
     steps = range(0, max(0, last), config.place_step)
-    places = [place for place in steps if place not in forgotten]
+    places = [place for place in steps if place not in forgotten and windows[place, 0] < math.inf]
     if len(places) == 0:
         return []
     seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)

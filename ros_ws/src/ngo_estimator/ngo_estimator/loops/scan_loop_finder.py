@@ -32,7 +32,12 @@ class ScanLoopFinder:
         self._submaps = ScanSubmaps(config)
 
     def find(
-        self, scans: Sequence[KeyScan], poses: np.ndarray, windows: np.ndarray, matches: Sequence[int] = ()
+        self,
+        scans: Sequence[KeyScan],
+        poses: np.ndarray,
+        windows: np.ndarray,
+        matches: Sequence[int] = (),
+        segments: np.ndarray | None = None,
     ) -> np.ndarray:
         """Loops of the last key, under the present poses.
 
@@ -40,6 +45,7 @@ class ScanLoopFinder:
             scans: of all keys, in their order; each call has one more than the call before, or more.
             poses: of all keys in the map ``(keys, 3)``.
             windows: half widths of the search around each key's pose, as seen from the last ``(keys, 3)`` (m, m, rad).
+            segments: keys with which segments of the map begin; None: there is one.
             matches: earlier keys that look like the last one, best first. They go before those near the pose, and are
                 searched in all directions.
 
@@ -58,9 +64,11 @@ class ScanLoopFinder:
             return np.zeros(0, np.int64)
         if not (windows > 0.0).all():
             raise ValueError(f"the narrowest of the windows is {windows.min()}; expected positive half widths")
+        if segments is not None and count - segments[-1] < config.source_keys:
+            return np.zeros(0, np.int64)  # scans of two segments do not lie together
         loops = self.loops
         for candidate in loop_candidates(config, self.views, poses, windows, matches):
-            loop = self._verified(scans, poses, candidate)
+            loop = self._verified(scans, poses, candidate, segments)
             if loop is not None:
                 loops = loops.extended(loop)
         if len(loops) == len(self.loops):
@@ -68,6 +76,11 @@ class ScanLoopFinder:
         self.loops = with_agreement(config, loops, len(self.loops), poses)
         fresh: np.ndarray = np.flatnonzero(self.loops.accepted & ~loops.accepted)
         return fresh
+
+    def add(self, loops: ScanLoops) -> np.ndarray:
+        """Take loops that were found and judged elsewhere; returns which of ``loops`` they are."""
+        known, self.loops = len(self.loops), self.loops.extended(loops)
+        return np.arange(known, len(self.loops))
 
     def forget(self, keys: Iterable[int]) -> None:
         """Look for no more loops at these keys, whose scans are gone."""
@@ -80,10 +93,12 @@ class ScanLoopFinder:
         keys, pairs = len(self.views), self.loops.pairs
         require(bool(((pairs >= 0) & (pairs < keys)).all()), f"a loop joins key scans that are not among the {keys}")
 
-    def _verified(self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: LoopCandidate) -> ScanLoops | None:
+    def _verified(
+        self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: LoopCandidate, segments: np.ndarray | None
+    ) -> ScanLoops | None:
         """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""
         config, key = self.config, len(scans) - 1
-        submap = self._submaps.around(candidate.place, scans, self.views.profiles, poses)
+        submap = self._submaps.around(candidate.place, scans, self.views.profiles, poses, segments)
         first = max(0, key + 1 - config.source_keys)
         source = laid_together(scans[first:], self.views.profiles[first:], poses[first:])
         found = fit(config, submap, source, candidate.centre, candidate.window)

@@ -44,13 +44,27 @@ class ScanSubmaps:
     def __len__(self) -> int:
         return len(self._submaps)
 
-    def around(self, place: int, scans: Sequence[KeyScan], profiles: Sequence[np.ndarray], poses: np.ndarray) -> Submap:
-        """The submap around a key, made of all key scans, their range profiles and their poses ``(keys, 3)``."""
+    def around(
+        self,
+        place: int,
+        scans: Sequence[KeyScan],
+        profiles: Sequence[np.ndarray],
+        poses: np.ndarray,
+        segments: np.ndarray | None = None,
+    ) -> Submap:
+        """The submap around a key, made of all key scans, their range profiles and their poses ``(keys, 3)``.
+
+        It holds no scan of another segment; ``segments`` are the keys with which these begin.
+        """
         if place in self._submaps:
             self._submaps.move_to_end(place)
             return self._submaps[place]
         half = self._config.submap_keys // 2
         first, after = max(0, place - half), min(len(scans), place - half + self._config.submap_keys)
+        if segments is not None:
+            borders = np.append(segments, len(scans))
+            own = int(np.searchsorted(segments, place, side="right"))
+            first, after = max(first, int(borders[own - 1])), min(after, int(borders[own]))
         local = _between(poses[place], poses[first:after])
         submap = self._made(first, local, placed(scans[first:after], profiles[first:after], local))
         self._submaps[place] = submap

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ngo_estimator.geometry.planar_covariance import position_std
+from ngo_estimator.trajectory.files import seconds
 
 if TYPE_CHECKING:
     from ngo_estimator.slam.loop_report import LoopReport
@@ -18,6 +19,7 @@ class TrajectoryReport:
         self._gaps = self._restarts = self._new_gaps = 0
         self._fault = ""
         self._last_correction_m = 0.0
+        self._lost_since_ns: int | None = None
 
     def count(self, gap: bool, restarted: bool) -> None:
         """Count a relative pose."""
@@ -28,12 +30,14 @@ class TrajectoryReport:
     def updated(self, update: "TrajectoryUpdate") -> None:
         """Take what a relative pose, or the end of an optimisation, changed."""
         self._fault = update.fault or self._fault
+        self._lost_since_ns = update.lost_since_ns
         if update.optimized:
             self._last_correction_m = update.largest_move_m
 
     def begin_anew(self) -> None:
-        """Forget the last correction, which was of another trajectory."""
+        """Forget what was of another trajectory."""
         self._last_correction_m = 0.0
+        self._lost_since_ns = None
 
     def counts(self) -> dict[str, str]:
         """Values for diagnostics in any mode."""
@@ -56,8 +60,10 @@ class TrajectoryReport:
         }
 
     def problems(self) -> list[str]:
-        """Gaps and faults since the last call."""
+        """Gaps and faults since the last call, and that the robot is lost."""
         found = []
+        if self._lost_since_ns is not None:
+            found.append(f"not localised in the map since {seconds(self._lost_since_ns)}")
         if self._new_gaps:
             found.append(f"{self._new_gaps} gaps in the relative poses, bridged by the odometry")
             self._new_gaps = 0

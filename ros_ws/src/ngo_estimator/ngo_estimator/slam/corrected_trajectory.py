@@ -287,6 +287,7 @@ class CorrectedTrajectory(ABC):
         graph = self._graph
         pose, covariance = graph.newest()
         map_from_odom = compose(pose, between(self._odom, np.zeros(3)))
+        lost = graph.lost_since
         return TrajectoryUpdate(
             stamp_ns=int(self._log.stamps_ns.values[-1]),
             pose_xyyaw=_read_only(pose.copy()),
@@ -300,6 +301,7 @@ class CorrectedTrajectory(ABC):
             closed_loops=int((graph.closed.weight > 0.5).sum()),
             window_fill=graph.window_fill,
             fault=self._fault,
+            lost_since_ns=None if lost is None else int(self._log.stamps_ns.values[lost]),
         )
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.data.state_arrays import Arrays, flat, part, require, split, taken, under
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.se2 import compose
 from ngo_estimator.slam.sightings import Sightings
@@ -71,9 +73,18 @@ class HypothesisWindow:
         return len(self._sightings)
 
     @property
+    def sightings(self) -> list[Sightings]:
+        """Those of each look, as they were then."""
+        return self._sightings
+
+    @property
     def way_m(self) -> np.ndarray:
         """Way since each look ``(looks,)``."""
         return self._way_m
+
+    def map_sightings(self, mapped: Callable[[Sightings], Sightings]) -> None:
+        """Put others in the place of the sightings of each look, as where the map was laid out anew."""
+        self._sightings = [mapped(sightings) for sightings in self._sightings]
 
     def move(self, relative: np.ndarray, covariance: np.ndarray) -> None:
         """Carry the sightings over a step ``(3,)`` with its covariance ``(3, 3)``."""
@@ -88,6 +99,32 @@ class HypothesisWindow:
         self._since = np.concatenate((self._since[drop:], np.zeros((1, 3))))
         self._covariance = np.concatenate((self._covariance[drop:], np.zeros((1, 3, 3))))
         self._way_m = np.append(self._way_m[drop:], 0.0)
+
+    def state(self) -> Arrays:
+        """All looks, for ``restore``."""
+        columns = {
+            "poses": flat([s.poses for s in self._sightings], np.zeros((0, 3))),
+            "covariance": flat([s.covariance for s in self._sightings], np.zeros((0, 3, 3))),
+            "belief": flat([s.belief for s in self._sightings], np.zeros(0)),
+        }
+        arrays: Arrays = {"since": self._since.copy(), "since_covariance": self._covariance.copy()}
+        arrays["way_m"] = self._way_m.copy()
+        for name, column in columns.items():
+            arrays |= under(name, column)
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``, in place of what is here; raises ``StateError``."""
+        shapes = {"poses": (3,), "covariance": (3, 3), "belief": ()}
+        columns = [split(part(arrays, name), np.float64, *shape) for name, shape in shapes.items()]
+        looks = len(columns[0])
+        require(looks <= self._size, f"there are {looks} looks; expected at most {self._size}")
+        same = all([len(x) for x in column] == [len(x) for x in columns[0]] for column in columns)
+        require(same, "the sightings of a look have no pose, no covariance or no belief")
+        self._sightings = [Sightings(*rows) for rows in zip(*columns, strict=True)]
+        self._since = taken(arrays, "since", np.float64, looks, 3)
+        self._covariance = taken(arrays, "since_covariance", np.float64, looks, 3, 3)
+        self._way_m = taken(arrays, "way_m", np.float64, looks)
 
     def hypotheses(self) -> Hypotheses:
         """All sightings as poses of the newest frame."""

@@ -172,14 +172,7 @@ class Localiser:
             self._track = fused(seen, *self._track)
 
     def _may_claim(self, mode: Mode, others: Sequence[Mode]) -> bool:
-        config, way_m = self.config, self._window.way_m[mode.looks]
-        rival = max((other.support for other in others), default=0.0)
-        return (
-            mode.support >= max(config.least_support, config.least_share * len(self._window))
-            and rival <= config.most_rival * mode.support
-            and float(way_m[0] - way_m[-1]) >= config.least_way_places * self._matcher.place_m
-            and mode.looks[-1] >= len(self._window) - _NEW_LOOKS
-        )
+        return may_claim(self.config, self._window, mode, others, self._matcher.place_m, len(self._window))
 
     def _contradicted(self, hypotheses: Hypotheses, agree: np.ndarray) -> bool:
         """Whether the track is lost; ``agree`` says which hypotheses agree with it."""
@@ -195,6 +188,27 @@ class Localiser:
             track = Mode(*self._track, ours, np.zeros(0, np.int64))
             return self._may_claim(others[0], (*others[1:], track))
         return False
+
+
+def may_claim(
+    config: LocalisationConfig,
+    window: HypothesisWindow,
+    mode: Mode,
+    others: Sequence[Mode],
+    place_m: float,
+    looks: int,
+) -> bool:
+    """Whether a mode of a window's hypotheses is beyond doubt, with ``others`` as its rivals.
+
+    ``looks`` says of how many a share must support it.
+    """
+    way_m, rival = window.way_m[mode.looks], max((other.support for other in others), default=0.0)
+    return (
+        mode.support >= max(config.least_support, config.least_share * looks)
+        and rival <= config.most_rival * mode.support
+        and float(way_m[0] - way_m[-1]) >= config.least_way_places * place_m
+        and mode.looks[-1] >= len(window) - _NEW_LOOKS
+    )
 
 
 def _same(mode: Mode, pose: np.ndarray, place_m: float) -> bool:

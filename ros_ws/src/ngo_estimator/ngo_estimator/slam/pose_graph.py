@@ -110,6 +110,11 @@ class PoseGraph(ABC):
         return 0
 
     @property
+    def lost_since(self) -> int | None:
+        """The frame from which on nobody knows where the newest is in the map; None where that is known."""
+        return None
+
+    @property
     @abstractmethod
     def window_fill(self) -> float:
         """Share of the window that is in use."""

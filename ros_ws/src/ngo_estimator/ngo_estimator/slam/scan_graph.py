@@ -6,12 +6,14 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.state_arrays import require
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import no_scan
-from ngo_estimator.geometry.planar_motion import transformed
+from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
-from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.key_scan_chain import OPEN, KeyScanChain
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
+from ngo_estimator.graph.segments import joined_parts, segment_of
 from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
@@ -19,6 +21,7 @@ from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
 from ngo_estimator.slam.scan_matcher import ScanMatcher
 
@@ -27,6 +30,12 @@ _KEYS_PER_OPTIMISED = 20
 
 _KEYS_PER_SURPRISED = 400
 """The same where a loop surprises."""
+
+_BELIEVED = 0.5
+"""Weight from which on a loop joins two segments."""
+
+_MOVED_M = 0.5
+"""Where an optimisation moves a key scan that far, the map is another one to search in."""
 
 
 class ScanGraph(PoseGraph):
@@ -45,6 +54,9 @@ class ScanGraph(PoseGraph):
         self._corrector: Corrector = Robust()
         # Loops when the graph was last solved without a warm start, and the scale of variances that was found.
         self._loops_from_nothing, self._scale = 0, np.ones(1)
+        self._own_map = OwnMap(config)
+        self._parts = np.zeros(0, np.int64)  # the part of the map that each segment is in, when that was asked last
+        self._claimed = np.zeros(0, np.int64)  # used loops by which the robot was found since the last optimisation
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
 
     @property
@@ -63,15 +75,25 @@ class ScanGraph(PoseGraph):
         self._nodes.begin_at(step.from_stamp_ns)
 
     def append(
-        self, relative: np.ndarray, covariance: np.ndarray, key: KeyScanStep | None, joins: bool = False
+        self,
+        relative: np.ndarray,
+        covariance: np.ndarray,
+        key: KeyScanStep | None,
+        joins: bool = False,
+        segment: bool = False,
     ) -> None:
         """Take a step ``(3,)`` with its covariance ``(3, 3)``; ``work`` does what it makes due.
 
-        With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place.
+        With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place. With
+        ``segment`` nobody measured it: it tells where the robot is taken to be until a loop does.
         """
-        self._nodes.append(relative, covariance, joins)
+        if segment:
+            covariance = OPEN
+            self._nodes.open_segment()
+        self._nodes.append(relative, covariance, joins or segment)
         if key is not None:
             self._nodes.add_key(key, joins)
+            self._own_map.follow(self._nodes)
             self._scans.append(key.scan)
             self._is_key = True
 
@@ -94,16 +116,41 @@ class ScanGraph(PoseGraph):
     def _look_for_loops(self) -> None:
         """Ask for loops of the newest key."""
         if (self.keys - 1) % self.config.loops.every == 0:
-            poses, used = self._nodes.poses, self.used_loops.pairs
-            windows = distance_windows(self.config.windows, graph_distances(poses, used, self.keys - 1))
-            fresh = self._finder.find(self._scans, poses, windows)
+            chain, joining = self._nodes, self._joining_pairs
+            distances = graph_distances(chain.poses, joining, self.keys - 1, chain.segments)
+            windows = distance_windows(self.config.windows, distances)
+            fresh = self._finder.find(self._scans, chain.poses, windows, segments=chain.segments)
             self._save_memory()
-            found, chain = self._finder.loops, self._nodes
-            believed = self._selection.believed(fresh, found, chain)
+            believed = self._selection.believed(fresh, self._finder.loops, chain)
             if len(believed):
-                surprises = self._selection.use(believed, found, chain)
+                surprises = self._selection.use(believed, self._finder.loops, chain)
                 self._waiting = max(self._waiting, self._wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
+            self._parts = joined_parts(chain.segments, joining)
+            self._claim(self._own_map.look(self._scans, self._finder.views, chain, windows, self._parts))
         self._waiting += self._waiting > 0
+
+    def _claim(self, loops: ScanLoops) -> None:
+        """Take loops by which the robot was found again in its own map; the next optimisation judges them."""
+        if len(loops):
+            first = len(self._selection)
+            self._selection.use(self._finder.add(loops), self._finder.loops, self._nodes)
+            self._claimed = np.concatenate((self._claimed, np.arange(first, len(self._selection))))
+            self._waiting = self._wait + 1
+
+    @property
+    def _joining_pairs(self) -> np.ndarray:
+        """Keys ``(n, 2)`` that loops join: of two segments only where the last optimisation believed the loop."""
+        pairs, weight = self.used_loops.pairs, np.zeros(len(self._selection))
+        weight[: len(self.closed)] = self.closed.weight
+        first, last = segment_of(self._nodes.segments, pairs).T
+        return pairs[(first == last) | (weight > _BELIEVED)]
+
+    @property
+    def lost_since(self) -> int | None:
+        """The frame from which on nobody knows where the newest is in the map, for no loop joins its segment."""
+        segments, known = self._nodes.segments, np.flatnonzero(self._parts == 0)
+        last = int(known[-1]) if len(known) else 0  # of the segments that are joined with the first
+        return None if last == len(segments) - 1 else int(self._nodes.frames.nodes[segments[last + 1]])
 
     def _save_memory(self) -> None:
         """Bound the memory of scans that the finder has seen."""
@@ -112,6 +159,7 @@ class ScanGraph(PoseGraph):
         if self._scans.kept > most + most // 10:
             newest = self.config.loops.submap_keys
             self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.poses, newest))
+            self._own_map.map_changed()
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
@@ -135,6 +183,7 @@ class ScanGraph(PoseGraph):
         removed = self._selection.drop(lambda rows: which(frames[found.pairs[rows]]))
         if removed:
             self.closed, self._loops_from_nothing = ClosedLoops.none(), 0
+            self._claimed = self._claimed[:0]  # they are numbered by the loops that are used
         return removed
 
     @property
@@ -148,9 +197,15 @@ class ScanGraph(PoseGraph):
 
     def _optimise(self) -> None:
         self._waiting = 0
-        loops, (steps, measured) = self.used_loops, self.measurements()
-        problem = GraphProblem(self._nodes.poses, steps, measured, np.ones(len(loops)))
-        solution = self._corrector.correct(problem, self._warm_start(problem))
+        loops, claimed = self.used_loops, self._claimed
+        self._claimed = claimed[:0]
+        solution = None
+        if len(claimed):
+            solution = self._corrected(self._found_poses(loops[claimed]), anew=True)
+            if not (solution.loop_weights[claimed] > _BELIEVED).any():
+                solution = None
+        if solution is None:
+            solution = self._corrected(self._nodes.poses)
         end = self._end_covariance(solution) if self.keys > 1 else self._nodes.end
         require_sound(solution.poses, end)
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
@@ -158,6 +213,28 @@ class ScanGraph(PoseGraph):
         weights = solution.loop_weights
         variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
         self.closed = ClosedLoops(self._nodes.frames.nodes[loops.pairs], loops.relative, np.sqrt(variance), weights)
+        self._parts = joined_parts(self._nodes.segments, self._joining_pairs)
+        if self.largest_move_m > _MOVED_M:
+            self._own_map.map_changed()
+
+    def _corrected(self, poses: np.ndarray, anew: bool = False) -> CorrectedGraph:
+        """The solution from these poses ``(keys, 3)`` on; ``anew``, without what the last one believed."""
+        steps, measured = self._nodes.steps_at(poses), self.measurements()[1]
+        problem = GraphProblem(poses, steps, measured, np.ones(len(measured)))
+        return self._corrector.correct(problem, None if anew else self._warm_start(problem))
+
+    def _found_poses(self, claimed: ScanLoops) -> np.ndarray:
+        """Poses of all keys ``(keys, 3)`` with two parts of the map put together as the last claimed loop says."""
+        poses, (earlier, later) = self._nodes.poses.copy(), claimed.pairs[-1]
+        part = self._parts[segment_of(self._nodes.segments, np.arange(self.keys))]
+        if part[earlier] != part[later]:
+            found = compose(poses[earlier], claimed.relative[-1])
+            if part[earlier] < part[later]:
+                moves, motion = part == part[later], compose(found, between(poses[later], np.zeros(3)))
+            else:
+                moves, motion = part == part[earlier], compose(poses[later], between(found, np.zeros(3)))
+            poses[moves] = se2.compose(motion, poses[moves])
+        return poses
 
     def _warm_start(self, problem: GraphProblem) -> CorrectedGraph | None:
         """The last solution, whose nodes the newer ones follow; None where there is none."""
@@ -204,7 +281,8 @@ class ScanGraph(PoseGraph):
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     SAVED = (
-        "_nodes", "_scans", "_finder", "_selection", "_waiting", "closed", "_loops_from_nothing", "_scale",
+        "_nodes", "_scans", "_finder", "_selection", "_own_map", "_parts", "_claimed", "_waiting", "closed",
+        "_loops_from_nothing", "_scale",
     )  # fmt: skip
 
     def check_state(self) -> None:
@@ -218,6 +296,14 @@ class ScanGraph(PoseGraph):
         require(
             len(self.closed) <= len(self._selection) and self._loops_from_nothing >= 0 and self._scale[0] > 0.0,
             "an optimisation is of loops that are not there",
+        )
+        parts, claimed = self._parts, self._claimed
+        require(
+            self._own_map.fits(self.keys)
+            and len(parts) <= len(self._nodes.segments)
+            and bool(((parts >= 0) & (parts <= np.arange(len(parts)))).all())
+            and bool(((claimed >= 0) & (claimed < len(self._selection))).all()),
+            "key scans are searched, parts of the map named, or loops claimed that are not there",
         )
         require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
 

@@ -6,6 +6,7 @@ verified in a submap of its place, with the tests of a loop.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from ngo_estimator.slam.sightings import Sightings
 
 _MARGIN_M = 2.0  # around the key scans of the map, where the robot may be
 _SEARCHED = 150  # points in the whole map; a pose that fits is verified with more of them
+_SEARCHED_NEAR, _MOST_BLOCKS_NEAR = 75, 20_000  # the same near the key scans, and how many blocks are split at most
+_LEAST_NEAR, _LEAST_SECOND_NEAR = 0.45, 0.75  # likelihoods that are distinguished there
 _AROUND = np.array((1.0, 1.0, math.radians(15.0)))  # of a pose that is verified
 
 
@@ -32,13 +35,19 @@ class ScanMatcher:
         scans, poses: of the map's key scans, poses ``(keys, 3)``; scans without points say nothing.
         views: of these scans, or of the first of them.
         config: how a loop is searched and tested.
+        reach_m: how far the robot is from one of the map's key scans at most. Anywhere, infinity, costs ten times more.
     """
 
     place_m = 1.0
     search_every = 4
 
     def __init__(
-        self, scans: Sequence[KeyScan], poses: np.ndarray, views: KeyScanViews, config: ScanLoopConfig
+        self,
+        scans: Sequence[KeyScan],
+        poses: np.ndarray,
+        views: KeyScanViews,
+        config: ScanLoopConfig,
+        reach_m: float = math.inf,
     ) -> None:
         points = [transformed(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)]
         if sum(map(len, points)) == 0:
@@ -50,6 +59,15 @@ class ScanMatcher:
         low, high = poses[:, :2].min(0) - _MARGIN_M, poses[:, :2].max(0) + _MARGIN_M
         self._centre = np.array((*(0.5 * (low + high)), 0.0))
         self._window = np.array((*(0.5 * (high - low)), math.pi))
+        self._search, self._searched, self._near = config.search, _SEARCHED, None
+        if reach_m < math.inf:
+            self._search = replace(
+                config.search,
+                most_blocks=_MOST_BLOCKS_NEAR,
+                least_response=_LEAST_NEAR,
+                least_second=_LEAST_SECOND_NEAR,
+            )
+            self._searched, self._near = _SEARCHED_NEAR, (poses[:, :2], reach_m)
         self.reset()
 
     def reset(self) -> None:
@@ -68,12 +86,15 @@ class ScanMatcher:
 
     def everywhere(self) -> Sightings:
         """Hypotheses of the newest frame's pose, wherever it may be: the best one, and the best well apart from it."""
-        source = self._source()
+        return self.search(self._source())
+
+    def search(self, source: PlacedScans) -> Sightings:
+        """The same of a source's pose."""
         points = search_points(self._config, source)
-        points = points[:: max(1, round(len(points) / _SEARCHED))]
+        points = points[:: max(1, round(len(points) / self._searched))]
         if len(points) == 0:
             return Sightings.none()
-        match = search(self._config.search, self._grid, points, self._centre, self._window)
+        match = search(self._search, self._grid, points, self._centre, self._window, self._near)
         if match is None:
             return Sightings.none()
         others = () if match.second_pose is None else (match.second_pose,)

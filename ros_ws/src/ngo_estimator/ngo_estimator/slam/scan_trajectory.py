@@ -72,7 +72,7 @@ class ScanTrajectory(CorrectedTrajectory):
         self._graph.begin_at(step)
 
     def _append(self, step: RelativeStep, taken: TakenStep) -> None:
-        self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins)
+        self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins, step.segment)
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether the trajectory can go on with another odometry from this step's frame, which needs a key scan."""

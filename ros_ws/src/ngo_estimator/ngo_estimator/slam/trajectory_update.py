@@ -1,6 +1,6 @@
 """What a trajectory that is corrected online reports: after each step, and as a whole."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,7 +15,8 @@ class TrajectoryUpdate:
     began a new trajectory, ``gap`` whether steps before it were lost and composed from the odometry.
     ``largest_move_m`` is how far this step moved a pose at most, ``closed_loops`` how many loop candidates the
     optimizer believes (a weight over one half), ``window_fill`` the share of the window that is in use. ``fault`` says
-    what failed inside, empty where nothing did: the trajectory goes on by odometry then. The arrays are read-only and
+    what failed inside, empty where nothing did: the trajectory goes on by odometry then. ``lost_since_ns`` is the stamp
+    from which on nobody knows where the robot is in the map, None where that is known. The arrays are read-only and
     stay as they are.
     """
 
@@ -31,6 +32,7 @@ class TrajectoryUpdate:
     closed_loops: int
     window_fill: float
     fault: str
+    lost_since_ns: int | None = field(default=None, kw_only=True)
 
 
 def fault_of(error: Exception, work: str) -> str:

@@ -1,0 +1,27 @@
+"""Segments of a chain of key scans, and the parts of the map that loops make of them.
+
+Nobody measured the step from a segment to the next: only loops between two segments tell how they lie.
+"""
+
+import numpy as np
+
+
+def segment_of(segments: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """The segment of each node, an array of the shape of ``nodes``; ``segments`` ``(s,)`` are their first nodes."""
+    found: np.ndarray = np.searchsorted(segments, nodes, side="right") - 1
+    return found
+
+
+def joined_parts(segments: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """The part of the map ``(s,)`` that each segment is in, by the number of the part's first segment.
+
+    Args:
+        segments: the first node of each segment ``(s,)``.
+        pairs: nodes ``(n, 2)`` that believed loops join.
+    """
+    part = np.arange(len(segments))
+    for a, b in np.unique(segment_of(segments, pairs), axis=0).tolist():
+        if part[a] != part[b]:
+            low, high = sorted((int(part[a]), int(part[b])))
+            part[part == high] = low
+    return part

@@ -1,0 +1,169 @@
+"""A robot that is found again in the map that it is making: the newest scans, searched where no window reaches.
+
+The key scans that are searched are those of parts of the map that no loop joins with the newest one, and those that are
+so far from it through the graph that it may be outside of the widest window. As in a saved map, a pose is claimed where
+sightings of several scans agree by the odometry between them, and no other pose has nearly as many. Each of these
+sightings is then a loop, which the corrector may still refuse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ngo_estimator.data.state_arrays import require
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance
+from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.segments import segment_of
+from ngo_estimator.loops.key_scan_views import KeyScanViews
+from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
+from ngo_estimator.loops.scan_submaps import laid_together
+from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, strongest_modes
+from ngo_estimator.slam.localisation import LocalisationConfig, may_claim
+from ngo_estimator.slam.scan_matcher import ScanMatcher
+from ngo_estimator.slam.sightings import Sightings
+
+_REACH_M = 2.0
+"""How far the robot is from where it was before, where it is found."""
+
+_GROWN = 1.1
+"""The map is laid out anew when so many times as many key scans are to be searched."""
+
+
+class OwnMap:
+    """Takes each newest key scan, and says where else in the map the robot was when it took the last ones."""
+
+    def __init__(self, config: ScanGraphConfig, claims: LocalisationConfig | None = None) -> None:
+        self._config = config
+        self._claims = claims or LocalisationConfig()
+        self._window = HypothesisWindow(self._claims.window)
+        self._looks = np.zeros(0, np.int64)  # the key scan of each look in the window
+        # The key scans that are searched, and where they lie: parts of the map beside each other.
+        self._keys, self._poses = np.zeros(0, np.int64), np.zeros((0, 3))
+        self._stale, self._parts = 1, 0  # whether they are to be laid out anew, and of how many parts they are
+        self._matcher: ScanMatcher | None = None
+
+    def follow(self, chain: KeyScanChain) -> None:
+        """Take the step to the newest key scan; nobody knows it where that begins a segment."""
+        if chain.segments[-1] == len(chain) - 1:
+            self._forget_looks()
+        else:
+            self._window.move(chain.last_step, chain.step_covariance[-1])
+
+    def fits(self, keys: int) -> bool:
+        """Whether all key scans that it names are among the first so many."""
+        return all(bool(((named >= 0) & (named < keys)).all()) for named in (self._looks, self._keys))
+
+    def _forget_looks(self) -> None:
+        self._window.clear()
+        self._looks = self._looks[:0]
+
+    def look(
+        self, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain, windows: np.ndarray, parts: np.ndarray
+    ) -> ScanLoops:
+        """Loops of the last key scans, where it is beyond doubt that they are right; mostly none.
+
+        Args:
+            scans, views: of all key scans.
+            windows: half widths of the search around each, as seen from the newest ``(keys, 3)``.
+            parts: the part of the map that each segment is in ``(segments,)``.
+        """
+        config, newest = self._config.loops, len(chain) - 1
+        first = newest + 1 - config.source_keys
+        far = np.flatnonzero(windows[:, 0] >= self._config.windows.most_m)
+        far = far[~np.isin(far, list(views.forgotten))]
+        if first < chain.segments[-1] or len(far) < config.submap_keys:
+            return ScanLoops.none()
+        self._lay_out(far, parts[segment_of(chain.segments, far)], chain.poses)
+        matcher = self._matcher_of(scans, views)
+        if matcher is None:
+            return ScanLoops.none()
+        source = laid_together(scans[first:], views.profiles[first:], chain.poses[first:])
+        self._window.add(matcher.search(source))
+        self._looks = np.append(self._looks, newest)[-self._claims.window :]
+        hypotheses, place_m = self._window.hypotheses(), matcher.place_m
+        modes = strongest_modes(hypotheses, place_m)
+        if not modes:
+            return ScanLoops.none()
+        # Before the first sighting the robot was perhaps where it had never been.
+        since = len(self._window) - int(modes[0].looks[0])
+        if not may_claim(self._claims, self._window, modes[0], modes[1:], place_m, since):
+            return ScanLoops.none()
+        agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
+        loops = self._loops(agree, self._looks[hypotheses.look], modes[0].support)
+        self._forget_looks()
+        return loops
+
+    def map_changed(self) -> None:
+        """Lay out the map anew at the next look: scans are gone, or many poses were moved."""
+        self._stale = 1
+
+    def _lay_out(self, keys: np.ndarray, part: np.ndarray, poses: np.ndarray) -> None:
+        """Lay out the key scans that are to be searched, unless nearly all of them are."""
+        parts = len(np.unique(part))
+        if not self._stale and parts == self._parts and len(keys) <= _GROWN * len(self._keys):
+            return
+        before = self._keys, self._poses
+        self._keys, self._poses = keys, _apart(poses[keys], part, 2.0 * self._config.loops.range_m)
+        self._window.map_sightings(lambda seen: self._laid_anew(seen, *before))
+        self._stale, self._parts, self._matcher = 0, parts, None
+
+    def _matcher_of(self, scans: Sequence[KeyScan], views: KeyScanViews) -> ScanMatcher | None:
+        """What searches in them; None where none of them has a point."""
+        if self._matcher is None:
+            keys = self._keys.tolist()
+            chosen, config = [scans[key] for key in keys], self._config.loops
+            if any(len(scan.points) for scan in chosen):
+                self._matcher = ScanMatcher(chosen, self._poses, views.of_keys(keys), config, _REACH_M)
+        return self._matcher
+
+    def _laid_anew(self, seen: Sightings, keys: np.ndarray, poses: np.ndarray) -> Sightings:
+        """Sightings in a map that lay otherwise: each goes with the key scan that was nearest."""
+        near = _nearest(poses, seen.poses)
+        there = np.isin(keys[near], self._keys)
+        seen, near = seen.where(there), near[there]
+        old, new = poses[near], self._poses[np.searchsorted(self._keys, keys[near])]
+        moved = [compose(b, between(a, pose)) for a, b, pose in zip(old, new, seen.poses, strict=True)]
+        turned = [turned_covariance(b[2] - a[2], c) for a, b, c in zip(old, new, seen.covariance, strict=True)]
+        return Sightings(np.array(moved).reshape(-1, 3), np.array(turned).reshape(-1, 3, 3), seen.belief)
+
+    def _loops(self, agree: np.ndarray, later: np.ndarray, support: float) -> ScanLoops:
+        """A loop of each sighting that agrees, from the searched key scan that is nearest."""
+        sightings = self._window.sightings
+        poses = np.concatenate([seen.poses for seen in sightings])[agree]
+        covariance = np.concatenate([seen.covariance for seen in sightings])[agree]
+        near = _nearest(self._poses, poses)
+        earlier = self._poses[near]
+        relative = [between(a, b) for a, b in zip(earlier, poses, strict=True)]
+        turned = [turned_covariance(-a[2], c) for a, c in zip(earlier, covariance, strict=True)]
+        evidence = np.zeros((len(poses), len(EVIDENCE)))
+        evidence[:, EVIDENCE.index("agreeing")] = support
+        pairs = np.stack((self._keys[near], later[agree]), axis=1)
+        return ScanLoops(pairs, np.stack(relative), np.stack(turned), evidence, np.ones(len(poses), bool))
+
+    SAVED = ("_window", "_looks", "_keys", "_poses", "_stale", "_parts")
+
+    def check_state(self) -> None:
+        """Raise ``StateError`` about restored arrays that do not belong together."""
+        require(len(self._looks) == len(self._window), f"{len(self._window)} looks are not of as many key scans")
+        require(len(self._keys) == len(self._poses), f"{len(self._keys)} key scans do not have as many poses")
+
+
+def _nearest(poses: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Row of the pose ``(n, 3)`` that is nearest to each of the others ``(m, 3)``."""
+    away = np.linalg.norm(others[:, None, :2] - poses[None, :, :2], axis=2)
+    return away.argmin(axis=1) if len(poses) else np.zeros(0, np.int64)
+
+
+def _apart(poses: np.ndarray, part: np.ndarray, gap_m: float) -> np.ndarray:
+    """Poses ``(n, 3)`` of parts of a map, the parts ``(n,)`` put beside each other with a gap between."""
+    laid, end = poses.copy(), 0.0
+    for one in np.unique(part):
+        own = part == one
+        low, high = poses[own, :2].min(0), poses[own, :2].max(0)
+        laid[own, :2] -= low - (end, 0.0)
+        end += float(high[0] - low[0]) + gap_m
+    return laid

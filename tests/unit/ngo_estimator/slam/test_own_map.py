@@ -1,0 +1,88 @@
+"""A robot that was carried while it saw nothing is found again in the map that it made, and nowhere else."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.geometry.planar_covariance import position_std
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
+from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, between, drifted, outline, scan_at, way
+
+FIRST = way(*ROUND, ROUND[0], (4.0, 1.0))
+BACK = way((1.0, 6.0), ROUND[0], *ROUND[1:])  # another corner, from which it drives on
+OTHER = np.concatenate((outline((0, 0), (7, 0), (7, 11), (0, 11)), outline((2, 3), (5, 3), (5, 8), (3.5, 8), (2, 6))))
+COVARIANCE = np.diag((0.01, 0.01, 0.004)) ** 2
+NOTHING = np.zeros(0, np.float32)
+
+
+def steps(walls: np.ndarray, poses: np.ndarray) -> tuple[RelativeStep, ...]:
+    """The way round the hallway, then, in a segment of its own, the one among ``walls``; odometry goes straight on."""
+    random = np.random.default_rng(1)
+    true = np.concatenate((FIRST, poses))
+    seen = [scan_at(HALLWAY if k < len(FIRST) else walls, pose, random) for k, pose in enumerate(true)]
+    seen = [replace(scan, stamp_ns=k * 10**9) for k, scan in enumerate(seen)]
+    relative = between(true[:-1], true[1:]) + random.normal(0.0, (0.003, 0.003, 0.001), (len(true) - 1, 3))
+    relative[len(FIRST) - 1] = 0.0
+    odometry = drifted(true, (0.0, 0.0, 0.0))
+    found = []
+    for k, step in enumerate(relative, 1):
+        key = KeyScanStep(seen[k], seen[k - 1].stamp_ns, step, COVARIANCE)
+        stamps, odom = (seen[k].stamp_ns, seen[k - 1].stamp_ns), odometry[k]
+        origin = seen[0] if k == 1 else None
+        found.append(
+            RelativeStep(
+                *stamps, step, COVARIANCE, 0, odom, NOTHING, NOTHING, key=key, origin_scan=origin,
+                segment=k == len(FIRST),
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+@cache
+def carried_back() -> tuple[RelativeStep, ...]:
+    return steps(HALLWAY, BACK)
+
+
+def driven(some: tuple[RelativeStep, ...], core: ScanTrajectory) -> list[TrajectoryUpdate]:
+    return [core.update(step) for step in some]
+
+
+def test_a_robot_that_was_carried_is_lost_until_it_is_found_in_its_own_map() -> None:
+    core = ScanTrajectory()
+    updates = driven(carried_back(), core)
+    begin = len(FIRST) - 1
+    assert all(update.lost_since_ns is None for update in updates[:begin])
+    lost = [update for update in updates[begin:] if update.lost_since_ns is not None]
+    assert 10 < len(lost) < 50 and updates[-1].lost_since_ns is None
+    for update in lost:
+        assert update.lost_since_ns == len(FIRST) * 10**9
+        assert position_std(update.covariance) > 50.0
+    np.testing.assert_allclose(lost[0].pose_xyyaw, updates[begin - 1].pose_xyyaw)
+    core.finish()
+    trajectory = core.trajectory()
+    assert trajectory is not None
+    off = trajectory.poses_xyyaw - between(FIRST[:1], np.concatenate((FIRST, BACK)))
+    assert np.abs(off[:, :2]).max() < 0.1
+    assert position_std(updates[-1].covariance) < 0.1
+
+
+def test_a_robot_in_another_building_is_not_found() -> None:
+    poses = way((1.0, 1.0), (6.0, 1.0), (6.0, 10.0), (1.0, 10.0), (1.0, 2.0))
+    core = ScanTrajectory()
+    updates = driven(steps(OTHER, poses), core)
+    assert updates[-1].lost_since_ns is not None
+    segment = core.graph.used_loops.pairs >= len(FIRST)
+    assert (segment[:, 0] == segment[:, 1]).all()
+
+
+def test_a_state_that_was_saved_while_it_was_lost_goes_on_to_the_last_bit() -> None:
+    all_steps, core = carried_back(), ScanTrajectory()
+    driven(all_steps[: len(FIRST) + 9], core)
+    other = ScanTrajectory().restored(core.state())
+    for step in all_steps[len(FIRST) + 9 :]:
+        mine, its = core.update(step), other.update(step)
+        np.testing.assert_array_equal(mine.pose_xyyaw, its.pose_xyyaw)
+        assert mine.lost_since_ns == its.lost_since_ns
