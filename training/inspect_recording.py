@@ -12,14 +12,16 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from ngo_common.files import written_whole
+from ngo_estimator.offline.lidar_check import lidar_lines
 from ngo_recordings.errors import RecordingError
+from ngo_recordings.images import SCAN_TYPE
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import TopicArguments, choose_topics
 from training.recordings.recording_picture import save_picture
@@ -42,15 +44,22 @@ def main(arguments: Arguments) -> Report:
     with open_recording(arguments.files) as recording:
         if not arguments.json:
             print("\n".join(topic_table(recording)))
-        report = inspect(recording, choose_topics(recording, arguments.topics))
+        topics = choose_topics(recording, arguments.topics)
+        lidar: list[str] = []
+        if recording.topics[topics.image].type_name == SCAN_TYPE:
+            if topics.action is None and arguments.topics.twist is None:  # a lidar takes no commanded velocities
+                topics = replace(topics, twist=None)
+            lidar = lidar_lines(recording, topics)
+        report = inspect(recording, topics)
     first = arguments.files[0]
     out = first.with_name(first.name + ".png") if arguments.out is None else arguments.out
     with written_whole(out) as file:
         save_picture(report, file)
     if arguments.json:
-        print(json.dumps({**report.numbers(), "picture": str(out)}))
+        print(json.dumps({**report.numbers(), "lidar": lidar, "picture": str(out)}))
     else:
-        print("\n".join(["", *text(report), "", f"picture: {out}"]))
+        told = ["", "lidar, as run_recording uses it:", *(f"  {line}" for line in lidar)] if lidar else []
+        print("\n".join(["", *text(report), *told, "", f"picture: {out}"]))
     return report
 
 

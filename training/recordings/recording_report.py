@@ -14,8 +14,9 @@ from tqdm import tqdm
 
 from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.frames import NO_DEPTH, UNUSABLE, Frame, frames
+from ngo_recordings.images import SCAN_TYPE
 from ngo_recordings.recording import Message, Recording
-from ngo_recordings.topics import POSE_TYPES, TF_TYPE, RecordingTopics
+from ngo_recordings.topics import POSE_TYPES, TF_TYPE, RecordingTopics, transform_topics
 
 REVISIT_M = 1.0
 """A place is visited again where the path comes this close to where it was before..."""
@@ -155,9 +156,18 @@ def topic_uses(recording: Recording, topics: RecordingTopics) -> dict[str, str]:
             uses[name] = f"{uses[name]}, {what}" if name in uses else what
 
     use(topics.image, "image")
+    for name in topics.more_scans:
+        use(name, "scans of another scanner")
+    if recording.topics[topics.image].type_name == SCAN_TYPE:
+        for name in transform_topics(recording, topics.image):
+            use(name, "where the scanner sits")
     use(topics.depth, "depth channel")
     use(topics.action, "action of each step")
     use(topics.twist, "velocity of each step")
+    if topics.wheels is not None:
+        by_tf = transform_topics(recording, topics.image)
+        for wheels in [topics.wheels.topic] if topics.wheels.tf is None else by_tf:
+            use(wheels, f"wheels ({topics.wheels})")
     truth = topics.ground_truth
     if truth is not None and truth.tf is not None:
         for name, info in recording.topics.items():

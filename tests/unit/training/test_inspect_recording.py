@@ -204,3 +204,23 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_picture(tmp_path: Path) -> N
     assert (ended.returncode, ended.stderr.count("\n")) == (1, 1), ended.stderr
     assert ended.stderr.startswith("inspect_recording: the picture cannot be written: ")
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_a_lidars_recording_is_shown_as_run_recording_uses_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries: list[m.Entry] = [("/tf_static", 1, m.transforms(m.transform(0, "base_link", "laser", m.pose(0.2, 0, 0))))]
+    for k in range(30):
+        stamp_ns = 10 * S + k * S // 10
+        made = m.scan(stamp_ns, np.linspace(1.0, 4.0, 90) + 0.01 * k, increment=0.05)
+        made.header.frame_id = "laser"
+        entries.append(("/scan", stamp_ns, made))
+        wheels = m.odometry(stamp_ns, m.pose(0.01 * k, 0, 0), m.twist(0, 0, 0))
+        wheels.header.frame_id = "odom"
+        entries += [("/odom", stamp_ns, wheels), ("/cmd_vel", stamp_ns, m.twist(0.1, 0, 0))]
+    path = m.write_mcap(tmp_path / "a.mcap", entries)
+    report = main(Arguments((path,), out=tmp_path / "a.png"))
+    assert set(report.uses) == {"/scan", "/odom", "/tf_static"}
+    told = capsys.readouterr().out
+    assert "not used: /cmd_vel" in told and "mounting: laser in base_link at x 0.200 m" in told
+    assert "wheels: /odom, 30 poses" in told

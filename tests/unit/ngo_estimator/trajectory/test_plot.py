@@ -30,3 +30,14 @@ def test_a_long_drive_makes_no_larger_picture(tmp_path: Path) -> None:
     save_plot(tmp_path / "long.png", "long", {"odometry": np.repeat(POSES, 1000, axis=0)})
     save_plot(tmp_path / "short.png", "long", {"odometry": POSES})
     assert (tmp_path / "long.png").stat().st_size < 1.2 * (tmp_path / "short.png").stat().st_size
+
+
+def test_a_straight_path_leaves_its_panels_their_height(tmp_path: Path) -> None:
+    straight = np.column_stack((np.linspace(0.0, 40.0, 200), np.zeros(200), np.zeros(200)))
+    for turned in (straight, straight[:, (1, 0, 2)]):
+        save_plot(tmp_path / "a.png", "a corridor", {"odometry": turned, "corrected": turned}, walls=turned[:, :2])
+        width, height = Image.open(tmp_path / "a.png").size
+        assert 1.5 < width / height < 4.0
+        pixels = np.asarray(Image.open(tmp_path / "a.png").convert("L")) < 250
+        rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+        assert np.ptp(rows) > 0.6 * height and np.ptp(columns) > 0.8 * width

@@ -11,6 +11,9 @@ from matplotlib.figure import Figure
 TRUTH = "#1f6fd6"
 _COLORS = ("#2ca02c", "#ff7f0e", "#9467bd", "#d62728")
 _MOST_POINTS = 20_000
+_NARROWEST = 0.6
+"""Height of a panel in its width, or the other way round, at least: else its labels overlap."""
+_LEAST_M = 0.5
 
 
 def save_plot(
@@ -28,9 +31,9 @@ def save_plot(
         walls: points ``(n, 2)`` of all scans at the last estimate's poses.
     """
     count = len(estimates) + (walls is not None)
-    figure = Figure(figsize=(6.2 * count, 6.2))
+    figure = Figure(figsize=(6.2 * count, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, count, sharex=walls is None, sharey=walls is None, squeeze=False)[0]
+    panels = figure.subplots(1, count, squeeze=False)[0]
     if walls is not None:
         # One dot a point: a wall that is drawn twice shows at once.
         panels[-1].plot(walls[:, 0], walls[:, 1], ",", color="black", alpha=0.35)
@@ -47,9 +50,23 @@ def save_plot(
         axes.grid(color="#dddddd", linewidth=0.5)
         axes.legend(frameon=False, fontsize=8)
     panels[0].set_ylabel("y (m)")
-    figure.subplots_adjust(wspace=0.05)
+    shown = [*estimates.values(), *([truth] if truth is not None else [])]
+    for axes in panels[: len(estimates)]:
+        _leave_room(axes, np.concatenate([poses[:, :2] for poses in shown]))
+    if walls is not None:
+        _leave_room(panels[-1], np.concatenate((walls, list(estimates.values())[-1][:, :2])))
     figure.suptitle(title)
     figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
+def _leave_room(axes: Axes, points: np.ndarray) -> None:
+    """Show the points with so much around them that a straight path leaves a panel its height and width."""
+    if not len(points):
+        return
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, extent = 0.5 * (low + high), high - low
+    half = 0.55 * np.maximum(extent, max(_NARROWEST * float(extent.max()), _LEAST_M))
+    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
 
 
 def _draw(axes: Axes, poses: np.ndarray, color: str, label: str) -> None:

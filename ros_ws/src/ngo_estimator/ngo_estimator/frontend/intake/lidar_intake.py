@@ -153,7 +153,7 @@ class LidarIntake:
         motion = self._wheels.motion(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
         elapsed_s = (step.stamp_ns - step.from_stamp_ns) * 1e-9
         for scanner, sweep in self._sweeps.items():
-            if (mounting := self._mountings.get(scanner)) is not None:
+            if self._turns.alone and (mounting := self._mountings.get(scanner)) is not None:
                 sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
         if not step.unsure and self._clock.add_step(step.from_stamp_ns, step.stamp_ns, step.relative_xyyaw):
             for stamp_ns, pose in self._wheels.again(self._clock.truth):

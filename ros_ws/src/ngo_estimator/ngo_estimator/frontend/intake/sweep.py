@@ -36,8 +36,8 @@ _DEVIATIONS = 5.0
 _OFF = 0.35
 """What is measured is another sweep where it is off by so many deviations, and by this share of the scans' period."""
 
-_NEAR = 0.2
-"""Share of the period within which a measured sweep is one of those that drivers make."""
+_NEAR = 0.45
+"""Share of the period within which a measured sweep is one of those that drivers make: noise makes it shorter."""
 
 _ONCE_KNOWN = 8
 """One scan in so many is measured where the sweep is known."""

@@ -76,6 +76,11 @@ class Turns:
         """How many parts wait."""
         return len(self._held)
 
+    @property
+    def alone(self) -> bool:
+        """Whether each scan is a turn of its own."""
+        return len(self._last) == 1
+
     def add(self, part: Part) -> list[LidarScan]:
         """Take a part; the turns that are whole with it, as scans of the first scanner."""
         whole: list[LidarScan] = []
