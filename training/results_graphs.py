@@ -4,8 +4,9 @@
     python -m training.results --world graphs --folder FOLDER --percents 10 30 --rows robust gtsam_gnc
 
 Synthetic graphs have wrong loops of five kinds, with a whole relative pose (KIND) or only "the same place"
-(KIND_place). With ``--folder`` Lecture Hall and Manhattan3500 are measured, too. The command writes
-``training/results/graphs.json`` and ``docs/results_graphs.md``; a run that is restricted adds its cells to them.
+(KIND_place); hard ones have a poor odometry, and twice as many loops. With ``--folder`` Lecture Hall and Manhattan3500
+are measured, too. The command writes ``training/results/graphs.json`` and ``docs/results_graphs.md``; a run that is
+restricted adds its cells to them.
 """
 
 import json
@@ -27,7 +28,7 @@ from training.report import graphs_page
 from training.scoring.graph_problems import KINDS, JudgedProblem, lecture_hall, manhattan, synthetic
 from training.scoring.statistics import Interval, mean_interval
 
-GRAPHS = ("synthetic_1000", "synthetic_3000", "lecture_hall", "manhattan")
+GRAPHS = ("synthetic_1000", "synthetic_3000", "hard_1000", "hard_3000", "lecture_hall", "manhattan")
 PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_gnc": graph_peers.gnc,
     "gtsam_lm_cauchy": graph_peers.cauchy,
@@ -101,15 +102,16 @@ def _cells(arguments: Arguments) -> Iterator[tuple[str, str, Callable[[int], Jud
         for kind in arguments.kinds:
             for percent in arguments.percents:
                 name, place = kind.removesuffix("_place"), kind.endswith("_place")
-                if graph.startswith("synthetic"):
-                    nodes = int(graph.removeprefix("synthetic_"))
-                    yield graph, f"{kind}_{percent}", _synthetic(name, percent, nodes, not place)
+                if graph.startswith(("synthetic", "hard")):
+                    form, _, nodes = graph.partition("_")
+                    draw = _synthetic(name, percent, int(nodes), not place, form == "hard")
+                    yield graph, f"{kind}_{percent}", draw
                 elif graph == "manhattan" and folder is not None and not place:
                     yield graph, f"{kind}_{percent}", _manhattan(folder, name, percent)
 
 
-def _synthetic(kind: str, percent: int, nodes: int, metric: bool) -> Callable[[int], JudgedProblem]:
-    return lambda seed: synthetic(kind, percent, nodes, metric, seed)
+def _synthetic(kind: str, percent: int, nodes: int, metric: bool, hard: bool) -> Callable[[int], JudgedProblem]:
+    return lambda seed: synthetic(kind, percent, nodes, metric, seed, hard)
 
 
 def _manhattan(folder: Path, kind: str, percent: int) -> Callable[[int], JudgedProblem]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ngo_estimator.geometry.se2 import between, compose
 from ngo_estimator.graph.corrector import GraphProblem
@@ -26,6 +27,7 @@ _GROUP, _STRETCH = 10, 50
 _NEAR_M = 2.0  # of a loop's two nodes
 _PLACE_STD = 0.5
 _STEP_STD = np.array((0.03, 0.03, 0.006))
+_POOR_STEP_STD = np.array((0.06, 0.04, 0.03))
 _LOOP_STD = np.array((0.05, 0.05, 0.02))
 _APART = 40  # nodes between a loop's two
 _OFFSET_M = 3.0
@@ -51,14 +53,17 @@ class JudgedProblem:
         return float(np.sqrt(((mine @ turn - true) ** 2).sum(1).mean()))
 
 
-def synthetic(kind: str, percent: float, nodes: int, metric: bool, seed: int) -> JudgedProblem:
-    """A graph of a robot that comes back to where it was; without ``metric`` its loops only say "the same place"."""
+def synthetic(kind: str, percent: float, nodes: int, metric: bool, seed: int, hard: bool = False) -> JudgedProblem:
+    """A graph of a robot that comes back to where it was; without ``metric`` its loops only say "the same place".
+
+    A ``hard`` one has the odometry of poor wheels, and twice as many loops: its chain alone tells few of them apart.
+    """
     rng = np.random.default_rng((seed, nodes, KINDS.index(kind), round(percent), int(metric)))
-    true = _drive(nodes, rng)
-    steps = between(true[:-1], true[1:]) + rng.normal(0.0, _STEP_STD, (nodes - 1, 3))
+    true, std = _drive(nodes, rng), _POOR_STEP_STD if hard else _STEP_STD
+    steps = between(true[:-1], true[1:]) + rng.normal(0.0, std, (nodes - 1, 3))
     ends = np.stack((np.arange(nodes - 1), np.arange(1, nodes)), axis=1)
-    chain = RelativePoses.of_deviations(ends, steps, np.tile(_STEP_STD, (nodes - 1, 1)))
-    pairs = _right_pairs(true, rng, nodes // 2, _NEAR_M if metric else _PLACE_STD)
+    chain = RelativePoses.of_deviations(ends, steps, np.tile(std, (nodes - 1, 1)))
+    pairs = _right_pairs(true, rng, nodes if hard else nodes // 2, _NEAR_M if metric else _PLACE_STD)
     relative = between(true[pairs[:, 0]], true[pairs[:, 1]]) + rng.normal(0.0, _LOOP_STD, (len(pairs), 3))
     right = RelativePoses.of_deviations(pairs, relative, np.tile(_LOOP_STD, (len(pairs), 1)))
     loops = with_wrong(right, true, kind, percent, rng)
@@ -88,8 +93,10 @@ def _drive(nodes: int, rng: np.random.Generator) -> np.ndarray:
 
 def _right_pairs(true: np.ndarray, rng: np.random.Generator, count: int, near_m: float) -> np.ndarray:
     """Pairs ``(n, 2)`` of nodes near each other, the earlier one first."""
-    distance = np.hypot(*(true[:, None, :2] - true[None, :, :2]).transpose(2, 0, 1))
-    pairs = np.argwhere(np.triu(distance < near_m, _APART))
+    pairs = KDTree(true[:, :2]).query_pairs(near_m, output_type="ndarray")
+    apart = np.hypot(*(true[pairs[:, 0], :2] - true[pairs[:, 1], :2]).T)
+    pairs = pairs[(pairs[:, 1] - pairs[:, 0] >= _APART) & (apart < near_m)]
+    pairs = pairs[np.lexsort(pairs.T[::-1])]
     return pairs[np.sort(rng.permutation(len(pairs))[:count])]
 
 

@@ -2,15 +2,18 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ngo_estimator.geometry.se2 import between
+from ngo_estimator.graph import robust
 from ngo_estimator.graph.corrector import GraphProblem, normal_equations
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
+from ngo_estimator.graph.surest_first import believe
 from tests.unit.ngo_estimator.graph.test_corrector import STD, loop, straight
 
 STEP_STD, LOOP_STD = np.array((0.02, 0.02, 0.004)), np.array((0.05, 0.05, 0.02))
@@ -146,6 +149,24 @@ def test_a_warm_start_ends_where_a_start_from_nothing_does() -> None:
     anew = Robust().correct(problem)
     assert np.array_equal(solution.loop_weights, anew.loop_weights)
     assert worst(solution.poses, anew.poses) < 1e-3
+
+
+def test_a_warm_start_asks_no_loop_again_that_was_refused_and_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _ = square(4, 2, 4 * ROUND)
+    old = len(problem.loops) - 20
+    before = replace(problem, loops=problem.loops[:old], trust=problem.trust[:old])
+    start = Robust().correct(before)
+    asked: list[int] = []
+
+    def counted(part: GraphProblem, *rest: Any, **more: Any) -> tuple[np.ndarray, np.ndarray]:
+        asked.append(len(part.loops))
+        return believe(part, *rest, **more)
+
+    monkeypatch.setattr(robust, "believe", counted)
+    solution = Robust().correct(problem, start)
+    believed = int((start.loop_weights > 0.0).sum())
+    assert asked == [believed + 20] and believed < 0.5 * old
+    assert np.array_equal(solution.loop_weights[:old], start.loop_weights)
 
 
 def test_a_wrong_first_verdict_does_not_last() -> None:

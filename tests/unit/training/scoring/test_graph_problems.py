@@ -56,6 +56,16 @@ def test_our_corrector_finds_what_gtsam_finds_in_a_clean_graph(easy: JudgedProbl
     np.testing.assert_allclose(between(ours.poses, theirs), 0.0, atol=1e-3)
 
 
+def test_a_hard_graph_is_solved_though_its_chain_rules_out_loops_that_are_right() -> None:
+    """Seven of ten loops are wrong, between stretches that look alike, and the odometry is 9 m off."""
+    judged = synthetic("lookalike", 70.0, 1000, True, 0, hard=True)
+    problem, kept = judged.problem, judged.problem.loops[judged.right]
+    right = graph_peers.least_squares(GraphProblem(problem.poses, problem.steps, kept, np.ones(len(kept))))
+    assert (
+        judged.ate_m(Robust().correct(problem).poses) < 1.2 * judged.ate_m(right) < 0.02 * judged.ate_m(problem.poses)
+    )
+
+
 def test_a_peer_that_takes_too_long_or_fails_has_no_answer(easy: JudgedProblem) -> None:
     def never_ends(problem: GraphProblem) -> np.ndarray:
         while True:

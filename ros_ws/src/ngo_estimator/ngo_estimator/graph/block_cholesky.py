@@ -335,19 +335,31 @@ def _selected_inverse(
             place[rows[p]] = p
         for p in range(first, last):
             column = rows[p]
+            # Written out, as in ``factorise``.
+            block = lower[p]
+            x0, x1, x2 = block[0, 0], block[1, 0], block[2, 0]
+            y0, y1, y2 = block[0, 1], block[1, 1], block[2, 1]
+            z0, z1, z2 = block[0, 2], block[1, 2], block[2, 2]
+            mine = sums[p - first]
             for r in range(3):
-                for c in range(3):
-                    for k in range(3):
-                        sums[p - first, r, c] += inverse_diagonal[column, r, k] * lower[p, k, c]
+                a, b, c = inverse_diagonal[column, r, 0], inverse_diagonal[column, r, 1], inverse_diagonal[column, r, 2]
+                mine[r, 0] += a * x0 + b * x1 + c * x2
+                mine[r, 1] += a * y0 + b * y1 + c * y2
+                mine[r, 2] += a * z0 + b * z1 + c * z2
             for q in range(starts[column], starts[column + 1]):
                 other = place[rows[q]]
                 if other < 0:
                     continue
+                theirs, below, across = sums[other - first], inverse_lower[q], lower[other]
                 for r in range(3):
-                    for c in range(3):
-                        for k in range(3):
-                            sums[other - first, r, c] += inverse_lower[q, r, k] * lower[p, k, c]
-                            sums[p - first, r, c] += inverse_lower[q, k, r] * lower[other, k, c]
+                    a, b, c = below[r, 0], below[r, 1], below[r, 2]
+                    theirs[r, 0] += a * x0 + b * x1 + c * x2
+                    theirs[r, 1] += a * y0 + b * y1 + c * y2
+                    theirs[r, 2] += a * z0 + b * z1 + c * z2
+                    a, b, c = below[0, r], below[1, r], below[2, r]
+                    mine[r, 0] += a * across[0, 0] + b * across[1, 0] + c * across[2, 0]
+                    mine[r, 1] += a * across[0, 1] + b * across[1, 1] + c * across[2, 1]
+                    mine[r, 2] += a * across[0, 2] + b * across[1, 2] + c * across[2, 2]
         own = inverse.copy().T
         for p in range(first, last):
             place[rows[p]] = -1

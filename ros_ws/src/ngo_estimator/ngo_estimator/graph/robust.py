@@ -15,6 +15,7 @@ from ngo_estimator.graph.corrector import (
     Told,
     normal_equations,
     silent,
+    thresholds,
     truncated_cost,
 )
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
@@ -95,6 +96,9 @@ def _from_nothing(problem: GraphProblem, told: Told) -> CorrectedGraph:
         believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio, told)[0],
     ]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
+    if whole:
+        again = _looked_again(scaled, best, area, inlier_ratio, told)
+        best = min((best, again), key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops))
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
     if whole and scale not in (1.0, solution.loop_scale):
@@ -102,14 +106,26 @@ def _from_nothing(problem: GraphProblem, told: Told) -> CorrectedGraph:
     return solution
 
 
+def _looked_again(problem: GraphProblem, poses: np.ndarray, area: float, inlier_ratio: float, told: Told) -> np.ndarray:
+    """Poses after what they predict has let more loops in: a cycle with a long chain ruled some out that are right."""
+    misfit = (problem.loops.residuals(poses) ** 2).sum(1) / thresholds(problem.loops)
+    nearest = _affordable(replace(problem, poses=poses), np.argsort(misfit, kind="stable"))
+    believed = (nearest.loops.residuals(poses) ** 2).sum(1) <= thresholds(nearest.loops)
+    return believe(nearest, poses, believed, area, inlier_ratio, told)[0]
+
+
 def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told) -> CorrectedGraph:
     """The solution that the last one leads to."""
     nodes, old = len(start.poses), len(start.loop_weights)
     since = chain_poses(problem.steps.relative[nodes - 1 :], start.poses[-1])
     poses = np.concatenate((start.poses, since[1:]))
-    believed = np.zeros(len(problem.loops), bool)
+    scaled, believed = _scaled(problem, start.scale, start.scale), np.zeros(len(problem.loops), bool)
     believed[:old] = start.loop_weights > 0.0
-    poses, _ = believe(_scaled(problem, start.scale, start.scale), poses, believed, map_area(poses), told=told)
+    # A loop that was refused is asked again where it fits, or when all are.
+    fits = (scaled.loops.residuals(poses) ** 2).sum(1) <= thresholds(scaled.loops)
+    asked = np.flatnonzero(believed | fits | (np.arange(len(believed)) >= old))
+    part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked], similarity=None)
+    poses, _ = believe(part, poses, believed[asked], map_area(poses), told=told)
     return _polished(problem, poses, start.scale, start.loops_from_nothing)
 
 
