@@ -81,7 +81,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     result["revision"] = records.record("results", arguments)["revision"]
     if arguments.folder is None:
         print("lecture_hall and manhattan are skipped: --folder gives none")
-    _measure(synthetic("random", 30, 200, True, 0), ROWS, arguments.limit_s)  # compiles everything
+    _measure(synthetic("random", 30, 200, True, 0), arguments.rows, arguments.limit_s)  # compiles everything
     for graph, cell, draw in _cells(arguments):
         measured = [_measure(draw(seed), arguments.rows, arguments.limit_s) for seed in arguments.seeds]
         rows = result["tables"].setdefault(graph, {}).setdefault(cell, {})

@@ -3,7 +3,7 @@
 import random
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +16,12 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.settings import BadParameter
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place, write_untrained
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.graph.robust import Robust
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.trajectory.chained_graph import chained
 from ngo_estimator.trajectory.files import read_tum, write_tum
+from ngo_estimator.trajectory.g2o import read_g2o, write_g2o
 from ngo_recordings.frames import frames
 from ngo_recordings.poses import read_tum as read_track
 from ngo_recordings.recording import open_recording
@@ -134,6 +137,23 @@ def _read_tum(path: Path) -> None:
     read_track(path, 10**9)
 
 
+def _graph_files(folder: Path) -> list[Path]:
+    """A square drive, with marks on its loops and stamps."""
+    turn = "10 1 0 10 0 40"
+    vertices = [f"VERTEX_SE2 {2 * k} {k} 0.5 {0.1 * k} # stamp {k}.5" for k in range(8)]
+    edges = [f"EDGE_SE2 {2 * k} {2 * k + 2} 1 0 0.1 {turn}" for k in range(7)]
+    loops = [f"EDGE_SE2 {2 * k} 0 {-k} 0 -0.5 {turn} # loop 0.5" for k in (3, 5, 7)]
+    (folder / "a.g2o").write_text("\n".join((*vertices, "FIX 0", *edges, *loops)) + "\n")
+    return [folder / "a.g2o"]
+
+
+def _read_graph(path: Path) -> None:
+    """Read, correct and write it."""
+    graph = chained(read_g2o(path))
+    with suppress(ArithmeticError):  # as the command says it
+        write_g2o(path.with_name("out.g2o"), graph.corrected(Robust().correct(graph.problem)))
+
+
 def _parameter_files(folder: Path) -> list[Path]:
     (folder / "a.yaml").write_text(
         "/**:\n  ros__parameters:\n    world: maze2d\n    window_frames: 500\n    path_rate_hz: 5.0\n"
@@ -173,5 +193,6 @@ TARGETS = {
     "lidar settings": Target(_lidar_files, _read_lidar),
     "WADs": Target(_wads, _read_wad),
     "TUM files": Target(_tum_files, _read_tum),
+    "graph files": Target(_graph_files, _read_graph),
     "parameter files": Target(_parameter_files, _read_parameters),
 }

@@ -100,6 +100,7 @@ def test_gtsam_reads_a_marked_file(tmp_path: Path) -> None:
         ("VERTEX_SE2 3 1 one 3", "line 8 is 'VERTEX_SE2 3 1 one 3'; expected VERTEX_SE2 id x y yaw"),
         ("VERTEX_SE2 3.5 1 1 3", "line 8 is 'VERTEX_SE2 3.5 1 1 3'; expected VERTEX_SE2 id x y yaw"),
         ("VERTEX_SE2 3 1 nan 3", "line 8 has a value that is not finite"),
+        ("VERTEX_SE2 3 1 1e200 3", "line 8 has a value that is not finite, or a pose beyond 1e+12; expected metres"),
         ("VERTEX_SE2 3 1 1 3 # stamp soon", "line 8 ends in '# stamp soon'; expected '# stamp' and seconds"),
         ("EDGE_SE2 1 1 0 0 0 1 0 0 1 0 1", "line 8 joins the vertex 1 with itself"),
         ("EDGE_SE2 0 2 0 0 0 1 2 0 1 0 1", "line 8 has the information 1 2 0 1 0 1; expected a positive definite"),

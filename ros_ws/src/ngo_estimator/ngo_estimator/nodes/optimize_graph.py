@@ -10,7 +10,6 @@ as they were, each loop marked with how much it is believed: '# loop 1.0' or '# 
 """
 
 import json
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from rich.console import Console
 from ngo_common.files import write_together
 from ngo_estimator.graph.corrector import CorrectedGraph
 from ngo_estimator.graph.robust import Robust
+from ngo_estimator.nodes.command import run_command
 from ngo_estimator.trajectory.chained_graph import BELIEVED, ChainedGraph, chained
 from ngo_estimator.trajectory.g2o import GRAPH_ENDING, PlanarGraph, read_g2o, write_g2o
 
@@ -80,8 +80,8 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
             solution = Robust(lambda words: status.update(f"{words}, {time.monotonic() - began:.0f} s")).correct(
                 graph.problem
             )
-        except ArithmeticError as error:
-            raise ValueError(f"{arguments.graph} cannot be solved: {error}") from None
+        except (ArithmeticError, MemoryError) as error:
+            raise ValueError(f"{arguments.graph} cannot be solved: {error or type(error).__name__}") from None
     corrected = graph.corrected(solution)
     report = _report(arguments, graph, solution, time.monotonic() - began)
     for line in _summary(report):
@@ -153,13 +153,7 @@ def _summary(report: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Run with the command line's arguments."""
-    try:
-        run(tyro.cli(Arguments, prog=NAME, description=__doc__), Console())
-    except (ValueError, OSError) as error:
-        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    run_command(NAME, lambda: run(tyro.cli(Arguments, prog=NAME, description=__doc__), Console()))
 
 
 if __name__ == "__main__":

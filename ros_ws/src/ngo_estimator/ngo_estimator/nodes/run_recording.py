@@ -14,7 +14,6 @@ metrics.json. The same recording gives the same bytes.
 import gc
 import json
 import math
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -33,6 +32,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ngo_common.files import folder_whole
 from ngo_estimator.data.lidar_file import is_lidar
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
+from ngo_estimator.nodes.command import run_command
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
@@ -366,15 +366,7 @@ def _losses(core: "RecordingRun | LidarRun", images: int) -> list[str]:
 def main() -> None:
     """Run with the command line's arguments."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    console = Console()
-    try:
-        arguments = tyro.cli(Arguments, prog=NAME, description=__doc__)
-        run(arguments, console)
-    except (ValueError, OSError) as error:
-        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    run_command(NAME, lambda: run(tyro.cli(Arguments, prog=NAME, description=__doc__), Console()))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ _VERTEX, _EDGE, _FIX = "VERTEX_SE2", "EDGE_SE2", "FIX"
 _FORMS = {_VERTEX: "id x y yaw", _EDGE: "from to x y yaw and six values of the information matrix"}
 _IDS, _VALUES = {_VERTEX: 1, _EDGE: 2}, {_VERTEX: 3, _EDGE: 9}
 _AT_ONCE = 50_000  # lines whose words wait for their conversion
+_LARGEST = 1e12  # m or rad, of a pose: squares of larger ones overflow
 _UPPER = np.triu_indices(3)
 _EDGE_MARK = re.compile(r"(loop|step)(?: ([01](?:\.\d*)?|\d(?:\.\d*)?e-\d{1,3}))?$")
 _STAMP_MARK = re.compile(r"stamp (\d{1,10}(?:\.\d{1,9})?)$")
@@ -185,8 +186,12 @@ def _numbers(tag: str, words: list[list[str]], lines: list[int]) -> tuple[np.nda
         _numbers(tag, words[:half], lines[:half])
         _numbers(tag, words[half:], lines[half:])
         raise
-    if not (finite := np.isfinite(values).all(1)).all():
-        raise ValueError(f"line {lines[int(finite.argmin())]} has a value that is not finite; expected finite ones")
+    sane = np.isfinite(values).all(1) & (np.abs(values[:, :3]) <= _LARGEST).all(1)
+    if not sane.all():
+        raise ValueError(
+            f"line {lines[int(sane.argmin())]} has a value that is not finite, or a pose beyond {_LARGEST:g}; "
+            "expected metres and radians"
+        )
     return ids, values
 
 
