@@ -6,52 +6,45 @@ import array
 import inspect
 import math
 import sys
-import time
-from collections.abc import Callable
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
-from ngo_common.nodes.last_catch import spin_once
-from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import run_node
 from ngo_common.settings import BadParameter, SettingsType, usage
-from ngo_sim.building2d import Building2d, BuildingFrame
+from ngo_sim.building2d import Building2d
 from ngo_sim.building_drivers import BuildingDriverConfig
 from ngo_sim.building_node_config import BuildingNodeConfig
 from ngo_sim.convex_shapes import Floats
 from ngo_sim.floor_plans import FloorPlanConfig
-from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.lidar import ScannerConfig
-from ngo_sim.nodes.consumers import Consumers
-from ngo_sim.nodes.outputs import Outputs
+from ngo_sim.nodes.paced_node import PacedNode
 from ngo_sim.nodes.velocity_input import VelocityInput
 from ngo_sim.simulation import yaw_quaternion_zw
 from ngo_sim.wheels import WheelsConfig
 
-_LOOK_AT_GRAPH_S = 0.1
-_IDLE_S = 0.05
 _SETTINGS = (BuildingNodeConfig, FloorPlanConfig, BuildingDriverConfig, ScannerConfig, WheelsConfig)
 
 
-class Building2dNode(Node):
+class Building2dNode(PacedNode):
     """Publishes `scan`, wheel odometry, `ground_truth` and `/tf_static`, and on request `/tf` and `/clock`.
 
     Angles of a scan are in the laser's frame; one that hangs upside down is turned by `/tf_static`. With driver
     `cmd_vel` it takes `cmd_vel` and publishes `collision`.
     """
 
+    published_are = "scans"
+    sensor_is = "scan"
+
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.config = self._declared(BuildingNodeConfig)
+        self._config = self._declared(BuildingNodeConfig)
         plan, driver = self._declared(FloorPlanConfig), self._declared(BuildingDriverConfig)
         scanner, wheels = self._declared(ScannerConfig), self._declared(WheelsConfig)
         drawn = self.config.draw_robot
@@ -61,24 +54,23 @@ class Building2dNode(Node):
         except (ValueError, OSError) as error:  # what only the building, or the file of its plan, can say
             raise BadParameter(str(error)) from None
         config = self.config
-        self._name_watch = NameWatch(self)
-        self._consumers = Consumers(self, config.flow_control_topics, FlowControl(config.max_in_flight))
-        qos = QoSProfile(depth=max(100, 2 * config.max_in_flight))
-        self.outputs = Outputs(self, qos, config.record)
-        self.outputs.set_time(config.stamp_ns(0.0))
+        self.open_outputs(config.stamp_ns(0.0))
         self._truth = self.outputs.create(Odometry, "ground_truth")
         self._odometry = self.outputs.create(Odometry, config.wheel_odometry_topic)
         self._tf = self.outputs.create(TFMessage, "/tf") if config.publish_tf else None
         self._clock_out = self.outputs.create(Clock, "/clock") if config.publish_clock else None
         self._scan = self.outputs.create(LaserScan, "scan")
+        self.sensor = self._scan.publisher
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._static_tf = self.outputs.create(TFMessage, "/tf_static", latched)
         self._static_tf.publish(TFMessage(transforms=[self._mounting()]))
         building, commanded = self._building, driver.driver == "cmd_vel"
         self._velocity = VelocityInput(self, self.outputs, building.command) if commanded else None
-        self._pacer = Pacer()
-        self._published = 0
-        self._looked_s = 0.0
+
+    @property
+    def config(self) -> BuildingNodeConfig:
+        """How the node runs."""
+        return self._config
 
     def _declared(self, settings_type: type[SettingsType]) -> SettingsType:
         """Declare the parameters of one part; none changes while the node runs."""
@@ -86,55 +78,9 @@ class Building2dNode(Node):
         live.lock()
         return live.values
 
-    def destroy_node(self) -> None:
-        """End the recording."""
-        self.outputs.close()
-        super().destroy_node()
-
-    def run(self, ended: Callable[[], bool]) -> None:
-        """Publish scans until there are enough and all are taken, or until ``ended`` says so."""
-        executor = SingleThreadedExecutor()
-        executor.add_node(self)
-        self.get_logger().info(self._ready_line())
-        while not ended():
-            now_s = time.monotonic()
-            if now_s - self._looked_s >= _LOOK_AT_GRAPH_S:
-                self._looked_s = now_s
-                self._consumers.look()
-                self._name_watch.look()
-            if 0 < self.config.frames <= self._published:
-                if self._consumers.drained(now_s, self.config.stall_timeout_s):
-                    self.outputs.wait_for_all_acked()
-                    self.get_logger().info(f"published all {self._published} scans")
-                    return
-                idle_s = _IDLE_S
-            elif (idle_s := self._idle_s(now_s)) == 0.0:
-                self._publish(self._building.step(), now_s)
-            self.outputs.flush_if_due()
-            spin_once(self, executor, idle_s)
-
-    def _ready_line(self) -> str:
-        """The name of the node, its seed, rate and topics, and the subscribers that it waits for."""
-        config, topics = self.config, ", ".join(sorted(self.outputs.topic_names))
-        pace = f"{config.rate:g} scans a second" if config.rate else "as fast as the scans are taken"
-        subscribers = f"; waits for {config.wait_for_subscribers} subscribers of the scan"
-        waits = subscribers if config.wait_for_subscribers else ""
-        return f"ready: {self.get_fully_qualified_name()}, seed {config.seed}, {pace}, publishes {topics}{waits}"
-
-    def _idle_s(self, now_s: float) -> float:
-        """Time until the next scan, 0 if it is due."""
-        config = self.config
-        if self._published == 0:
-            awaited = self._scan.publisher.get_subscription_count() < config.wait_for_subscribers or (
-                config.wait_for_flow_control and not self._consumers.complete()
-            )
-            return _IDLE_S if awaited else 0.0
-        if config.rate > 0:
-            return min(_IDLE_S, self._pacer.remaining_s(now_s))
-        return 0.0 if self._consumers.may_publish(now_s, config.stall_timeout_s) else _IDLE_S
-
-    def _publish(self, frame: BuildingFrame, now_s: float) -> None:
-        config = self.config
+    def publish_next(self, now_s: float) -> int:
+        """Drive on, and publish the scan; returns its stamp in ns."""
+        config, frame = self.config, self._building.step()
         stamp_ns = config.stamp_ns(frame.stamp_s)
         stamp, wheel_stamp = _time(stamp_ns), _time(config.stamp_ns(frame.wheel_stamp_s))
         self.outputs.set_time(stamp_ns)
@@ -169,9 +115,7 @@ class Building2dNode(Node):
         scan.header.stamp, scan.header.frame_id = stamp, config.framed(config.laser_frame)
         scan.ranges = array.array("f", frame.ranges_m.tobytes())
         self._scan.publish(scan)
-        self._published += 1
-        self._consumers.published(stamp_ns, now_s)
-        self._pacer.taken(now_s, config.rate)
+        return stamp_ns
 
     def _mounting(self) -> TransformStamped:
         scanner, config = self._building.scanner, self.config

@@ -30,7 +30,7 @@ class Maze2DNode(SimulatorNode):
         super().__init__(name)
         self._scan = self.outputs.create(LaserScan, "scan")
         self._image = self.outputs.create(Image, "image")
-        self.image_publisher = self._image.publisher
+        self.sensor = self._image.publisher
 
     def make_world(self) -> World:
         """The world of the parameters."""

@@ -34,7 +34,7 @@ class Maze3DNode(SimulatorNode):
         super().__init__(name)
         self._camera_info = self.outputs.create(CameraInfo, "camera_info")
         self._image = self.outputs.create(Image, "image")
-        self.image_publisher = self._image.publisher
+        self.sensor = self._image.publisher
         config: Maze3DConfig = self.world_config
         focal_x, focal_y = config.focal_lengths_px
         # The middle of the picture, where the centre of pixel 0 is 0.
