@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -17,9 +17,12 @@ KEYS = (*online.BARS, "ratio_to_isam2_best", "cpu_s_a_minute_at_10_hz")
 
 @pytest.mark.timeout(300)
 def test_online(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = online.Arguments(worlds=("maze2d",), window=64, live=20, repeats=3, latency_frames=70, out=tmp_path)
+    arguments = online.Arguments(worlds=("maze2d",), window=64, live=20, repeats=3, out=tmp_path)
     monkeypatch.setattr(online, "BARS", dict.fromkeys(online.BARS, 1e9))
-    monkeypatch.setattr(online, "end_to_end", lambda *_: 123.0)  # tests/ros/test_demo.py runs the whole graph
+    # tests/ros/test_demo.py runs the whole graph, and measures this latency.
+    monkeypatch.setattr(online, "end_to_end", lambda *_: 123.0)
+    latencies = {"image_to_path_median_ms": 10.0, "image_to_path_p99_ms": 15.0, "image_to_path_p99_to_median": 1.5}
+    monkeypatch.setattr(online, "image_to_path", lambda *_: latencies)
     assert online.main(arguments) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])["maze2d"]
     for key in KEYS:
@@ -37,12 +40,13 @@ class TenFramesASecond:
     def __init__(self, config: SessionConfig, _: Path, lost: int = 0) -> None:
         self.frames, self.lost = config.frames, lost
 
-    def run(self, show: Callable[[str, int], None]) -> dict[str, int]:
+    def run(self, show: Callable[[str, int], None], with_latency: bool = False) -> dict[str, Any]:
         show("loading the networks", 0)
         for count in range(1, self.frames + 1):
             TenFramesASecond.now_s = 100.0 + 0.1 * count
             show("driving", count)
-        return {"frames": self.frames - self.lost}
+        latency = {"latency_ms": {"median": 10.0, "p99": 15.0, "max": 1000.0}} if with_latency else {}
+        return {"frames": self.frames - self.lost, **latency}
 
     now_s = 0.0
 
@@ -52,6 +56,9 @@ def test_frames_end_to_end_are_counted_and_none_may_be_lost(tmp_path: Path, monk
     monkeypatch.setattr(online.time, "monotonic", lambda: TenFramesASecond.now_s)
     monkeypatch.setattr(online, "Session", TenFramesASecond)
     assert online.end_to_end("maze2d", arguments) == pytest.approx(10.0)
+    found = online.image_to_path("maze2d", arguments)
+    wanted = {"image_to_path_median_ms": 10.0, "image_to_path_p99_ms": 15.0, "image_to_path_p99_to_median": 1.5}
+    assert found == pytest.approx(wanted)
     monkeypatch.setattr(online, "Session", partial(TenFramesASecond, lost=2))
     with pytest.raises(GraphError, match="2 of 50 frames were lost"):
         online.end_to_end("maze2d", arguments)
