@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.lidar_description import describe_lidar
 from ngo_recordings.mounting import find_mounting
+from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import open_recording
 from ngo_recordings.scan_stream import BAD_SCAN, BAD_WHEELS, LidarScan, WheelPose, scan_angles, scan_stream
 from ngo_recordings.topics import GroundTruth, RecordingTopics, TopicArguments, WheelSource, choose_topics
@@ -51,6 +52,26 @@ def drive(count: int = 20, lag_ns: int = 0) -> list[m.Entry]:
 
 def static(parent: str, child: str, *pose: float, **turn: float) -> Any:
     return m.transform(0, parent, child, m.pose(*pose, **turn))
+
+
+def test_odometry_with_velocities_alone_is_summed_up(tmp_path: Path) -> None:
+    entries: list[m.Entry] = []
+    for k in range(60):
+        made = odometry(stamp(k), 0.0, 0.0, 0.0)
+        made.twist.twist = m.twist(0.5, 0.0, 0.2)
+        if k % 2:
+            made.pose.pose.orientation.w = 0.0  # as robots leave it that fill in nothing
+        entries += [("/odom", stamp(k), made), ("/scan", stamp(k), scan(stamp(k)))]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        found = [each for each in scan_stream(recording, WITH_WHEELS, skipped=Counter()) if isinstance(each, WheelPose)]
+    turned, radius = 0.2 * 5.9, 0.5 / 0.2
+    np.testing.assert_allclose(
+        found[-1].pose_xyyaw, [radius * math.sin(turned), radius * (1.0 - math.cos(turned)), turned], atol=1e-3
+    )
+    standing = odometry(stamp(1), 1.0, 2.0, 0.5)
+    poses = OdometryPoses()
+    for _ in range(20):
+        np.testing.assert_allclose(poses.read(standing), [1.0, 2.0, 0.5], atol=1e-12)
 
 
 @pytest.mark.parametrize("lag_ns", [0, S // 5, 9 * S // 10])

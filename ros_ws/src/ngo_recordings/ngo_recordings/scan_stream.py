@@ -14,6 +14,7 @@ import numpy as np
 from ngo_recordings.association import RESTART_NS, header_stamp_ns
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.images import SCAN_TYPE
+from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import Message, Recording
 from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
@@ -220,13 +221,14 @@ class _Wheels:
     """Wheel poses of messages."""
 
     def __init__(self, recording: Recording, source: WheelSource, image: str) -> None:
+        self._odometry = OdometryPoses()
         self._tf = None if source.tf is None else FramePoses(TransformBuffer(), *source.tf)
         self.names = (str(source.topic),) if source.tf is None else tuple(transform_topics(recording, image))
 
     def read(self, message: Message, lost: Counter[str]) -> Iterator[WheelPose]:
         if self._tf is None:
             value = message.value
-            pose = _planar(value.pose.pose.position, value.pose.pose.orientation)
+            pose = self._odometry.read(value)
             if pose is None:
                 lost[BAD_WHEELS] += 1
             else:
@@ -258,16 +260,6 @@ def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> Lid
         str(value.header.frame_id).strip("/"),
         topic=topic,
     )
-
-
-def _planar(position: Any, rotation: Any) -> np.ndarray | None:
-    """Position and the direction of x from above; None where they are no numbers."""
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
-    size = x * x + y * y + z * z + w * w
-    if not (math.isfinite(position.x) and math.isfinite(position.y) and 1e-12 < size < math.inf):
-        return None
-    yaw = math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
-    return np.array([position.x, position.y, yaw])
 
 
 def _spans(increment: float, count: int) -> bool:

@@ -25,9 +25,9 @@ from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
-from ngo_recordings.association import ros_pose
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
+from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.scan_stream import LidarScan, scan_of
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
@@ -57,6 +57,7 @@ class LidarInput:
         self._transforms = TransformBuffer()
         self._wheels = FramePoses(self._transforms, self._odom_frame, self._base_frame)
         self._on_tf = OdometryOnTf(self._transforms, self._odom_frame, self._base_frame)
+        self._odometry = OdometryPoses()
         self._said = ""
         self._held: deque[LidarScan] = deque(maxlen=_MOST_HELD)
         self._mountings: dict[str, KnownMounting | None] = {}  # by frame; None: taken to be the base frame
@@ -119,11 +120,15 @@ class LidarInput:
         self._update()
 
     def _on_odometry(self, message: Odometry) -> None:
-        pose = ros_pose(message.pose.pose.position, message.pose.pose.orientation)
+        try:
+            pose = self._odometry.read(message)
+        except ValueError as error:
+            self._status.dropped("robot odometry", error)
+            return
         if pose is None:
             self._status.dropped("robot odometry", _NO_POSE)
             return
-        self._add_wheels(messages.to_ns(message.header.stamp), pose.planar()[0])
+        self._add_wheels(messages.to_ns(message.header.stamp), pose)
         self._update()
 
     def _add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:

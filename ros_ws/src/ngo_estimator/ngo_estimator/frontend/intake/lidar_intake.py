@@ -156,6 +156,8 @@ class LidarIntake:
             if self._turns.alone and (mounting := self._mountings.get(scanner)) is not None:
                 sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
         if not step.unsure and self._clock.add_step(step.from_stamp_ns, step.stamp_ns, step.relative_xyyaw):
+            for sweep in self._sweeps.values():
+                sweep.forget()
             for stamp_ns, pose in self._wheels.again(self._clock.truth):
                 if not self._clock.truth.useless:
                     self.front_end.add_wheels(stamp_ns, pose)

@@ -86,6 +86,11 @@ class MeasuredSweep:
         self._taken.clear()
         self._last_ns = None
 
+    def forget(self) -> None:
+        """Measure anew: the motions that it was measured by were wrong."""
+        self._found.clear()
+        self.reversed, self.known_s = False, None
+
     def correct(self, scan: LidarScan) -> LidarScan:
         """The scan with its rays in the order in which they were measured, and with their time."""
         if self._last_ns is not None and scan.stamp_ns > self._last_ns:

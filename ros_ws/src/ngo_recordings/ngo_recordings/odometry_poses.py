@@ -1,0 +1,79 @@
+"""Poses of nav_msgs/Odometry, also of robots that fill in the velocity alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ngo_recordings.association import header_stamp_ns
+
+_FEWEST = 5
+"""Messages that move by their velocity and not by their pose, after which the velocity counts."""
+
+_MOVES = 1e-3
+"""Velocity (m/s, rad/s) of a robot that does not stand."""
+
+_LONGEST_S = 1.0
+"""Between two messages whose velocities are summed up."""
+
+
+class OdometryPoses:
+    """The planar pose of each message: as it is given, or summed up from velocities where no pose ever moves."""
+
+    def __init__(self) -> None:
+        self.from_velocity = False
+        """Whether velocities are summed up."""
+        self._first: np.ndarray | None = None
+        self._moved = False  # whether a pose was another than the first one
+        self._count = 0
+        self._pose = np.zeros(3)
+        self._last: tuple[int, np.ndarray] | None = None
+
+    def read(self, message: Any) -> np.ndarray | None:
+        """The pose ``(3,)`` of a message: m, m, rad; None where there is none.
+
+        Raises RecordingError for a message without a stamp.
+        """
+        stamp_ns = header_stamp_ns(message)
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        twist = np.array([linear.x, linear.y, angular.z])
+        given = planar_pose(message.pose.pose.position, message.pose.pose.orientation)
+        if np.isfinite(twist).all():
+            self._sum_up(stamp_ns, twist)
+            self._judge(given, bool((np.abs(twist) > _MOVES).any()))
+        return self._pose.copy() if self.from_velocity else given
+
+    def _judge(self, given: np.ndarray | None, moves: bool) -> None:
+        if self._first is None:
+            self._first = given
+        elif given is not None and not np.array_equal(given, self._first):
+            self._moved, self.from_velocity = True, False
+        if moves and not self._moved:
+            self._count += 1
+            self.from_velocity = self._count >= _FEWEST
+
+    def _sum_up(self, stamp_ns: int, twist: np.ndarray) -> None:
+        if self._last is not None:
+            elapsed_s, mean = (stamp_ns - self._last[0]) * 1e-9, 0.5 * (self._last[1] + twist)
+            if elapsed_s < -_LONGEST_S:  # the source restarted
+                self._pose = np.zeros(3)
+            elif 0.0 < elapsed_s < _LONGEST_S:
+                heading = self._pose[2] + 0.5 * elapsed_s * mean[2]
+                x, y, turn = (elapsed_s * mean).tolist()
+                cos, sin = math.cos(heading), math.sin(heading)
+                self._pose = self._pose + (x * cos - y * sin, x * sin + y * cos, turn)
+            elif elapsed_s <= 0.0:
+                return
+        self._last = stamp_ns, twist
+
+
+def planar_pose(position: Any, rotation: Any) -> np.ndarray | None:
+    """Position and the direction of x from above ``(3,)``; None where they are no numbers."""
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    size = x * x + y * y + z * z + w * w
+    if not (math.isfinite(position.x) and math.isfinite(position.y) and 1e-12 < size < math.inf):
+        return None
+    yaw = math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return np.array([position.x, position.y, yaw])
