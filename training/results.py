@@ -5,6 +5,7 @@
     python -m training.results --world scan      # of the lidar: training.results_scan
     python -m training.results --world doom      # of other Doom maps: training.results_doom
     python -m training.results --world graphs    # of graphs with wrong loops: training.results_graphs
+    python -m training.results --world explore   # of exploration: training.results_explore
     python -m training.results --world stress    # of changed logs of a lidar: training.results_stress
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
@@ -22,7 +23,7 @@ import numpy as np
 from ngo_estimator.loops import overlaps, pair_measurement
 from ngo_estimator.ngo import neural_graph_optimizer
 from ngo_estimator.trajectory import errors
-from training import results_doom, results_graphs, results_scan, results_stress
+from training import results_doom, results_explore, results_graphs, results_scan, results_stress
 from training.common import records
 from training.common.command_line import run_command
 from training.data.feature_store import open_store
@@ -187,6 +188,8 @@ if __name__ == "__main__":
         run_command(results_scan.main, results_scan.Arguments, results_scan.__doc__)
     elif "--world doom" in given:
         run_command(results_doom.main, results_doom.Arguments, results_doom.__doc__)
+    elif "--world explore" in given:
+        run_command(results_explore.main, results_explore.Arguments, results_explore.__doc__)
     elif "--world graphs" in given:
         run_command(results_graphs.main, results_graphs.Arguments, results_graphs.__doc__)
     elif "--world stress" in given:

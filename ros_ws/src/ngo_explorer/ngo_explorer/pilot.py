@@ -62,10 +62,6 @@ class Pilot:
             self._decide(robot_xyyaw, now_s)
         return exploration.goal
 
-    def end(self, robot_xyyaw: Floats) -> None:
-        """Explore no more: go home, if there is one, or stop here."""
-        self._finish(robot_xyyaw)
-
     def _decide(self, robot_xyyaw: Floats, now_s: float) -> None:
         before, self.decided = self.exploration.goal, self.decided + 1
         goal = self.exploration.decide(robot_xyyaw, now_s)

@@ -1,0 +1,41 @@
+"""The tables of exploration at toy size: every number is there, and two robots that explore for longer see more."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ngo_explorer.settings import DriveConfig, ExplorerConfig
+from training.data.explored_worlds import Maze
+from training.results_explore import Arguments, Maze2DConfig, main
+from training.scoring.exploring import Seen, drive_known_tour, explore
+
+pytestmark = pytest.mark.slow
+
+TINY = Maze2DConfig(rows=2, cols=2)
+
+
+def test_the_tables_of_two_mazes(tmp_path: Path) -> None:
+    folders = {"out": tmp_path, "docs": tmp_path, "runs": tmp_path / "runs"}
+    rows = ("nearest", "explore_lite", "ours")
+    main(Arguments(worlds=("mazes",), split="validation", count=2, rows=rows, most_s=12.0, **folders))
+    result = json.loads((tmp_path / "explore.json").read_text())
+    table = result["tables"]["mazes"]
+    assert sorted(table) == sorted(rows)
+    for entry in table.values():
+        assert 0.0 < entry["coverage"]["mean"] < 1.0
+        assert {"ended_early", "iou", "collisions", "decision_ms", "ate_m"} <= entry.keys()
+    assert "| **tour over frontiers** |" in (tmp_path / "results_explore.md").read_text()
+    assert (tmp_path / "images" / "results_explore_mazes_coverage.png").stat().st_size > 0
+
+
+def test_a_tiny_maze_is_explored_to_its_end_with_and_without_its_map() -> None:
+    config = ExplorerConfig(radius_m=TINY.radius_m)
+    seen = Seen(Maze(5, TINY))
+    for run in (
+        explore(Maze(5, TINY), seen, config, DriveConfig(), most_s=400.0),
+        drive_known_tour(Maze(5, TINY), seen, config, DriveConfig(), most_s=400.0),
+    ):
+        assert run.ended and run.coverage[-1] > 0.98 and run.collisions == 0
+        assert (np.diff(run.path_m) >= 0.0).all() and 0.0 < run.path_to(0.95) <= run.path_m[-1]

@@ -1,0 +1,135 @@
+"""Worlds to explore in this process: buildings, drawn or from a file, and 2D mazes, with a robot that is commanded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ngo_estimator.mapping.range_scan import RangeScan, range_scan
+from ngo_sim.building2d import Building2d
+from ngo_sim.building_drivers import BuildingDriverConfig
+from ngo_sim.floor_plans import FloorPlan, FloorPlanConfig
+from ngo_sim.lidar import ScannerConfig, cast_scans, ray_world
+from ngo_sim.maze2d import Maze2D, Maze2DConfig
+from ngo_sim.raycast import cast_rays
+from ngo_sim.routes import CELL_M, RouteMap
+from ngo_sim.simulation import Simulation
+
+_APART_M = 0.4  # between two places that say what can be seen
+_RAYS = 720
+_RANGE_M = 12.0  # of the robot's lidar
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Where a robot is and what it sees: true pose ``(3,)``, the rays, and whether something stopped it on the way."""
+
+    time_s: float
+    pose_xyyaw: np.ndarray
+    scan: RangeScan
+    blocked: bool
+
+
+class ExploredWorld(Protocol):
+    """A world with a robot in it that drives by velocities."""
+
+    radius_m: float
+    range_m: float
+
+    def step(self, speed_mps: float, turn_rate_rps: float) -> Sight:
+        """Drive for one period."""
+        ...
+
+    def exact_scans(self) -> tuple[list[RangeScan], np.ndarray]:
+        """What can be seen: exact scans all around, and their poses ``(n, 3)`` all over where the robot can go."""
+        ...
+
+
+class Building:
+    """A building of a seed; a robot with a lidar of 270 degrees and 12 m."""
+
+    range_m = _RANGE_M
+
+    def __init__(self, seed: int, plan: FloorPlanConfig, speed_mps: float = 1.0) -> None:
+        self._driver = BuildingDriverConfig(driver="cmd_vel", speed_mps=speed_mps, acceleration_mps2=1.0)
+        self.radius_m = self._driver.radius_m
+        self._scanner = ScannerConfig(range_max_m=_RANGE_M, rays=360)
+        self._angles = self._scanner.base_angles_rad()
+        self._building = Building2d(plan, self._scanner, driver=self._driver)
+        self._building.reset(seed)
+
+    @property
+    def plan(self) -> FloorPlan:
+        """The floor plan."""
+        return self._building.plan
+
+    def step(self, speed_mps: float, turn_rate_rps: float) -> Sight:
+        """Drive for one period, and look."""
+        self._building.command(speed_mps, turn_rate_rps)
+        frame = self._building.step()
+        # Of rays without a return nothing is known: glass, a dropout, or nothing within the range.
+        scan = range_scan(self._angles, frame.ranges_m.astype(np.float64), np.zeros(3), _RANGE_M)
+        return Sight(frame.stamp_s, frame.true_pose_xyyaw, scan, self._building.blocked)
+
+    def exact_scans(self) -> tuple[list[RangeScan], np.ndarray]:
+        """Exact scans all over where the robot can go; doors that it cannot rely on are shut, and glass is a wall."""
+        plan = self._building.plan
+        area = RouteMap(plan, self.radius_m).area
+        step = round(_APART_M / CELL_M)
+        cells = np.argwhere(area[::step, ::step]) * step
+        poses = np.column_stack(((cells[:, ::-1] + 0.5) * CELL_M, np.zeros(len(cells))))
+        exact = ScannerConfig(
+            rays=_RAYS, field_of_view_deg=360.0, range_max_m=_RANGE_M, noise_m=0.0, noise_per_m=0.0, dropout=0.0
+        )
+        swing = np.column_stack((plan.doors.hinges_m, plan.doors.widths_m))
+        world = ray_world(plan.segments_m, np.zeros(len(plan.glass), np.bool_), plan.circles_m, swing)
+        doors = plan.doors
+        opened = np.where(doors.passable, doors.angles_rad[:, 0], 0.0)[None]
+        leaves = np.repeat(doors.leaves_at(opened), len(poses), axis=0)
+        ranges = cast_scans(
+            world,
+            exact,
+            poses,
+            np.zeros((len(poses), 2)),
+            leaves,
+            np.zeros((len(poses), 0, 3)),
+            np.random.default_rng(0),
+        )
+        return [range_scan(exact.base_angles_rad(), row.astype(float), np.zeros(3), _RANGE_M) for row in ranges], poses
+
+
+class Maze:
+    """A 2D maze of a seed; rays end at its walls."""
+
+    def __init__(self, seed: int, config: Maze2DConfig) -> None:
+        self._world = Maze2D(config)
+        self._run = Simulation(self._world, seed, "cmd_vel")
+        self.radius_m = config.radius_m
+        self.range_m = math.hypot(*self._world.maze.size_m) + 1.0
+
+    def step(self, speed_mps: float, turn_rate_rps: float) -> Sight:
+        """Drive for one period, and look."""
+        assert self._run.velocity is not None
+        self._run.velocity.set(speed_mps, turn_rate_rps)
+        frame, blocked = self._run.drive()
+        ranges = frame.observation[:, 3].astype(np.float64)
+        scan = range_scan(self._world.ray_angles_rad, ranges, np.zeros(3), self.range_m)
+        return Sight(frame.index * self._world.period_s, frame.pose_xyyaw, scan, blocked)
+
+    def exact_scans(self) -> tuple[list[RangeScan], np.ndarray]:
+        """Exact scans from several places of every free block."""
+        maze, radius = self._world.maze, self.radius_m
+        inset = (maze.block_m / 2 - radius) * 0.9
+        offsets = [(x, y) for x in (-inset, 0.0, inset) for y in (-inset, 0.0, inset)]
+        middles = maze.block_center(maze.free_blocks())
+        poses = np.concatenate([np.column_stack((middles + offset, np.zeros(len(middles)))) for offset in offsets])
+        angles = np.linspace(-math.pi, math.pi, _RAYS, endpoint=False)
+        scans, seen = [], np.empty((_RAYS, 4), np.float32)
+        colors = np.zeros((*maze.walls.shape, 3), np.float32)
+        for x, y, yaw in poses.tolist():
+            cast_rays(maze.walls, maze.block_m, x, y, yaw, np.cos(angles), np.sin(angles), colors, seen)
+            scans.append(range_scan(angles, seen[:, 3].astype(np.float64), np.zeros(3), self.range_m))
+        return scans, poses

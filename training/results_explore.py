@@ -1,0 +1,192 @@
+"""The tables of exploration: how far a robot drives until it has seen 95 % of what it can see, by rule.
+
+    python -m training.results --world explore
+    python -m training.results --world explore --worlds mazes --count 20 --rows explore_lite ours
+    python -m training.results --world explore --worlds plans --plans FOLDER
+
+The robot explores in this process, at true poses, with the same map, follower and limits in all rows. FOLDER holds maps
+of a map server as NAME.yaml. What is measured is kept in ``runs/``. The command writes
+``training/results/explore.json``, ``docs/results_explore.md`` and ``docs/images/results_explore_*.png``.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ngo_explorer import exploration, frontiers, known_map, path_follower, pilot, planner, put_aside, rules, tours
+from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
+from ngo_sim.floor_plans import FloorPlanConfig
+from ngo_sim.maze2d import Maze2DConfig
+from training.common import records
+from training.data import explored_worlds
+from training.data.building_drives import BUILDING_TEST_SEEDS
+from training.data.explored_worlds import Building, ExploredWorld, Maze
+from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS
+from training.report import explore_page
+from training.report.explore_figures import draw_figures
+from training.report.folders import Folders
+from training.scoring import exploring, known_tour
+from training.scoring.exploring import Explored, Seen, drive_known_tour, explore
+from training.scoring.map_errors import intersections
+from training.scoring.statistics import mean_interval
+from training.scoring.table import Drive, Measured, Numbers, Row, Table, column, intervals, measure, pairs, samples
+
+ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours")
+BASE = "explore_lite"
+_CODE = (
+    exploration,
+    frontiers,
+    known_map,
+    path_follower,
+    pilot,
+    planner,
+    put_aside,
+    rules,
+    tours,
+    exploring,
+    known_tour,
+)
+_BUILDING_SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS}
+_MAZE_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+
+
+@dataclass(frozen=True)
+class Arguments(Folders):
+    """Settings of the table."""
+
+    world: Literal["explore"] = "explore"
+    """World to measure in."""
+    worlds: tuple[Literal["mazes", "buildings", "plans"], ...] = ("mazes", "buildings")
+    """Kinds of places: 2D mazes, drawn buildings, floor plans from files."""
+    plans: Path | None = None
+    """Folder of floor plans, for the kind plans."""
+    rows: tuple[str, ...] = ROWS
+    """Rules to measure; explore_lite is always measured."""
+    count: int = 10
+    """Places of each kind; of plans all are taken."""
+    scale: float = 0.5
+    """Factor on the length of the corridors of drawn buildings."""
+    most_s: float = 7200.0
+    """Simulated time after which an exploration is stopped, s."""
+    split: Literal["validation", "test"] = "test"
+    """Seeds of the places. Rules are chosen on validation; test is for the final table alone."""
+
+    def __post_init__(self) -> None:
+        if unknown := [row for row in self.rows if row not in ROWS]:
+            raise ValueError(f"rows has {', '.join(unknown)}; expected among {', '.join(ROWS)}")
+        if "plans" in self.worlds and self.plans is None:
+            raise ValueError("the kind plans needs --plans, which is not given")
+        if self.count < 2 or not self.most_s > 0.0:
+            raise ValueError(f"count, most_s are {self.count}, {self.most_s}; expected at least 2, and a time")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place: what makes it anew for each row, and what can be seen of it."""
+
+    make: Callable[[], ExploredWorld]
+    seen: Seen
+
+
+def main(arguments: Arguments) -> dict[str, Any]:
+    """Measure, write everything, and return the JSON's content."""
+    record = records.record("results", arguments)
+    rows = {name: _row(name, arguments) for name in ROWS if name in (*arguments.rows, BASE)}
+    found: dict[str, Table] = {
+        kind: measure([(drive, rows) for drive in _drives(kind, arguments)], arguments.runs / "explore" / kind, kind)
+        for kind in arguments.worlds
+    }
+    result = {
+        "command": "make results WORLD=explore",
+        "revision": record["revision"],
+        "settings": {name: getattr(arguments, name) for name in ("split", "count", "scale", "most_s")},
+        "poses": "true",
+        "tables": {kind: {row: _numbers(table, row) for row in rows} for kind, table in found.items()},
+        "paired": {kind: {row: _paired(table, row) for row in rows if row != BASE} for kind, table in found.items()},
+    }
+    images = draw_figures(arguments.images, found)
+    return arguments.publish("explore", result, explore_page.page(result, images))
+
+
+def _drives(kind: str, arguments: Arguments) -> Iterator[Drive]:
+    for name, identity, make in _places(kind, arguments):
+        yield Drive(name, identity, partial(_place, make), (explored_worlds, exploring))
+
+
+def _places(kind: str, arguments: Arguments) -> Iterator[tuple[str, str, Callable[[], ExploredWorld]]]:
+    if kind == "mazes":
+        for seed in _MAZE_SEEDS[arguments.split][: arguments.count]:
+            yield f"maze_{seed}", f"maze {seed}", partial(Maze, seed, Maze2DConfig())
+    elif kind == "buildings":
+        plan = FloorPlanConfig(scale=arguments.scale, people=0)
+        for seed in _BUILDING_SEEDS[arguments.split][: arguments.count]:
+            yield f"building_{seed}_{arguments.scale:g}", f"building {seed} {plan}", partial(Building, seed, plan)
+    else:
+        assert arguments.plans is not None
+        for path in sorted(arguments.plans.glob("*.yaml")):
+            plan = FloorPlanConfig(plan=str(path), people=0)
+            yield f"plan_{path.stem}", f"plan {path.name}", partial(Building, 0, plan)
+
+
+def _place(make: Callable[[], ExploredWorld]) -> Place:
+    return Place(make, Seen(make()))
+
+
+def _row(name: str, arguments: Arguments) -> Row:
+    return Row(partial(_measure, name=name, most_s=arguments.most_s), f"{name} {arguments.most_s}", _CODE)
+
+
+def _measure(place: Place, name: str, most_s: float) -> Measured:
+    world = place.make()
+    config = ExplorerConfig(rule="tour" if name in ("ours", "known_tour") else name, radius_m=world.radius_m)
+    if name == "known_tour":
+        run = drive_known_tour(world, place.seen, config, DriveConfig(), most_s)
+    else:
+        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s)
+    return Measured.of(
+        scores(run, place.seen),
+        path_m=run.path_m,
+        coverage=run.coverage,
+        way=run.poses_xyyaw[::5],
+        free=np.packbits(place.seen.map.values == 0, axis=1),
+        columns=np.array(place.seen.map.values.shape[1]),
+        corner=place.seen.map.origin_xy,
+    )
+
+
+def scores(run: Explored, seen: Seen) -> dict[str, float]:
+    """The metrics of one exploration; a path that never reached 95 % has no length."""
+    free, occupied = intersections(run.found, seen.map)
+    found: dict[str, Table] = {
+        "ended_early": float(run.ended and run.coverage[-1] < 0.98),
+        "ended": float(run.ended),
+        "coverage": float(run.coverage[-1]),
+        "path_m": float(run.path_m[-1]),
+        "time_s": float(run.time_s[-1]),
+        "iou": 0.5 * (free + occupied),
+        "collisions": 1e3 * run.collisions / max(float(run.path_m[-1]), 1.0),
+        "decision_ms": float(np.percentile(run.decisions_ms, 99)) if len(run.decisions_ms) else 0.0,
+    }
+    if np.isfinite(run.path_to(0.95)):
+        found["path_to_95_m"] = run.path_to(0.95)
+    return found
+
+
+def _numbers(table: Table, row: str) -> Numbers:
+    """``{mean, ci95}`` by metric; ``ate_m`` is empty at true poses."""
+    found = intervals(samples(column(table, row)))
+    return {**found, "ate_m": {"mean": None, "ci95": None}}
+
+
+def _paired(table: Table, row: str) -> dict[str, Any]:
+    """Geometric mean of the paths to 95 % by those of explore_lite's rule, on the places where both got there."""
+    both = pairs(table, row, BASE, "path_to_95_m")
+    if len(both) < 2:
+        return {"path_to_95_ratio": {"mean": None, "ci95": None}, "places": len(both)}
+    ratio = mean_interval(np.log(both[:, 0] / both[:, 1]))
+    bounds = {"mean": float(np.exp(ratio.mean)), "ci95": [float(np.exp(ratio.low)), float(np.exp(ratio.high))]}
+    return {"path_to_95_ratio": bounds, "places": len(both)}

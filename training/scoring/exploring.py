@@ -1,0 +1,166 @@
+"""A robot that explores a simulated world in this process: its map, its path, and what it saw of what can be seen."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ngo_estimator.mapping.occupancy_grid import UNKNOWN, OccupancyConfig, OccupancyGrid, OccupancyMap
+from ngo_explorer.exploration import Exploration
+from ngo_explorer.known_map import KnownMap
+from ngo_explorer.path_follower import DRIVING, PathFollower
+from ngo_explorer.pilot import DONE, Pilot
+from ngo_explorer.settings import DriveConfig, ExplorerConfig
+from training.data.explored_worlds import ExploredWorld
+from training.scoring.known_tour import known_tour
+
+RESOLUTION_M = 0.05
+_MAP_EVERY_S = 0.5
+_MOVED_M, _TURNED_RAD = 0.1, math.radians(5.0)  # between two scans that enter the map
+_OCCUPANCY = OccupancyConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Explored:
+    """One exploration of n maps.
+
+    ``path_m``, ``coverage`` and ``time_s`` ``(n,)``: length of the path, share seen of what can be seen, and time.
+    ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself.
+    """
+
+    path_m: np.ndarray
+    coverage: np.ndarray
+    time_s: np.ndarray
+    poses_xyyaw: np.ndarray
+    decisions_ms: np.ndarray
+    collisions: int
+    ended: bool
+    found: OccupancyMap
+
+    def path_to(self, coverage: float) -> float:
+        """Path until so much was seen, m; infinite where it never was."""
+        reached = np.flatnonzero(self.coverage >= coverage)
+        return float(self.path_m[reached[0]]) if len(reached) else math.inf
+
+
+class Seen:
+    """What can be seen of a world, and how much of it a map holds."""
+
+    def __init__(self, world: ExploredWorld) -> None:
+        scans, poses = world.exact_scans()
+        grid = OccupancyGrid(RESOLUTION_M)
+        for begin in range(0, len(scans), 200):
+            grid.add(scans[begin : begin + 200], poses[begin : begin + 200])
+        self.map = grid.cells(_OCCUPANCY).trinary(_OCCUPANCY.free, _OCCUPANCY.occupied)
+        self._free = self.map.values == 0
+        self._count = int(np.count_nonzero(self._free))
+
+    def free_points(self) -> np.ndarray:
+        """Middles ``(n, 2)`` of the free cells that can be seen."""
+        return self.map.origin_xy + (np.argwhere(self._free)[:, ::-1] + 0.5) * RESOLUTION_M
+
+    def coverage(self, found: OccupancyMap) -> float:
+        """Share of the free cells that can be seen which a map knows."""
+        column, row = np.rint((found.origin_xy - self.map.origin_xy) / RESOLUTION_M).astype(int).tolist()
+        rows, columns = self._free.shape
+        top, left = max(0, row), max(0, column)
+        low, right = min(rows, row + found.values.shape[0]), min(columns, column + found.values.shape[1])
+        if top >= low or left >= right:
+            return 0.0
+        known = found.values[top - row : low - row, left - column : right - column] != UNKNOWN
+        return float(np.count_nonzero(known & self._free[top:low, left:right])) / self._count
+
+
+def explore(
+    world: ExploredWorld, seen: Seen, config: ExplorerConfig, drive: DriveConfig, seed: int = 0, most_s: float = 3600.0
+) -> Explored:
+    """Explore a world at true poses until the robot says that nothing is left, or for most_s of simulated time."""
+    run = _Run(world, seen)
+    exploration = Exploration(config, seed=seed)
+    run.drive(exploration, PathFollower(drive, run.need_m(config)), most_s)
+    return run.explored()
+
+
+def drive_known_tour(
+    world: ExploredWorld, seen: Seen, config: ExplorerConfig, drive: DriveConfig, most_s: float = 3600.0
+) -> Explored:
+    """Drive the tour of a robot that knows the map, and then explore what it has left out."""
+    run = _Run(world, seen)
+    known = KnownMap(config.radius_m, config.comfort_m)
+    known.update(seen.map.values, RESOLUTION_M, seen.map.origin_xy)
+    follower = PathFollower(drive, run.need_m(config))
+    for path in known_tour(world, known, run.sight.pose_xyyaw[:2], run.need_m(config)):
+        follower.follow(path, float(np.arctan2(*(path[-1] - path[max(0, len(path) - 5)])[::-1])))
+        while follower.state == DRIVING and run.sight.time_s < most_s:
+            run.look()
+            run.move(*follower.step(known, run.sight.pose_xyyaw, run.sight.time_s))
+    run.drive(Exploration(replace(config, rule="nearest")), follower, most_s)
+    return run.explored()
+
+
+class _Run:
+    """A robot on its way, its map and what is written down of both."""
+
+    def __init__(self, world: ExploredWorld, seen: Seen) -> None:
+        self._world, self._seen, self._grid = world, seen, OccupancyGrid(RESOLUTION_M)
+        self.sight = world.step(0.0, 0.0)
+        self._rows: list[tuple[float, float, float]] = []
+        self._poses, self._decisions_ms = [self.sight.pose_xyyaw], list[float]()
+        self._entered: np.ndarray | None = None
+        self._mapped_s, self._path_m, self._collisions, self._touched, self._ended = -math.inf, 0.0, 0, False, False
+        self.found = self._grid.cells(_OCCUPANCY)
+
+    def need_m(self, config: ExplorerConfig) -> float:
+        """Clearance that the robot's middle needs."""
+        return config.radius_m + config.margin_m + 0.5 * RESOLUTION_M
+
+    def drive(self, exploration: Exploration, follower: PathFollower, most_s: float) -> None:
+        """Explore until nothing is left. Decisions are timed by the time of this process, on one core."""
+        pilot = Pilot(exploration, follower, 2.0 * _MAP_EVERY_S, None)
+        follower.stop()
+        while self.sight.time_s < most_s and pilot.state != DONE:
+            mapped, decided, begun_s = self.look(), pilot.decided, time.process_time()
+            if mapped or exploration.known.empty:
+                exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
+            pilot.step(self.sight.pose_xyyaw, self.sight.time_s)
+            if pilot.decided > decided:
+                self._decisions_ms.append(1e3 * (time.process_time() - begun_s))
+            self.move(*follower.step(exploration.known, self.sight.pose_xyyaw, self.sight.time_s))
+        self._ended = pilot.state == DONE
+
+    def look(self) -> bool:
+        """Enter what is seen, and draw the map from time to time; returns whether it was drawn."""
+        sight = self.sight
+        if self._entered is None or _moved(self._entered, sight.pose_xyyaw):
+            self._entered = sight.pose_xyyaw
+            self._grid.add([sight.scan], sight.pose_xyyaw[None])
+        if sight.time_s - self._mapped_s < _MAP_EVERY_S - 1e-6:
+            return False
+        self._mapped_s = sight.time_s
+        self.found = self._grid.cells(_OCCUPANCY).trinary(_OCCUPANCY.free, _OCCUPANCY.occupied)
+        self._rows.append((self._path_m, self._seen.coverage(self.found), sight.time_s))
+        return True
+
+    def move(self, speed_mps: float, turn_rate_rps: float) -> None:
+        """Drive for a period."""
+        before, self.sight = self.sight.pose_xyyaw, self._world.step(speed_mps, turn_rate_rps)
+        self._path_m += float(np.hypot(*(self.sight.pose_xyyaw - before)[:2]))
+        self._collisions += self.sight.blocked and not self._touched
+        self._touched = self.sight.blocked
+        self._poses.append(self.sight.pose_xyyaw)
+
+    def explored(self) -> Explored:
+        """What came of it."""
+        path, coverage, times = np.array(self._rows).T
+        poses, decisions = np.array(self._poses), np.array(self._decisions_ms)
+        return Explored(path, coverage, times, poses, decisions, self._collisions, self._ended, self.found)
+
+
+def _moved(before: np.ndarray, now: np.ndarray) -> bool:
+    away = now - before
+    return bool(
+        math.hypot(away[0], away[1]) >= _MOVED_M or abs(math.remainder(float(away[2]), math.tau)) >= _TURNED_RAD
+    )
