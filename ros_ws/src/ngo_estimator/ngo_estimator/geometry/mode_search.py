@@ -28,6 +28,14 @@ class Mixture:
     deviations: Array
     log_weights: Array
 
+    def widened(self, metres: float, radians: float) -> "Mixture":
+        """The same where the last hypothesis has at least these deviations."""
+        deviations, logs = self.deviations.copy(), self.log_weights.copy()
+        deviations[-1] = np.maximum(deviations[-1], (metres, radians))
+        ratio = np.log(deviations[-1] / self.deviations[-1])
+        logs[-1] -= 2.0 * ratio[0] + ratio[1]
+        return Mixture(self.means, deviations, logs)
+
     def logs(self, pose: Array) -> Array:
         """Logarithm ``(k,)`` of the density of each at a pose ``(3,)``."""
         way = np.hypot(*(self.means[:, :2] - pose[:2]).T) / self.deviations[:, 0]

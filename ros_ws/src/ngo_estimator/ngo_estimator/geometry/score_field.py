@@ -27,7 +27,7 @@ class ScoreFieldConfig:
     saw a return in it."""
 
     cell_m: float = 0.06
-    reach_m: float = 16.0
+    reach_m: float = 30.0
     deviation_m: float = 0.10
     unknown: float = 0.4
     passed: float = 1.5

@@ -115,6 +115,43 @@ def test_a_robot_that_was_carried_while_all_was_silent_begins_a_segment() -> Non
     assert steps[19].key is not None and steps[19].covariance[0, 0] > 10.0
 
 
+def test_a_robot_that_turned_far_while_no_scan_came_is_found_again() -> None:
+    """Without wheels, 80 degrees in three seconds: far outside of what the last motion promises."""
+    poses = way(20)
+    turned = compose(poses[-1], np.array((0.1, -0.1, -1.4)))
+    poses = np.concatenate((poses, [compose(turned, np.array((0.05 * k, 0.0, 0.0))) for k in range(5)]))
+    given = records(poses, wheels=False)
+    steps = fed([*given[:20], *(replace(each, stamp_ns=each.stamp_ns + 3 * 10**9) for each in given[20:])])
+    assert not any(step.unsure or step.segment for step in steps)
+    assert off(steps, poses) < 0.05
+
+
+def swung(monkeypatch: pytest.MonkeyPatch, again: bool) -> float:
+    """How far (rad) the turns are off, of a robot without wheels that swings while its scanner sweeps."""
+    if not again:
+        monkeypatch.setattr(MixtureLidar, "_swept_again", lambda *_: None)
+
+    def pose_at(second: float) -> np.ndarray:
+        return np.array((2.0 + 0.2 * second, 2.0, 0.3 * abs((5.0 * second + 2.0) % 4.0 - 2.0)))
+
+    count, sweep_s, given = 24, 0.09, []
+    for k in range(count):
+        at_s = 0.1 * k + sweep_s * np.arange(len(ANGLES)) / len(ANGLES)
+        rays = [cast(ROOM, pose_at(second), ANGLES[i : i + 1]) for i, second in enumerate(at_s)]
+        ranges = np.concatenate(rays).astype(np.float32)
+        given.append(replace(scan(ROOM, pose_at(0.1 * k), k), ranges=ranges, time_increment=sweep_s / len(ANGLES)))
+    poses = [pose_at(0.1 * k) for k in range(count)]
+    true = [between(a, b)[2] for a, b in zip(poses[:-1], poses[1:], strict=True)]
+    off = [step.relative_xyyaw[2] - turn for step, turn in zip(fed(given), true, strict=True)]
+    return float(np.sqrt(np.mean(np.square(off))))
+
+
+def test_a_sweep_is_removed_by_the_motion_that_the_match_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the robot turns back the last motion foretells nothing: the match does."""
+    by_match, by_last = swung(monkeypatch, True), swung(monkeypatch, False)
+    assert by_match < 0.85 * by_last
+
+
 def test_scans_that_cannot_be_used_are_refused() -> None:
     lidar, first = MixtureLidar(), scan(ROOM, way(1)[0], 10)
     lidar.add_scan(first)

@@ -13,10 +13,11 @@ from ngo_estimator.geometry.score_field import ScoreFieldConfig
 class MixtureConfig:
     """Settings of the front end; see the comment of each."""
 
-    # Hypotheses of a motion: wheels that are good, wheels that are poor, the last displacement, none, anything.
-    first_weights: tuple[float, ...] = (0.45, 0.2, 0.25, 0.07, 0.03)
-    first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 3.0, 1.0)  # on the deviations below
-    least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.5, 1.0)
+    # Hypotheses of a motion: wheels that are good, wheels that are poor, the last displacement, the last velocity,
+    # none, anything.
+    first_weights: tuple[float, ...] = (0.45, 0.2, 0.1, 0.15, 0.07, 0.03)
+    first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 2.0, 3.0, 1.0)  # on the deviations below
+    least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.3, 0.5, 1.0)
     most_factor: float = 6.0
     least_weight: float = 0.01
     still_m: float = 0.01  # deviation of a motion's position where there is none; it grows with way and turn
@@ -26,8 +27,9 @@ class MixtureConfig:
     turn_share: float = 0.08  # rad for each rad
     way_rad: float = 0.03  # rad for each m
     anything: tuple[float, float] = (0.3, 0.3)  # deviation of anything, in usual periods of the scanner (m, rad)
+    standing: float = 50.0  # factor on the weight of no motion where the ranges show none
     most_gap: float = 10.0  # usual periods up to which deviations without wheels grow
-    repeated: float = 8.0  # steps that share an error of the motion
+    repeated: float = 8.0  # steps that share an error of the wheels
 
     # Learning, by distance.
     learn_rate: float = 0.05  # what one match counts at most
@@ -45,11 +47,15 @@ class MixtureConfig:
     least_window_m: float = 0.4
     least_window_deg: float = 10.0
     most_window_m: float = 2.5
-    most_window_deg: float = 60.0
+    most_window_deg: float = 180.0
     heading_step_deg: float = 1.25
     apart_m: float = 0.3  # modes closer than this are one
     apart_deg: float = 6.0
     margin: float = 3.0  # of log likelihoods, up to which the second mode counts
+    noise: float = 0.5  # log likelihood by which a mode of the search must be better than where a hypothesis leads
+    same_m: float = 0.05  # poses closer than this are one
+    same_rad: float = 0.03
+    open_share: float = 0.01  # mean squared slope of the lines, below which a direction is left to the hypothesis
 
     # Lost, and segments.
     lost_share: float = 0.6  # of the usual score, below which a scan fits nowhere
@@ -77,9 +83,9 @@ class MixtureConfig:
         for name, value in vars(self).items():
             if not _positive(value):
                 raise ValueError(f"{name} is {value}; expected positive numbers")
-        if not all(len(each) == 5 for each in (self.first_weights, self.first_factors, self.least_factors)):
+        if not all(len(each) == 6 for each in (self.first_weights, self.first_factors, self.least_factors)):
             raise ValueError(
-                "first_weights, first_factors, least_factors: expected one number for each of 5 hypotheses"
+                "first_weights, first_factors, least_factors: expected one number for each of 6 hypotheses"
             )
         if len(self.anything) != 2:
             raise ValueError(f"anything is {self.anything}; expected two deviations")

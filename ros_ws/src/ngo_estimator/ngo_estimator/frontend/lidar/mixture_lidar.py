@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry, ScanEstimate
 from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
+from ngo_estimator.frontend.lidar.standstill import StandstillDetector
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.planar_motion import Array, compose
+from ngo_estimator.geometry.planar_motion import Array, arc_velocity, compose
 from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan
 from ngo_estimator.networks.step_scaling import STEP_EVIDENCE
 from ngo_recordings.scan_stream import LidarScan
@@ -31,6 +33,9 @@ _LEAST_POINTS = 3
 
 _SILENT_S = 1.0
 """Wheels that were silent for longer are not waited for."""
+
+_SWEPT_M, _SWEPT_RAD = 0.005, 0.005
+"""Motion until the middle of a sweep that is too small to remove it anew."""
 
 _LEAST = np.diag((1e-8, 1e-8, 1e-9))
 """The smallest covariance of a step."""
@@ -55,6 +60,7 @@ class MixtureLidar:
         self._core = MixtureOdometry(self.config)
         self._wheels: StampedWheels | None = None
         self._period = UsualPeriod()
+        self._standstill = StandstillDetector()
         self._waiting: deque[tuple[LidarScan, float]] = deque()  # with the evened stamp (s)
         self._held: list[LidarScan] = []  # that may be a bunch
         self._newest_ns: int | None = None
@@ -183,14 +189,24 @@ class MixtureLidar:
         if self._wheels is not None:
             by_wheels = self._wheels.motion(self._last_s, at_s, self._core.mixture.calibration.matrix)
             counted = self._wheels.motion(self._last_s, at_s, np.eye(3))
-        key = self._key_scan(scan, self._sweep(scan, gap_s, by_wheels))
+        sweep = self._sweep(scan, at_s, gap_s)
+        key = self._key_scan(scan, sweep)
+        again = None if sweep is None else partial(self._swept_again, scan, sweep, gap_s)
         silent = gap_s > self.config.silent_s and (by_wheels is None or self._wheels_paused(at_s - gap_s, at_s))
-        estimate = self._core.update(key, by_wheels, counted, gap_s / max(self._period.period_s, 1e-3), silent)
+        estimate = self._core.update(
+            key,
+            by_wheels,
+            counted,
+            gap_s / max(self._period.period_s, 1e-3),
+            silent,
+            again,
+            self._standstill.stands(scan),
+        )
         if self._wheels is not None and not estimate.unsure:
             self._wheels.observe_turn(self._last_s, at_s, float(estimate.step[2]))
         self._last, self._last_s = key, at_s
-        self._twist = estimate.step / max(gap_s, 1e-3)
-        return self._published(key, last, estimate, at_s)
+        self._twist = arc_velocity(estimate.step, max(gap_s, 1e-3))
+        return self._published(estimate.scan, last, estimate, at_s)
 
     def _wheels_paused(self, from_s: float, to_s: float) -> bool:
         return self._wheels is not None and self._wheels.paused(from_s, to_s, self.config.silent_s)
@@ -239,13 +255,29 @@ class MixtureLidar:
             raise UnusableImage(f"the scan has {len(key.points)} usable returns; expected at least {_LEAST_POINTS}")
         return key
 
-    def _sweep(self, scan: LidarScan, gap_s: float, by_wheels: Array | None) -> Sweep | None:
+    def _sweep(self, scan: LidarScan, at_s: float, gap_s: float) -> Sweep | None:
         """How the robot moves during the scan, where the scan says how long it takes."""
         sweep_s = _duration_s(scan)
         if scan.sweep_s == 0.0 or not 0.0 < sweep_s <= 1.2 * gap_s:
             return None
-        twist = self._twist if by_wheels is None else by_wheels / gap_s
-        return Sweep(scan.ray_offsets_s, twist)
+        offsets_s, twist = scan.ray_offsets_s, self._twist
+        first_s, last_s = float(offsets_s.min()), float(offsets_s.max())
+        if self._wheels is not None:
+            by_wheels = self._wheels.motion(at_s + first_s, at_s + last_s, self._core.mixture.calibration.matrix)
+            twist = twist if by_wheels is None else arc_velocity(by_wheels, max(last_s - first_s, 1e-3))
+        return Sweep(offsets_s, twist)
+
+    def _swept_again(self, scan: LidarScan, sweep: Sweep, gap_s: float, step: Array) -> KeyScan | None:
+        """The scan without the motion that a match ``step`` ``(3,)`` tells; None where that is much the same.
+
+        Points that were moved by another velocity lie off by its error until the sweep's middle, and so does the step.
+        """
+        middle_s = 0.5 * float(sweep.offsets_s.min() + sweep.offsets_s.max())
+        twist = (arc_velocity(step, 1.0) + middle_s * sweep.twist) / (gap_s + middle_s)
+        off = np.abs(middle_s * (twist - sweep.twist))
+        if max(off[0], off[1]) < _SWEPT_M and off[2] < _SWEPT_RAD:
+            return None
+        return self._key_scan(scan, replace(sweep, twist=twist))
 
 
 def _duration_s(scan: LidarScan) -> float:

@@ -1,11 +1,13 @@
 """The local estimator of a 2D lidar: a mixture of hypotheses, a search over all of them, registration, segments.
 
-Each scan is searched in the last key scans, under the mixture as its prior. The two best modes are registered; the
-second widens the covariance. A scan that fits nowhere follows the likeliest hypothesis, and after a while begins a new
-segment with an empty submap: what is not known bends nothing.
+Each scan is registered to the last key scans from where each hypothesis has it, and searched there under the mixture as
+its prior. What the search finds must fit better by more than a score's noise. Other modes widen the covariance. Where
+walls leave a direction open, the likeliest hypothesis is followed. A scan that fits nowhere is dead reckoned, and after
+a while begins a new segment with an empty submap: what is not known bends nothing.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +23,6 @@ from ngo_estimator.geometry.planar_motion import (
     between,
     compose,
     inverted,
-    propagated,
     squared_deviations,
     transformed,
     turned_covariance,
@@ -45,8 +46,8 @@ class ScanEstimate:
 
     ``step`` ``(3,)`` is its pose seen from the last scan, with ``step_covariance``; ``pose`` ``(3,)`` that in ``odom``;
     ``since_key`` ``(3,)`` that seen from the last key scan, with ``since_key_covariance``. ``score`` is how well it
-    fits, 0 to 1. ``unsure`` scans fitted nowhere. With ``segment`` nothing ties the scan to those before. Of a key scan
-    ``walls`` ``(n,)`` tells which points are on walls.
+    fits, 0 to 1. ``unsure`` scans fitted nowhere. With ``segment`` nothing ties the scan to those before. ``scan`` is
+    the scan without the sweep's motion. Of a key scan ``walls`` ``(n,)`` tells which points are on walls.
     """
 
     step: Array
@@ -58,6 +59,7 @@ class ScanEstimate:
     score: float
     unsure: bool
     segment: bool
+    scan: KeyScan
     walls: NDArray[np.bool_] | None = None
 
 
@@ -65,7 +67,8 @@ class ScanEstimate:
 class _Mode:
     pose: Array
     covariance: Array
-    variance: Array  # of the walls alone: position, heading
+    walls: Array  # covariance by them alone, along the axes of the last pose
+    hypothesis: int
     score: float
     total: float
     fitted: int
@@ -92,7 +95,14 @@ class MixtureOdometry:
         self._submap.add(scan, self._pose)
 
     def update(
-        self, scan: KeyScan, by_wheels: Array | None, counted: Array | None, gap: float, silent: bool
+        self,
+        scan: KeyScan,
+        by_wheels: Array | None,
+        counted: Array | None,
+        gap: float,
+        silent: bool,
+        again: Callable[[Array], KeyScan | None] | None = None,
+        stands: bool = False,
     ) -> ScanEstimate:
         """Estimate where a scan was taken.
 
@@ -102,23 +112,46 @@ class MixtureOdometry:
             counted: the same as the wheels counted it.
             gap: time since then in usual periods.
             silent: neither scans nor wheels told anything for so long that the robot may be anywhere.
+            again: gives the scan without the sweep of another motion ``(3,)`` since then; None where that is much the
+                same.
+            stands: the ranges look as if the robot stands.
         """
-        self.mixture.foretell(by_wheels, counted, gap)
-        points = _on_lines(scan, self.config.search_points)
-        found = None if silent else self._found(scan, points)
-        lost = found is None
+        self.mixture.foretell(float(self._pose[2]), by_wheels, counted, gap, stands)
+        found = None if silent else self._found(scan)
+        if found is not None and again is not None:
+            scan, found = self._swept_again(scan, found, again)
+        before = self._pose
         if found is None:
-            (pose, covariance), score = self._foretold(), 0.0
-        else:
-            pose, covariance, score = found.pose, found.covariance, found.score
+            pose, covariance = self.mixture.foretold(before, self._covariance)
+            self.mixture.take(self.mixture.heaviest, before, pose, covariance, None)
+            return self._accepted(scan, pose, covariance, 0.0, True, silent or self._is_gone(pose, covariance), silent)
+        step = between(before, found.pose)
+        self.mixture.learn(step, found.walls)
+        self.mixture.take(found.hypothesis, before, found.pose, found.covariance, found.walls)
+        self._reckoned = np.zeros(2)
+        rate = min(0.1, math.hypot(step[0], step[1]) + abs(step[2])) if self._usual else 1.0
+        self._usual += rate * (found.score - self._usual)
+        return self._accepted(scan, found.pose, found.covariance, found.score, False, False, False)
+
+    def _is_gone(self, pose: Array, covariance: Array) -> bool:
+        """Whether too much was dead reckoned to go on: by its way and turn, or by the deviation of where it led."""
         step = between(self._pose, pose)
-        self._reckoned = self._reckoned + (math.hypot(step[0], step[1]), abs(step[2])) if lost else np.zeros(2)
-        segment = silent or bool((self._reckoned > (self.config.lost_m, self.config.lost_rad)).any())
-        if found is not None:
-            self.mixture.learn(step, found.variance)
-            rate = min(0.1, math.hypot(step[0], step[1]) + abs(step[2])) if self._usual else 1.0
-            self._usual += rate * (score - self._usual)
-        return self._accepted(scan, pose, covariance, score, lost, segment, silent)
+        self._reckoned = self._reckoned + (math.hypot(step[0], step[1]), abs(step[2]))
+        deviations = np.sqrt((0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]))
+        return bool((np.maximum(self._reckoned, deviations) > (self.config.lost_m, self.config.lost_rad)).any())
+
+    def _swept_again(
+        self, scan: KeyScan, found: _Mode, again: Callable[[Array], KeyScan | None]
+    ) -> tuple[KeyScan, _Mode]:
+        """The scan without the motion that its match tells, registered again, where that fits as well."""
+        other = again(between(self._pose, found.pose))
+        if other is None:
+            return scan, found
+        points = _on_lines(other, self.config.search_points)
+        if not len(points):
+            return scan, found
+        refound = self._fit(other, points, found.pose, self._prior(), self._weight(points))
+        return (other, refound) if refound.score >= found.score else (scan, found)
 
     def _accepted(
         self, scan: KeyScan, pose: Array, covariance: Array, score: float, lost: bool, segment: bool, silent: bool
@@ -140,46 +173,69 @@ class MixtureOdometry:
             turned_covariance(-self._pose[2], both),
             pose,
             since_key,
-            turned_covariance(-self._key[2], covariance),
+            turned_covariance(-self._key[2], covariance + self.mixture.filter.shared()),
             is_key,
             score,
             lost,
             segment,
+            scan,
         )
         self._pose, self._covariance = pose, covariance
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
+            self.mixture.filter.begin_at_key()
             self._submap.add(scan, pose)
             estimate = replace(estimate, walls=self._submap.walls(transformed(pose, scan.points)))
         return estimate
 
-    def _foretold(self) -> tuple[Array, Array]:
-        """Pose and covariance by the likeliest hypothesis."""
-        heaviest = self.mixture.heaviest
-        step = self.mixture.steps[heaviest]
-        pose = compose(self._pose, step)
-        return pose, propagated(self._covariance, pose, step, self.mixture.step_covariance(heaviest))
+    def _prior(self) -> Mixture:
+        """The prior of where the place is chosen."""
+        return self.mixture.prior(self._pose, self._covariance, None, (self.config.least_m, self.config.least_rad))
 
-    def _found(self, scan: KeyScan, points: Array) -> _Mode | None:
-        """The best mode, with the doubt that the second one leaves; None where the scan fits nowhere."""
+    def _weight(self, points: Array) -> float:
+        """Weight of a log likelihood against a score, which is a mean: of few points it says less."""
+        most = self.config.search_points
+        return self.config.prior_weight * most / min(len(points), most)
+
+    def _found(self, scan: KeyScan) -> _Mode | None:
+        """The best mode, with the doubt that others leave; None where the scan fits nowhere.
+
+        Modes are those near the means of the hypotheses, and the two best of the search where these are others.
+        """
         config = self.config
+        points = _on_lines(scan, config.search_points)
         if not len(points):
             return None
-        prior = self.mixture.prior(self._pose, self._covariance, (config.least_m, config.least_rad))
-        # A score is a mean: of few points it says less.
-        weight = config.prior_weight * config.search_points / min(len(points), config.search_points)
+        # Few points contradict nothing: the prior decides.
+        least = config.lost_share * self._usual if len(points) >= _FEWEST else 0.0
+        prior, weight = self._prior(), self._weight(points)
+        fits = [self._fit(scan, points, mean, prior, weight) for mean in self._starts(prior)]
         for wide in (False, True):
-            modes = two_modes(
+            if wide:
+                prior = prior.widened(0.5 * config.most_window_m, 0.5 * math.radians(config.most_window_deg))
+            for pose, _ in two_modes(
                 self._submap.field, points, self._window(prior, wide), prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
-            )  # fmt: skip
-            fits = sorted(
-                (self._fit(scan, points, pose, prior, weight) for pose, _ in modes), key=lambda fit: -fit.total
-            )
-            # Few points contradict nothing: the prior decides.
-            if fits and (fits[0].score >= config.lost_share * self._usual or len(points) < _FEWEST):
-                return _doubted(fits, weight)
+            ):  # fmt: skip
+                fit = self._fit(scan, points, pose, prior, weight)
+                if not any(self._is_same(fit.pose, other.pose) for other in fits):
+                    fits.append(replace(fit, total=fit.total - config.noise * weight))
+            fitting = sorted((fit for fit in fits if fit.score >= least), key=lambda fit: -fit.total)
+            if fitting:
+                return _doubted(fitting, weight)
         return None
+
+    def _is_same(self, a: Array, b: Array) -> bool:
+        off = between(a, b)
+        return math.hypot(off[0], off[1]) < self.config.same_m and abs(off[2]) < self.config.same_rad
+
+    def _starts(self, prior: Mixture) -> list[Array]:
+        """Means of the hypotheses but anything, the likeliest first, without those that are much the same."""
+        starts: list[Array] = []
+        for k in np.argsort(-prior.log_weights[:-1]):
+            if not any(self._is_same(prior.means[k], start) for start in starts):
+                starts.append(prior.means[k])
+        return starts
 
     def _window(self, prior: Mixture, wide: bool) -> SearchWindow:
         config = self.config
@@ -206,21 +262,22 @@ class MixtureOdometry:
         far = _FAR / max(squared_deviations(pose, broad_mean, broad), 1e-9)
         near = self._icp(scan, pose, broad_mean, broad * min(1.0, far), self.config.icp)
         walls = inverted(near.information + np.diag((1.0, 1.0, 1.0)))
-        sharp = self.mixture.prior(self._pose, self._covariance + walls, (0.0, 0.0))
+        sharp = self.mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0))
         likeliest = self.mixture.likeliest(near.pose, sharp)
-        step = self.mixture.steps[likeliest]
-        mean = compose(self._pose, step)
-        covariance = propagated(self._covariance, mean, step, self.mixture.step_covariance(likeliest))
+        mean = compose(self._pose, self.mixture.steps[likeliest])
+        covariance = self.mixture.pose_covariance(likeliest, self._covariance, mean)
         squared = squared_deviations(near.pose, mean, inverted(covariance + walls))
         information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
         found = self._icp(scan, near.pose, mean, information, self._last_steps)
         score = self._submap.field.score(points, found.pose)
         total = score + weight * float(prior.logs(found.pose).max())
-        variance = np.array((0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2]))
-        return _Mode(found.pose, found.covariance, variance, score, total, found.fitted)
+        turned = turned_covariance(-self._pose[2], walls)
+        return _Mode(found.pose, found.covariance, turned, likeliest, score, total, found.fitted)
 
     def _icp(self, scan: KeyScan, start: Array, mean: Array, information: Array, config: IcpConfig) -> Registration:
-        return icp(self._submap.lines, scan.points, scan.normals, start, (mean, information), config)
+        return icp(
+            self._submap.lines, scan.points, scan.normals, start, (mean, information), config, self.config.open_share
+        )
 
 
 def _on_lines(scan: KeyScan, most: int) -> Array:
@@ -239,4 +296,4 @@ def _doubted(fits: list[_Mode], weight: float) -> _Mode:
         away = other.pose - best.pose
         away[2] = wrap(away[2])
         covariance = covariance + share * np.outer(away, away)
-    return _Mode(best.pose, covariance, best.variance, best.score, best.total, best.fitted)
+    return replace(best, covariance=covariance)

@@ -10,8 +10,18 @@ import math
 import numpy as np
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
+from ngo_estimator.frontend.lidar.velocity_filter import VelocityFilter
 from ngo_estimator.geometry.mode_search import Mixture
-from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
+from ngo_estimator.geometry.planar_motion import (
+    Array,
+    arc_motion,
+    arc_velocity,
+    between,
+    compose,
+    inverted,
+    propagated,
+    wrap,
+)
 
 
 class WheelCalibration:
@@ -39,55 +49,70 @@ class WheelCalibration:
         self._matrix = np.linalg.solve(self._squares, self._products)
 
 
-TIGHT, LOOSE, LAST, NONE, ANY = range(5)
+TIGHT, LOOSE, LAST, VELOCITY, NONE, ANY = range(6)
 
 
 class MotionMixture:
-    """Hypotheses: wheels that are good, wheels that are poor, the last displacement, none, anything."""
+    """Hypotheses: wheels that are good, wheels that are poor, the last displacement, the last velocity, none,
+    anything."""
 
     def __init__(self, config: MixtureConfig) -> None:
         self._config = config
         self._weights = np.array(config.first_weights)
         self._factors = np.array(config.first_factors)[:, None].repeat(2, axis=1)  # of positions, of headings
         self._squares = self._factors**2
-        self._steps = np.zeros((5, 3))
-        self._usable = np.zeros(5, np.bool_)
-        self._base = self._deviations = np.ones((5, 2))
+        self._steps = np.zeros((6, 3))
+        self._usable = np.zeros(6, np.bool_)
+        self._base = self._deviations = np.ones((6, 2))
         self._gap = 1.0
-        self._last = np.zeros(3)
+        self.filter = VelocityFilter()
+        self._foretold = {k: self.filter.predicted(0.0, np.zeros(3), 1.0, np.zeros(2)) for k in (LAST, VELOCITY)}
+        self._last_gap = 1.0
+        self._prior_weights = self._weights
         self._raw: Array | None = None
         self.calibration = WheelCalibration(config)
 
     @property
     def weights(self) -> Array:
-        """Weights ``(5,)`` of the hypotheses, as learned."""
+        """Weights ``(6,)`` of the hypotheses, as learned."""
         return self._weights
 
     @property
     def steps(self) -> Array:
-        """Mean motions ``(5, 3)`` as foretold last."""
+        """Mean motions ``(6, 3)`` as foretold last."""
         return self._steps
 
-    def foretell(self, by_wheels: Array | None, counted: Array | None, gap: float) -> None:
-        """Form the hypotheses of the next motion; ``by_wheels`` ``(3,)`` is what the wheels tell of it, and
-        ``counted`` ``(3,)`` the same without calibration; None where they are silent.
+    def foretell(
+        self, yaw: float, by_wheels: Array | None, counted: Array | None, gap: float, stands: bool = False
+    ) -> None:
+        """Form the hypotheses of the next motion from a pose of heading ``yaw``; ``by_wheels`` ``(3,)`` is what the
+        wheels tell of it, and ``counted`` ``(3,)`` the same without calibration; None where they are silent.
 
         ``gap`` is the time since the last scan in usual periods: what the wheels did not count is as much longer.
+        ``stands``: the ranges look as if the robot stands.
         """
-        self._usable[:] = by_wheels is not None, by_wheels is not None, True, True, True
+        self._usable[:] = by_wheels is not None, by_wheels is not None, True, True, True, True
         self._steps[:] = 0.0
-        self._steps[LAST] = self._steps[ANY] = self._last
+        self._last_gap, self._gap = self._gap, min(max(gap, 0.05), self._config.most_gap)
+        self._steps[LAST] = self._steps[ANY] = arc_motion(self.filter.velocity, self._last_gap)
+        self._steps[VELOCITY] = arc_motion(self.filter.velocity, self._gap)
         self._raw = counted
+        self._prior_weights = self._weights.copy()
+        if stands and by_wheels is None:  # a corridor looks so, too: wheels know better
+            self._prior_weights[NONE] *= self._config.standing
+        self._prior_weights /= self._prior_weights.sum()
         if by_wheels is not None:
             self._steps[TIGHT] = self._steps[LOOSE] = self._steps[ANY] = by_wheels
-        self._gap = min(max(gap, 1.0), self._config.most_gap)
+        longer = max(self._gap, 1.0)
         self._base = self._unscaled()
         self._deviations = self._factors * self._base
-        self._deviations[[LAST, NONE]] *= self._gap
-        self._deviations[ANY] = np.array(self._config.anything) * self._gap
+        self._deviations[[LAST, VELOCITY, NONE]] *= longer
+        self._deviations[ANY] = np.array(self._config.anything) * longer
+        for k, periods in ((LAST, self._last_gap), (VELOCITY, self._gap)):
+            self._foretold[k] = self.filter.predicted(yaw, self._steps[k], periods, self._deviations[k])
 
     def _unscaled(self) -> Array:
-        """Deviations ``(5, 2)`` (m, rad) before factors."""
+        """Deviations ``(6, 2)`` (m, rad) before factors."""
         c = self._config
         way, turn = np.hypot(self._steps[:, 0], self._steps[:, 1]), np.abs(self._steps[:, 2])
         way[[NONE, ANY]], turn[[NONE, ANY]] = 0.0, 0.0
@@ -95,37 +120,82 @@ class MotionMixture:
         heading = math.radians(c.still_deg) + c.turn_share * turn + c.way_rad * way
         return np.stack((position, heading), axis=-1)
 
-    def prior(self, pose: Array, covariance: Array, least: tuple[float, float]) -> Mixture:
-        """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``; no deviation is below ``least``
-        (m, rad)."""
+    def prior(self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float]) -> Mixture:
+        """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``, as ``walls`` ``(3, 3)`` would
+        measure them; no deviation is below ``least`` (m, rad)."""
         usable = self._usable
-        own = np.array((0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]))
-        deviations = np.sqrt(self._deviations[usable] ** 2 + own + np.square(least))
-        weights = self._weights[usable] / self._weights[usable].sum()
+        variances = self._deviations**2 + (0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2])
+        for k in (LAST, VELOCITY):
+            joint, _ = self._foretold[k]
+            variances[k] = 0.5 * (joint[0, 0] + joint[1, 1]), joint[2, 2]
+        if walls is not None:
+            variances += (0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])
+        deviations = np.sqrt(variances[usable] + np.square(least))
+        weights = self._prior_weights[usable] / self._prior_weights[usable].sum()
         logs = np.log(weights) - 2.0 * np.log(deviations[:, 0]) - np.log(deviations[:, 1])
         peak = -2.0 * math.log(least[0]) - math.log(least[1]) if min(least) > 0.0 else 0.0
         means = np.array([compose(pose, step) for step in self._steps[usable]])
         return Mixture(means, deviations, logs - peak)
 
+    def _unknown(self) -> Array:
+        """Variances ``(6, 2)`` of what the last match left open of the motion."""
+        result = np.zeros((6, 2))
+        known = self.filter.joint[3:, 3:]
+        for k, periods in ((LAST, self._last_gap), (VELOCITY, self._gap)):
+            result[k] = 0.5 * (known[0, 0] + known[1, 1]) * periods**2, known[2, 2] * periods**2
+        return result
+
     @property
     def heaviest(self) -> int:
-        """The hypothesis whose density is highest."""
-        density = self._weights / (self._deviations[:, 0] ** 2 * self._deviations[:, 1])
-        return int(np.where(self._usable, density, 0.0).argmax())
+        """The hypothesis of the largest weight, of those that can be formed."""
+        return int(np.where(self._usable, self._prior_weights, 0.0).argmax())
 
     def likeliest(self, pose: Array, mixture: Mixture) -> int:
         """The hypothesis that is likeliest at a pose ``(3,)``."""
         return int(np.flatnonzero(self._usable)[int(mixture.logs(pose).argmax())])
 
-    def step_covariance(self, hypothesis: int) -> Array:
-        """Covariance ``(3, 3)`` of a hypothesis' motion, whose errors repeat from step to step."""
-        position, heading = math.sqrt(self._config.repeated) * self._deviations[hypothesis]
-        return np.diag((position**2, position**2, heading**2))
+    def pose_covariance(self, hypothesis: int, covariance: Array, mean: Array) -> Array:
+        """Covariance ``(3, 3)`` of the ``mean`` ``(3,)`` that a hypothesis foretells from a pose of ``covariance``."""
+        if hypothesis in (LAST, VELOCITY):
+            result: Array = self._foretold[hypothesis][0][:3, :3].copy()
+            return result
+        return propagated(covariance, mean, self._steps[hypothesis], self.step_covariance(hypothesis))
 
-    def learn(self, step: Array, variance: Array) -> None:
-        """Take the motion ``(3,)`` that a match found, with the variances ``(2,)`` of its position and heading."""
+    def step_covariance(self, hypothesis: int) -> Array:
+        """Covariance ``(3, 3)`` of a hypothesis' motion; errors of wheels repeat from step to step."""
+        position, heading = self._deviations[hypothesis] ** 2
+        repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
+        return repeated * np.diag((position, position, heading))
+
+    def foretold(self, pose: Array, covariance: Array) -> tuple[Array, Array]:
+        """The pose ``(3,)`` after one of ``covariance`` ``(3, 3)`` by the likeliest hypothesis, with the covariance of
+        all."""
+        means = [compose(pose, step) for step in self._steps]
+        best, total = means[self.heaviest], np.zeros((3, 3))
+        weights = np.where(self._usable, self._prior_weights, 0.0)
+        for k in map(int, np.flatnonzero(self._usable)):
+            off = means[k] - best
+            off[2] = wrap(float(off[2]))
+            total += weights[k] / weights.sum() * (self.pose_covariance(k, covariance, means[k]) + np.outer(off, off))
+        return best, total
+
+    def take(self, hypothesis: int, before: Array, pose: Array, covariance: Array, walls: Array | None) -> None:
+        """The robot went from ``before`` to ``pose``, both ``(3,)``, as a hypothesis has it; ``walls`` ``(3, 3)`` is
+        what a match says of the step alone."""
+        if hypothesis in (LAST, VELOCITY):
+            change = pose - compose(before, self._steps[hypothesis])
+            self.filter.correct(self._foretold[hypothesis], change, covariance)
+            return
+        step = between(before, pose)
+        motion = self.step_covariance(hypothesis)
+        if walls is not None:
+            motion = inverted(inverted(motion) + inverted(walls))
+        self.filter.begin(arc_velocity(step, self._gap), motion / self._gap**2, covariance)
+
+    def learn(self, step: Array, walls: Array) -> None:
+        """Take the motion ``(3,)`` that a match found, with the covariance ``(3, 3)`` that walls alone leave it."""
         c, usable = self._config, self._usable
-        self._last = step
+        variance = np.array((0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])) + self._unknown()
         way, turn = math.hypot(step[0], step[1]), abs(float(step[2]))
         by_wheels = self._steps[TIGHT] if usable[TIGHT] else step
         way, turn = max(way, math.hypot(by_wheels[0], by_wheels[1])), max(turn, abs(float(by_wheels[2])))
@@ -137,7 +207,7 @@ class MotionMixture:
             (0.5 * (off[:, 0] ** 2 + off[:, 1] ** 2), np.array([wrap(float(e)) ** 2 for e in off[:, 2]])), axis=-1
         )
         spread = self._deviations**2 + variance
-        logs = np.log(self._weights) - np.log(spread[:, 0]) - 0.5 * np.log(spread[:, 1])
+        logs = np.log(self._prior_weights) - np.log(spread[:, 0]) - 0.5 * np.log(spread[:, 1])
         logs -= errors[:, 0] / spread[:, 0] + 0.5 * errors[:, 1] / spread[:, 1]
         logs[~usable] = -np.inf
         shares = np.exp(logs - logs.max())
