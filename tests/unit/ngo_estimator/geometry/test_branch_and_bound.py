@@ -104,6 +104,22 @@ def test_of_two_rooms_that_are_alike_the_second_is_a_second_peak() -> None:
     assert match.second > 0.95 * match.response
 
 
+def test_a_search_near_places_finds_what_is_near_one_of_them_and_nothing_else() -> None:
+    grid, truth = pooled_grid(CONFIG, room()), np.array((2.0, 1.2, 2.9))
+    seen, window = seen_from(truth, room()), np.array((8.0, 8.0, math.pi))
+    everywhere = search(CONFIG, grid, seen, np.zeros(3), window)
+    assert everywhere is not None
+    for places in (((2.5, 1.0), (-6.0, 5.0)), ((2.0, 2.1), (2.1, 2.0))):
+        near = search(CONFIG, grid, seen, np.zeros(3), window, (np.array(places), 1.0))
+        assert near is not None
+        np.testing.assert_array_equal(near.pose, everywhere.pose)
+    far = search(CONFIG, grid, seen, np.zeros(3), window, (np.array(((-4.0, 5.0), (6.0, -3.0))), 1.0))
+    assert far is not None
+    block_m = 16 * CONFIG.resolution_m
+    away = min(math.dist(far.pose[:2], place) for place in ((-4.0, 5.0), (6.0, -3.0)))
+    assert away <= 1.0 + block_m * math.sqrt(2.0) and far.response < everywhere.response
+
+
 def test_responses_below_the_least_are_no_match() -> None:
     config = SearchConfig(least_response=0.9)
     grid = pooled_grid(config, room())

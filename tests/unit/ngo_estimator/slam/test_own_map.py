@@ -7,9 +7,11 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.planar_covariance import position_std
+from ngo_estimator.geometry.se2 import compose
+from ngo_estimator.nodes.trajectory_report import TrajectoryReport
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
-from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, between, drifted, outline, scan_at, way
+from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, between, outline, scan_at, way
 
 FIRST = way(*ROUND, ROUND[0], (4.0, 1.0))
 BACK = way((1.0, 6.0), ROUND[0], *ROUND[1:])  # another corner, from which it drives on
@@ -26,7 +28,9 @@ def steps(walls: np.ndarray, poses: np.ndarray) -> tuple[RelativeStep, ...]:
     seen = [replace(scan, stamp_ns=k * 10**9) for k, scan in enumerate(seen)]
     relative = between(true[:-1], true[1:]) + random.normal(0.0, (0.003, 0.003, 0.001), (len(true) - 1, 3))
     relative[len(FIRST) - 1] = 0.0
-    odometry = drifted(true, (0.0, 0.0, 0.0))
+    odometry = [true[0]]
+    for step in relative:
+        odometry.append(compose(odometry[-1], step))
     found = []
     for k, step in enumerate(relative, 1):
         key = KeyScanStep(seen[k], seen[k - 1].stamp_ns, step, COVARIANCE)
@@ -56,6 +60,9 @@ def test_a_robot_that_was_carried_is_lost_until_it_is_found_in_its_own_map() -> 
     begin = len(FIRST) - 1
     assert all(update.lost_since_ns is None for update in updates[:begin])
     lost = [update for update in updates[begin:] if update.lost_since_ns is not None]
+    report = TrajectoryReport()
+    report.updated(lost[-1])
+    assert report.problems() == [f"not localised in the map since {len(FIRST)}.000000000"]
     assert 10 < len(lost) < 50 and updates[-1].lost_since_ns is None
     for update in lost:
         assert update.lost_since_ns == len(FIRST) * 10**9
@@ -78,11 +85,20 @@ def test_a_robot_in_another_building_is_not_found() -> None:
     assert (segment[:, 0] == segment[:, 1]).all()
 
 
+def test_a_key_scan_that_begins_a_segment_leaves_map_from_odom_as_it_was() -> None:
+    core = ScanTrajectory()
+    updates = driven(carried_back()[: len(FIRST) + 3], core)
+    before = updates[len(FIRST) - 2].map_from_odom_xyyaw
+    for update in updates[len(FIRST) - 1 :]:
+        carried = between(before[None], update.map_from_odom_xyyaw[None])[0]
+        assert np.abs(carried).max() < 1e-9
+
+
 def test_a_state_that_was_saved_while_it_was_lost_goes_on_to_the_last_bit() -> None:
     all_steps, core = carried_back(), ScanTrajectory()
     driven(all_steps[: len(FIRST) + 9], core)
     other = ScanTrajectory().restored(core.state())
-    for step in all_steps[len(FIRST) + 9 :]:
+    for step in all_steps[len(FIRST) + 9 : len(FIRST) + 40]:
         mine, its = core.update(step), other.update(step)
         np.testing.assert_array_equal(mine.pose_xyyaw, its.pose_xyyaw)
         assert mine.lost_since_ns == its.lost_since_ns

@@ -50,7 +50,9 @@ class KeyScanViews:
         """Those of all key scans of a map, of which these are the first."""
         other = KeyScanViews()
         other._profiles = [*self._profiles, *map(_profile, scans[len(self) :])]  # rays of old scans are gone
-        for scan in scans:
+        for middle in self._middles.values:
+            other._middles.append(middle)
+        for scan in scans[len(self) :]:
             other._middles.append(_middle(scan.points))
         other._forgotten = set(self._forgotten)
         return other
@@ -59,6 +61,8 @@ class KeyScanViews:
         """Those of some key scans, none of them forgotten."""
         other = KeyScanViews()
         other._profiles = [self._profiles[key] for key in keys]
+        for key in keys:
+            other._middles.append(self._middles.values[key])
         return other
 
     def at(self, poses: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from ngo_estimator.slam.sightings import Sightings
 
 _MARGIN_M = 2.0  # around the key scans of the map, where the robot may be
 _SEARCHED = 150  # points in the whole map; a pose that fits is verified with more of them
-_SEARCHED_NEAR, _MOST_BLOCKS_NEAR = 75, 20_000  # the same near the key scans, and how many blocks are split at most
+_SEARCHED_NEAR, _MOST_BLOCKS_NEAR = 60, 12_000  # the same near the key scans, and how many blocks are split at most
 _LEAST_NEAR, _LEAST_SECOND_NEAR = 0.45, 0.75  # likelihoods that are distinguished there
 _AROUND = np.array((1.0, 1.0, math.radians(15.0)))  # of a pose that is verified
 
@@ -55,7 +55,10 @@ class ScanMatcher:
         self._scans, self._poses, self._views = scans, poses, views.of_map(scans)
         self._config = config
         self._submaps = ScanSubmaps(config)
-        self._grid = pooled_grid(config.search, np.concatenate(points))
+        together = np.concatenate(points)
+        if reach_m < math.inf:  # a map that grows is made again and again
+            together = _one_a_cell(together, 0.5 * config.search.resolution_m)
+        self._grid = pooled_grid(config.search, together)
         low, high = poses[:, :2].min(0) - _MARGIN_M, poses[:, :2].max(0) + _MARGIN_M
         self._centre = np.array((*(0.5 * (low + high)), 0.0))
         self._window = np.array((*(0.5 * (high - low)), math.pi))
@@ -127,3 +130,9 @@ class ScanMatcher:
             return None
         turned = turned_covariance(self._poses[place, 2], found.covariance + SUBMAP_VARIANCE)
         return compose(self._poses[place], found.pose), turned
+
+
+def _one_a_cell(points: np.ndarray, cell_m: float) -> np.ndarray:
+    """The first of the points ``(n, 2)`` in each cell."""
+    _, first = np.unique(np.floor(points / cell_m).astype(np.int64) @ (1 << 32, 1), return_index=True)
+    return points[np.sort(first)]
