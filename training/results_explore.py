@@ -17,7 +17,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ngo_explorer import exploration, frontiers, known_map, path_follower, pilot, planner, put_aside, rules, tours
+from ngo_explorer import (
+    exploration,
+    frontiers,
+    known_map,
+    path_follower,
+    pilot,
+    planner,
+    put_aside,
+    rules,
+    settings,
+    tours,
+)
 from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
 from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.maze2d import Maze2DConfig
@@ -37,19 +48,8 @@ from training.scoring.table import Drive, Measured, Numbers, Row, Table, column,
 
 ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours")
 BASE = "explore_lite"
-_CODE = (
-    exploration,
-    frontiers,
-    known_map,
-    path_follower,
-    pilot,
-    planner,
-    put_aside,
-    rules,
-    tours,
-    exploring,
-    known_tour,
-)
+_EXPLORER = (exploration, frontiers, known_map, path_follower, pilot, planner, put_aside, rules, settings, tours)
+_CODE = (*_EXPLORER, exploring, known_tour)
 _BUILDING_SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS}
 _MAZE_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
@@ -101,7 +101,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         for kind in arguments.worlds
     }
     result = {
-        "command": "make results WORLD=explore",
+        "command": f'make results WORLD=explore ARGS="--worlds {" ".join(arguments.worlds)} --count {arguments.count}"',
         "revision": record["revision"],
         "settings": {name: getattr(arguments, name) for name in ("split", "count", "scale", "most_s")},
         "poses": "true",

@@ -27,13 +27,15 @@ _ROWS = {
 }
 _INTRODUCTION = """# Results: exploration
 
-Written by `{command}` at revision {revision}. {count} places of each kind, {split} seeds, one run each; buildings have
-corridors of {scale:g} of the usual length. The robot drives at **true poses**: no row says anything about the error of
+Written by `{command}`
+at revision {revision}. {count} places of each kind, {split} seeds, one run each; drawn buildings have corridors of
+{scale:g} of the usual length. The robot drives at **true poses**: no row says anything about the error of
 the estimator. Robot, map, path follower and limits are the same in all rows; explore_lite's has its own
-smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places.
+smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places; few places make them too narrow.
 
 Coverage counts the free cells that exact rays see from all places where the robot can go. The ratio is the geometric
-mean over the places where both rules came to 95 %. The tour on the known map is a heuristic, greedy cover and 2-opt.
+mean over the places where both rules came to 95 %. The tour on the known map is a heuristic, greedy cover and 2-opt: it
+is no bound, and rules may beat it.
 IoU is the mean of free and occupied cells beside those exact rays. Decisions are timed as processor time."""
 
 
