@@ -18,17 +18,22 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import GraphProblem, thresholds
+from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, thresholds
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
 from training.common import records
 from training.common.command_line import run_command
 from training.common.records import write_at_once
 from training.report import graphs_page
+from training.scoring.graph_blocks import Online, blocks
 from training.scoring.graph_problems import KINDS, JudgedProblem, lecture_hall, manhattan, synthetic
 from training.scoring.statistics import Interval, mean_interval
 
 GRAPHS = ("synthetic_1000", "synthetic_3000", "hard_1000", "hard_3000", "lecture_hall", "manhattan")
+_ONLINE = "_online"
+"""Ending of a graph whose loops come in blocks: its numbers are means over the blocks."""
+
+_ALL_GRAPHS = (*GRAPHS, *(f"{graph}{_ONLINE}" for graph in GRAPHS))
 PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_gnc": graph_peers.gnc,
     "gtsam_lm_cauchy": graph_peers.cauchy,
@@ -36,9 +41,12 @@ PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_lm_geman_mcclure": graph_peers.geman_mcclure,
     "pcm": graph_peers.pcm,
 }
-ROWS = ("odometry", *PEERS, "robust", "right_loops")
+ROWS = ("odometry", *PEERS, "robust", "robust_anew", "right_loops")
 _SOLVED = 1.5
 """A graph is solved where its error is below so many times that of the right loops."""
+
+
+Correct = Callable[[GraphProblem], CorrectedGraph]
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,7 @@ class Arguments:
     world: Literal["graphs"] = "graphs"
     """World to measure in."""
     graphs: tuple[str, ...] = GRAPHS
-    """Graphs to measure."""
+    """Graphs to measure; GRAPH_online has its loops in blocks, where robust goes on from its last solution."""
     folder: Path | None = None
     """Folder with Lecture Hall and Manhattan3500; without it they are skipped."""
     kinds: tuple[str, ...] = (*KINDS, *(f"{kind}_place" for kind in KINDS))
@@ -57,8 +65,8 @@ class Arguments:
     """Wrong loops in percent of all."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of a cell's graphs."""
-    rows: tuple[str, ...] = ROWS
-    """Rows to measure; odometry and right_loops are always measured."""
+    rows: tuple[str, ...] = tuple(row for row in ROWS if row != "robust_anew")
+    """Rows to measure; odometry and right_loops are always measured. robust_anew solves each block from nothing."""
     limit_s: int = 300
     """Computing time after which a peer is stopped; its answer is the odometry then."""
     out: Path = records.ROOT / "training" / "results"
@@ -67,7 +75,7 @@ class Arguments:
     """Folder that gets results_graphs.md."""
 
     def __post_init__(self) -> None:
-        known = {"graphs": GRAPHS, "kinds": (*KINDS, *(f"{kind}_place" for kind in KINDS)), "rows": ROWS}
+        known = {"graphs": _ALL_GRAPHS, "kinds": (*KINDS, *(f"{kind}_place" for kind in KINDS)), "rows": ROWS}
         for name, names in known.items():
             if unknown := [one for one in getattr(self, name) if one not in names]:
                 raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(names)}")
@@ -83,7 +91,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
         print("lecture_hall and manhattan are skipped: --folder gives none")
     _measure(synthetic("random", 30, 200, True, 0), arguments.rows, arguments.limit_s)  # compiles everything
     for graph, cell, draw in _cells(arguments):
-        measured = [_measure(draw(seed), arguments.rows, arguments.limit_s) for seed in arguments.seeds]
+        measure = _measure_online if graph.endswith(_ONLINE) else _measure
+        measured = [measure(draw(seed), arguments.rows, arguments.limit_s) for seed in arguments.seeds]
         rows = result["tables"].setdefault(graph, {}).setdefault(cell, {})
         rows.update({row: _intervals([each[row] for each in measured if row in each]) for row in measured[0]})
         print(f"{graph} {cell}: {json.dumps({row: _means(rows[row]) for row in measured[0]})}", flush=True)
@@ -95,19 +104,23 @@ def main(arguments: Arguments) -> dict[str, Any]:
 def _cells(arguments: Arguments) -> Iterator[tuple[str, str, Callable[[int], JudgedProblem]]]:
     """Graph, KIND_PERCENT, and what draws the problem of a seed."""
     folder = arguments.folder
-    if folder is not None and "lecture_hall" in arguments.graphs:
-        hall = lecture_hall(folder)
-        yield "lecture_hall", f"own_{100.0 * (~hall.right).mean():.0f}", lambda _: hall
     for graph in arguments.graphs:
+        if folder is not None and graph.startswith("lecture_hall"):
+            hall = lecture_hall(folder)
+            yield graph, f"own_{100.0 * (~hall.right).mean():.0f}", _always(hall)
         for kind in arguments.kinds:
             for percent in arguments.percents:
                 name, place = kind.removesuffix("_place"), kind.endswith("_place")
                 if graph.startswith(("synthetic", "hard")):
-                    form, _, nodes = graph.partition("_")
+                    form, nodes, *_ = graph.split("_")
                     draw = _synthetic(name, percent, int(nodes), not place, form == "hard")
                     yield graph, f"{kind}_{percent}", draw
-                elif graph == "manhattan" and folder is not None and not place:
+                elif graph.startswith("manhattan") and folder is not None and not place:
                     yield graph, f"{kind}_{percent}", _manhattan(folder, name, percent)
+
+
+def _always(judged: JudgedProblem) -> Callable[[int], JudgedProblem]:
+    return lambda _: judged
 
 
 def _synthetic(kind: str, percent: int, nodes: int, metric: bool, hard: bool) -> Callable[[int], JudgedProblem]:
@@ -118,19 +131,34 @@ def _manhattan(folder: Path, kind: str, percent: int) -> Callable[[int], JudgedP
     return lambda seed: manhattan(folder, kind, percent, seed)
 
 
-def _measure(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) -> dict[str, dict[str, float]]:
-    """The numbers of each row on one graph."""
+def _measure(
+    judged: JudgedProblem, rows: tuple[str, ...], limit_s: int, correct: Correct | None = None
+) -> dict[str, dict[str, float]]:
+    """The numbers of each row on one graph; ``correct`` stands in for the row robust."""
     problem, kept = judged.problem, judged.problem.loops[judged.right]
     right = GraphProblem(problem.poses, problem.steps, kept, np.ones(len(kept)))
     found = {"odometry": (problem.poses, 0.0), "right_loops": _timed(graph_peers.least_squares, right, limit_s)}
     for row in rows:
-        if row == "robust":
+        if row in ("robust", "robust_anew"):
+            solve = correct if correct and row == "robust" else Robust().correct
             began = time.process_time()
-            found[row] = (Robust().correct(problem).poses, time.process_time() - began)
+            found[row] = (solve(problem).poses, time.process_time() - began)
         elif row in PEERS and not (row == "pcm" and problem.loops.degrees.min(initial=3) < 3):
             found[row] = _timed(PEERS[row], problem, limit_s)
     bar = max(_SOLVED * judged.ate_m(found["right_loops"][0]), judged.least_ate_m)
     return {row: _numbers(judged, poses, seconds, bar) for row, (poses, seconds) in found.items()}
+
+
+def _measure_online(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) -> dict[str, dict[str, float]]:
+    """The means over all blocks, and the share of verdicts that changed."""
+    online = Online(Robust())
+    found = [_measure(block, rows, limit_s, online.correct) for block in blocks(judged)]
+    means = {
+        row: {key: float(np.mean([block[row][key] for block in found])) for key in found[0][row]} for row in found[0]
+    }
+    if "robust" in means:
+        means["robust"]["changed"] = online.changed / max(online.verdicts, 1)
+    return means
 
 
 def _timed(solve: graph_peers.Peer, problem: GraphProblem, limit_s: int) -> tuple[np.ndarray, float]:

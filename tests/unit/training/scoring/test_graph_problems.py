@@ -12,6 +12,7 @@ from ngo_estimator.graph.robust import Robust
 from training import results_graphs
 from training.baselines import graph_peers
 from training.baselines.lidar_peers import solve_with
+from training.scoring.graph_blocks import blocks
 from training.scoring.graph_problems import KINDS, JudgedProblem, synthetic
 
 
@@ -99,3 +100,22 @@ def test_the_table_has_every_row_and_keeps_other_cells(tmp_path: Path, monkeypat
 def test_an_unknown_row_is_refused() -> None:
     with pytest.raises(ValueError, match="rows has robusted"):
         results_graphs.Arguments(rows=("robusted",))
+
+
+def test_online_a_graph_comes_in_blocks_and_is_solved_in_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judged = synthetic("random", 50.0, 300, True, 1)
+    parts = list(blocks(judged))
+    assert [len(part.problem.loops) for part in parts] == [120, 240, 300]
+    newest = [part.problem.loops.nodes.max(axis=1) for part in parts]
+    assert all(len(part.problem.poses) == ends.max() + 1 for part, ends in zip(parts, newest, strict=True))
+    assert newest[0].max() <= newest[1][120:].min()
+    monkeypatch.setattr(results_graphs, "synthetic", lambda *_: judged)
+    arguments = results_graphs.Arguments(
+        graphs=("hard_1000_online",), kinds=("random",), percents=(50,), seeds=(0,), rows=("robust", "robust_anew"),
+        out=tmp_path, docs=tmp_path,
+    )  # fmt: skip
+    cell = results_graphs.main(arguments)["tables"]["hard_1000_online"]["random_50"]
+    assert cell["robust"]["solved"]["mean"] == cell["robust_anew"]["solved"]["mean"] == 1.0
+    assert cell["robust"]["changed"]["mean"] < 0.02
+    page = (tmp_path / "results_graphs.md").read_text()
+    assert "| cell | row | seconds | precision | recall | changed |" in page
