@@ -1,8 +1,9 @@
 """The robust corrector: no network, and right with most loops wrong.
 
-Two methods give a solution, and one cost judges between them: graduated non-convexity over all loops that the cycles do
-not rule out, and belief in the surest loops first. Covariances that are not as stated are scaled. The cycles measure
-the scale before anything is solved, and the residuals of what is believed measure it afterwards.
+Two methods give a solution: graduated non-convexity over all loops that the cycles do not rule out, and belief in the
+surest loops first. What each solution predicts lets more loops in. One cost judges between all. Covariances that
+are not as stated are scaled. The cycles measure the scale before anything is solved, and the residuals of what is
+believed measure it afterwards.
 """
 
 from dataclasses import replace
@@ -95,10 +96,9 @@ def _from_nothing(problem: GraphProblem, told: Told) -> CorrectedGraph:
         graduate(likely, chain, told=told)[0],
         believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio, told)[0],
     ]
-    best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     if whole:
-        again = _looked_again(scaled, best, area, inlier_ratio, told)
-        best = min((best, again), key=lambda poses: truncated_cost(scaled, poses))
+        solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in solutions]
+    best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops))
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
     if whole and scale not in (1.0, solution.loop_scale):
