@@ -161,7 +161,7 @@ def _measure(place: Place, name: str, most_s: float) -> Measured:
 def scores(run: Explored, seen: Seen) -> dict[str, float]:
     """The metrics of one exploration; a path that never reached 95 % has no length."""
     free, occupied = intersections(run.found, seen.map)
-    found: dict[str, Table] = {
+    found: dict[str, float] = {
         "ended_early": float(run.ended and run.coverage[-1] < 0.98),
         "ended": float(run.ended),
         "coverage": float(run.coverage[-1]),

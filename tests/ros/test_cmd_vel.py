@@ -44,12 +44,6 @@ def test_it_drives_as_told_collides_and_stops_when_nobody_speaks(
         assert node.running
 
 
-def test_a_world_of_actions_refuses_to_be_driven_by_velocities() -> None:
-    with NodeProcess("ngo_sim", "maze3d", {"driver": "cmd_vel"}) as node:
-        assert node.wait() == 2
-        assert any("maze2d alone" in line for line in node.lines), node.log
-
-
 def test_a_plan_that_is_not_there_is_one_line_and_exit_code_2() -> None:
     with NodeProcess("ngo_sim", "building2d", {"plan": "/nowhere/plan.yaml"}) as node:
         assert node.wait() == 2
