@@ -299,6 +299,15 @@ def test_each_robot_of_a_recording_has_its_own_wheels_and_mounting(
         assert len([each for each in scan_stream(recording, by_tf) if isinstance(each, WheelPose)]) == 5
 
 
+def test_a_direction_that_is_given_leaves_the_scanner_its_place(tmp_path: Path) -> None:
+    entries = [("/tf_static", 1, m.transforms(static("base_link", "laser", 0.78, 0.1, 0.3))), *drive(3)]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        given = describe_lidar(recording, choose_topics(recording)).looking_at(math.pi)
+    assert given.mounting is not None
+    np.testing.assert_allclose(given.mounting.base_from_scan_xyyaw, [0.78, 0.1, math.pi], atol=1e-12)
+    assert "x 0.780 m, y 0.100 m, yaw 180.0 deg" in given.lines()[1] and "as it was given" in given.lines()[1]
+
+
 def test_of_several_scans_and_odometries_one_is_taken_and_the_others_are_named(tmp_path: Path) -> None:
     entries = drive(10)
     for name in ("/scan_filtered", "/front/scan"):
