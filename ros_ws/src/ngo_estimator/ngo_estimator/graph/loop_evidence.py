@@ -21,6 +21,7 @@ _MOST_SUPPORT = 7.0
 
 _SCALES = np.exp(np.linspace(math.log(1e-3), math.log(1e3), 61))
 _ROUNDS = 12  # of expectation and maximisation, for the inlier ratio
+_TOLD = 0.1  # log odds that a chain's prediction has at least where it comes true
 _FEW = 30  # loops from which on a scale and an inlier ratio are estimated
 _LARGEST = 50.0  # log odds of one cycle, either way
 
@@ -50,12 +51,15 @@ def scale_and_inlier_ratio(chain: ChainUncertainty, loops: RelativePoses, area: 
 
     The likeliest mixture of right and wrong loops. Both are 1 and a half where there are few loops.
     """
-    if len(loops) < _FEW:
-        return 1.0, 0.5
     squared, logs = chain.off_chain(loops)
+    # A chain that says no more than "on the map", as behind a step that nobody measured, measures no scale.
+    told = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area) > _TOLD
+    squared, logs, degrees = squared[told], logs[told], loops.degrees[told]
+    if len(squared) < _FEW:
+        return 1.0, 0.5
     best = (-math.inf, 1.0, 0.5)
     for scale in _SCALES.tolist():
-        ratio = np.clip(likelihood_ratio(squared, logs, loops.degrees, area, scale), -_LARGEST, _LARGEST)
+        ratio = np.clip(likelihood_ratio(squared, logs, degrees, area, scale), -_LARGEST, _LARGEST)
         inlier_ratio = 0.5
         for _ in range(_ROUNDS):
             inlier_ratio = float(
