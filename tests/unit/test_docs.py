@@ -123,7 +123,9 @@ def test_commands_are_right(page: Path) -> None:
     wrong = []
     for command in [*commands(text), *re.findall(r"`((?:python|make|ros2) [^`]+)`", text)]:
         script = re.match(
-            r"python -m (\w[\w.]+)|python ([\w/]+)\.py|ros2 run ngo_estimator (run_recording|optimize_graph)", command
+            r"python -m (\w[\w.]+)|python ([\w/]+)\.py|"
+            r"ros2 run ngo_estimator (run_recording|optimize_graph|join_sessions)",
+            command,
         )
         if script:
             module = script[1] or (script[2] or "").replace("/", ".") or f"ngo_estimator.nodes.{script[3]}"

@@ -40,6 +40,7 @@ setup(
     extras_require={"test": ["pytest"], "view": ["rerun-sdk"]},
     entry_points={
         "console_scripts": [
+            "join_sessions = ngo_estimator.nodes.join_sessions:main",
             "local_node = ngo_estimator.nodes.local_node:main",
             "ngo_map = ngo_estimator.nodes.ngo_map:main",
             "ngo_node = ngo_estimator.nodes.ngo_node:main",

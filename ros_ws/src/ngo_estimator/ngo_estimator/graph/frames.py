@@ -36,6 +36,11 @@ class Frames:
         return self._nodes.values
 
     @property
+    def joins(self) -> np.ndarray:
+        """The frames from which on another odometry goes on ``(n,)``, without a copy."""
+        return self._joins.values
+
+    @property
     def last_join(self) -> int:
         """The newest frame from which on another odometry goes on; 0 where there is none."""
         return int(self._joins.values[-1]) if len(self._joins) else 0

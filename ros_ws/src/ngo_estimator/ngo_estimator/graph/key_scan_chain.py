@@ -8,6 +8,7 @@ from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.graph.relative_poses import RelativePoses
@@ -110,6 +111,23 @@ class KeyScanChain(NodeChain):
         self._step_variance.append(largest_variances(covariance[None])[0])
         self._published_covariance.append(published)
         self._key_stamp_ns = key.scan.stamp_ns
+
+    @property
+    def segment_frames(self) -> np.ndarray:
+        """The frames ``(n,)`` with which a segment begins, but the first: before its first key scan, or that one."""
+        joins, nodes = self.frames.joins, self.frames.nodes
+        first = np.searchsorted(joins, nodes[self.segments[1:] - 1], side="right")
+        return joins[first]
+
+    def key_step(self, node: int, scan: KeyScan, from_key_stamp_ns: int) -> KeyScanStep:
+        """The step to a node, as ``add_key`` took it; the one to the first node is not known."""
+        if node == 0:
+            return KeyScanStep(scan, from_key_stamp_ns, np.zeros(3), OPEN)
+        given, published = (
+            rows.values[node - 1] - self._floor for rows in (self._step_covariance, self._published_covariance)
+        )
+        factors = np.sqrt(np.diagonal(published) / np.diagonal(given))
+        return KeyScanStep(scan, from_key_stamp_ns, self._steps.values[node - 1].copy(), given, factors)
 
     SAVED = (
         *NodeChain.SAVED, "_steps", "_step_covariance", "_published_covariance", "_step_variance", "_segments",

@@ -37,6 +37,14 @@ def range_profile(scan: KeyScan) -> Array:
     return profile
 
 
+def profile_rays(profile: Array) -> tuple[Array, Array]:
+    """Directions and ranges ``(360,)`` of rays that have this range profile again."""
+    seen = np.where(profile > 0.0, profile, np.inf)
+    ranges: Array = np.maximum(seen, np.maximum(np.roll(seen, 1), np.roll(seen, -1)))
+    angles: Array = (np.arange(PROFILE_BINS, dtype=np.float64) + 0.5) * (2.0 * math.pi / PROFILE_BINS)
+    return angles, ranges
+
+
 @njit(cache=True)
 def _profile(angles: Array, ranges: Array) -> Array:
     nearest = np.full(PROFILE_BINS, np.inf)

@@ -169,11 +169,15 @@ class CorrectedTrajectory(ABC):
             RejectedStep: as of ``update``; the stamp is not later than the newest one, or ``may_join`` is false.
         """
         step = self._checked(step)
+        self._work()  # it may move the newest pose
+        return self._join_at(step, *bridged(*self._graph.newest(), pose_xyyaw, covariance))
+
+    def _join_at(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
+        """Go on with another odometry; its first frame is ``relative`` ``(3,)`` to the newest one."""
         if not self.may_join(step):
             raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
         self._begin_result()
-        relative, uncertainty = bridged(*self._graph.newest(), pose_xyyaw, covariance)
-        return self._take(step, self._log.join(step, relative, uncertainty), optimize=True)
+        return self._take(step, self._log.join(step, relative, covariance), optimize=True)
 
     def begins_anew(self, step: RelativeStep) -> bool:
         """Whether a step is of another odometry, so that ``update`` would forget this trajectory."""

@@ -59,6 +59,12 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
         raise StateError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
 
 
+def identity_of(folder: Path) -> dict[str, Any]:
+    """Whose state is in ``folder``, as ``read_state`` expects it; raises ``StateError``, of one line."""
+    identity: dict[str, Any] = _description(folder / DESCRIPTION)["identity"]
+    return identity
+
+
 def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
     """The arrays in ``folder``, which were saved by a trajectory with this ``identity``.
 

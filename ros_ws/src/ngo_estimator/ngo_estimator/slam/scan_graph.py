@@ -1,6 +1,7 @@
 """The graph of key scans behind the online trajectory of a lidar: a chain of nodes, verified loops, warm starts."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
+from ngo_estimator.loops.walls_seen_through import profile_rays
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
@@ -68,6 +70,24 @@ class ScanGraph(PoseGraph):
     def key_frames(self) -> np.ndarray:
         """The frames that are nodes ``(keys,)``."""
         return self._nodes.frames.nodes
+
+    @property
+    def odometry(self) -> np.ndarray:
+        """Poses ``(frames, 3)`` of all frames by the steps that came."""
+        return self._nodes.frames.odometry
+
+    @property
+    def segment_frames(self) -> np.ndarray:
+        """The frames ``(n,)`` with which a segment begins, but the first."""
+        return self._nodes.segment_frames
+
+    def key_step(self, key: int) -> KeyScanStep:
+        """A key scan and the step to it, as the odometry had them; of old scans rays tell what loops ask of them."""
+        scan = self._scans[key]
+        if len(scan.points) and not len(scan.ranges):
+            angles, ranges = profile_rays(self._finder.views.profiles[key].astype(np.float64))
+            scan = replace(scan, angles=angles, ranges=ranges)
+        return self._nodes.key_step(key, scan, self._scans[max(0, key - 1)].stamp_ns)
 
     def begin_at(self, step: RelativeStep) -> None:
         """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""

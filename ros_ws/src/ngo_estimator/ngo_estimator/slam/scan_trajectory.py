@@ -9,13 +9,15 @@ import numpy as np
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.graph.key_scan_chain import OPEN
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_graph import ScanGraph
-from ngo_estimator.slam.step_log import TakenStep
+from ngo_estimator.slam.step_log import StepLog, TakenStep
+from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of
 
 
@@ -43,6 +45,19 @@ class ScanTrajectory(CorrectedTrajectory):
     def graph(self) -> ScanGraph:
         """The graph of key scans."""
         return self._graph
+
+    @property
+    def log(self) -> StepLog:
+        """The stamps and the odometry of all frames."""
+        return self._log
+
+    def begin_segment(self, step: RelativeStep) -> TrajectoryUpdate:
+        """Go on with another odometry, from the frame that ``step`` ends at; nobody knows where that is in the map.
+
+        Raises:
+            RejectedStep: as of ``update``; the stamp is not later than the newest one, or the step has no key scan.
+        """
+        return self._join_at(replace(self._checked(step), segment=True), np.zeros(3), OPEN)
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
