@@ -39,6 +39,9 @@ _OFF = 0.35
 _NEAR = 0.45
 """Share of the period within which a measured sweep is one of those that drivers make: noise makes it shorter."""
 
+_DILUTED = 0.3
+"""Share of its time at which a sweep may be measured: errors of the motion make it shorter, never longer."""
+
 _ONCE_KNOWN = 8
 """One scan in so many is measured where the sweep is known."""
 
@@ -192,7 +195,10 @@ class MeasuredSweep:
         low, measured, high = np.interp((0.25, 0.5, 0.75), share, times[order])
         spread = max(0.74 * (high - low), float(1.0 / math.sqrt(weights.sum() / len(times)))) / math.sqrt(len(times))
         scan = self._scans[self._taken[-1].stamp_ns]
-        if abs(measured - self._time_s(scan)) < max(_DEVIATIONS * spread, _OFF * self.period_s):
+        believed_s = self._time_s(scan)
+        if abs(measured - believed_s) < max(_DEVIATIONS * spread, _OFF * self.period_s):
+            return
+        if believed_s != 0.0 and _DILUTED <= measured / believed_s <= 1.0:
             return
         given_s = self._given_s(scan)
         full_s = self.period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
