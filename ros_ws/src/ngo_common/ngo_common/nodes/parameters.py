@@ -55,6 +55,8 @@ class LiveSettings(Generic[SettingsType]):
         for name, entry in self._entries.items():
             value = _for_ros(getattr(self.values, name))
             node.declare_parameter(name, value, _descriptor(entry), ignore_override=True)
+            if isinstance(value, Parameter.Type):  # else nobody could ask the node for its parameters
+                node.set_parameters([Parameter(name, value, [])])
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
         self._listeners: list[Callable[[SettingsType], None]] = []

@@ -295,9 +295,8 @@ class ScanGraph(PoseGraph):
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
         every = max(1, -(-self._scans.points // most))
-        parts = [
-            transformed(pose, scan.points[::every]) for pose, scan in zip(self._nodes.poses, self._scans, strict=True)
-        ]
+        placed = self._nodes.poses[: len(self._scans)]  # before the first step the origin has no scan
+        parts = [transformed(pose, scan.points[::every]) for pose, scan in zip(placed, self._scans, strict=True)]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     SAVED = (
