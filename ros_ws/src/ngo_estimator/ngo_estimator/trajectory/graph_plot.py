@@ -32,7 +32,7 @@ def save_graph_plot(path: Path, title: str, before: np.ndarray, after: np.ndarra
         _frame(axes, poses[:, :2])
         axes.set(title=name, xlabel="x (m)", ylabel="y (m)")
         axes.grid(color="#dddddd", linewidth=0.5)
-    right.legend(frameon=False, fontsize=8, loc="upper right")
+    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
 
