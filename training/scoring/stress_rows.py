@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from ngo_estimator.frontend.lidar import front_ends
 from ngo_estimator.geometry.planar_motion import all_between
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.slam import scan_trajectory
 from training.baselines.lidar_peers import scan_points
 from training.data.batches import seen_from_first
@@ -28,7 +29,6 @@ _LOOP_WAY_M = 50.0
 _SAME_PLACE_M = 1.0
 _EVERY_M = 0.5
 _LAST_VISITS = 10
-_BELIEVED = 0.5
 
 
 def with_facts(name: str, facts: Facts) -> Row:
@@ -88,7 +88,7 @@ def _ours_with_joins(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
     graph, truth = run.online.graph, _truth(runs.drive)
     rows = np.searchsorted(truth.stamps_ns, run.trajectory.stamps_ns[graph.closed.pairs])
     wrong = wrong_joins(truth.poses_xyyaw, rows, graph.closed.relative)
-    facts = {"wrong_loops": wrong.sum(), "wrong_believed": (wrong & (graph.closed.weight > _BELIEVED)).sum()}
+    facts = {"wrong_loops": wrong.sum(), "wrong_believed": (wrong & (graph.closed.weight > BELIEVED)).sum()}
     return dataclasses.replace(found, facts={**found.facts, **facts})
 
 

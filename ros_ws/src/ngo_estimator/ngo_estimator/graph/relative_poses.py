@@ -7,6 +7,9 @@ import numpy as np
 
 from ngo_estimator.geometry.se2 import between, wrap
 
+BELIEVED = 0.5
+"""Weight of an edge, zero to one, from which on it is believed."""
+
 
 @dataclass(frozen=True)
 class RelativePoses:

@@ -8,8 +8,9 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.nodes.messages import to_time
-from ngo_estimator.slam.loop_report import BELIEVED_ABOVE, REFUSED_BELOW
+from ngo_estimator.slam.loop_report import REFUSED_BELOW
 
 if TYPE_CHECKING:  # brings torch, which takes seconds: nodes import it after checking their parameters
     from ngo_estimator.slam.trajectory_update import Trajectory
@@ -64,7 +65,7 @@ class LoopMarkerWriter:
 def loop_colors(weights: np.ndarray) -> np.ndarray:
     """Colors ``(n, 4)`` of loops with these weights ``(n,)``; one that is believed is as opaque as its weight."""
     share = np.clip(weights, 0.0, 1.0)
-    doubt = (share <= BELIEVED_ABOVE).astype(np.int64) + (share < REFUSED_BELOW)
+    doubt = (share <= BELIEVED).astype(np.int64) + (share < REFUSED_BELOW)
     return np.column_stack((_COLORS[doubt], np.where(doubt > 0, _FAINTEST, share)))
 
 

@@ -21,9 +21,10 @@ from rich.console import Console
 
 from ngo_common.files import write_together
 from ngo_estimator.graph.corrector import CorrectedGraph
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.nodes.command import run_command
-from ngo_estimator.trajectory.chained_graph import BELIEVED, ChainedGraph, chained
+from ngo_estimator.trajectory.chained_graph import ChainedGraph, chained
 from ngo_estimator.trajectory.g2o import GRAPH_ENDING, PlanarGraph, read_g2o, write_g2o
 
 NAME = "optimize_graph"

@@ -11,10 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from ngo_estimator.geometry import se2
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.ngo.loop_gates import odometry_variances
-
-_BELIEVED = 0.5
-"""Weight from which on a loop ties the poses that it joins."""
 
 _LEAST_VARIANCE = 1e-12
 
@@ -32,7 +30,7 @@ def shrunk_corrections(
             is familiar.
         loops: nodes that each loop joins ``(m, 2)``, the earlier one first; weights: belief in each ``(m,)``.
     """
-    cut = _untied(variance, loops[weights > _BELIEVED])
+    cut = _untied(variance, loops[weights > BELIEVED])
     if not cut.any():
         return nodes
     poses = nodes.copy()

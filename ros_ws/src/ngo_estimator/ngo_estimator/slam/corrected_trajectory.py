@@ -10,6 +10,7 @@ from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, attributes_of, require, with_attributes
 from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.slam.bridge import bridged
 from ngo_estimator.slam.loop_report import LoopReport, loop_report
 from ngo_estimator.slam.map_localisation import MapLocalisation
@@ -302,7 +303,7 @@ class CorrectedTrajectory(ABC):
             restarted=restarted,
             gap=gap,
             largest_move_m=graph.largest_move_m if self._optimized else 0.0,
-            closed_loops=int((graph.closed.weight > 0.5).sum()),
+            closed_loops=int((graph.closed.weight > BELIEVED).sum()),
             window_fill=graph.window_fill,
             fault=self._fault,
             lost_since_ns=None if lost is None else int(self._log.stamps_ns.values[lost]),

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.geometry.se2 import between
+from ngo_estimator.graph.relative_poses import BELIEVED
 
-BELIEVED_ABOVE, REFUSED_BELOW = 0.5, 0.1
-"""Weights of a loop that is believed, and of one that is refused; between, and before it has one, it is doubted."""
+REFUSED_BELOW = 0.1
+"""Weight of a loop that is refused; up to ``BELIEVED``, and before it has one, it is doubted."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def loop_report(
         waiting: loops that it has not seen.
         stamps_ns: of all frames ``(frames,)``, and their poses ``(frames, 3)``.
     """
-    believed, refused = weights > BELIEVED_ABOVE, weights < REFUSED_BELOW
+    believed, refused = weights > BELIEVED, weights < REFUSED_BELOW
     words = ""
     if refused.any():
         rows = np.flatnonzero(refused)

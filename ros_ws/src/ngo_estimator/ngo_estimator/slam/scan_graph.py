@@ -12,7 +12,7 @@ from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
 from ngo_estimator.graph.key_scan_chain import OPEN, KeyScanChain
-from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.relative_poses import BELIEVED, RelativePoses
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.graph.segments import joined_parts, segment_of
 from ngo_estimator.loops.key_scan_store import KeyScanStore
@@ -32,9 +32,6 @@ _KEYS_PER_OPTIMISED = 20
 
 _KEYS_PER_SURPRISED = 400
 """The same where a loop surprises."""
-
-_BELIEVED = 0.5
-"""Weight from which on a loop joins two segments."""
 
 _MOVED_M = 0.5
 """Where an optimisation moves a key scan that far, the map is another one to search in."""
@@ -163,7 +160,7 @@ class ScanGraph(PoseGraph):
         pairs, weight = self.used_loops.pairs, np.zeros(len(self._selection))
         weight[: len(self.closed)] = self.closed.weight
         first, last = segment_of(self._nodes.segments, pairs).T
-        return pairs[(first == last) | (weight > _BELIEVED)]
+        return pairs[(first == last) | (weight > BELIEVED)]
 
     @property
     def lost_since(self) -> int | None:
@@ -222,7 +219,7 @@ class ScanGraph(PoseGraph):
         solution = None
         if len(claimed):
             solution = self._corrected(self._found_poses(loops[claimed]), anew=True)
-            if not (solution.loop_weights[claimed] > _BELIEVED).any():
+            if not (solution.loop_weights[claimed] > BELIEVED).any():
                 solution = None
         if solution is None:
             solution = self._corrected(self._nodes.poses)

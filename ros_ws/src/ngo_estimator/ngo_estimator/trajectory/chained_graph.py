@@ -11,11 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from ngo_estimator.geometry.se2 import between, compose, inverse
 from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, thresholds
 from ngo_estimator.graph.cycle_agreement import chain_poses
-from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.relative_poses import BELIEVED, RelativePoses
 from ngo_estimator.trajectory.g2o import UNSTAMPED, PlanarGraph
-
-BELIEVED = 0.5
-"""A loop whose weight is above is believed."""
 
 _BREAK = -1  # in place of an edge, where no step leads to the next vertex
 
