@@ -129,6 +129,25 @@ def test_misstated_covariances_are_noticed(factor: float) -> None:
     assert 0.5 < ratio[0, 0] < 2.0
 
 
+@pytest.mark.parametrize(("least_scale", "believed"), [(1.0, True), (1e-3, False)])
+def test_errors_in_common_do_not_shut_out_the_loops_of_another_place(least_scale: float, believed: bool) -> None:
+    """All residuals are small, until the last loops, which are two deviations off, and agree with each other."""
+    problem, true = square(3, seed=0)
+    later = problem.loops.nodes[:, 1]
+    nodes = problem.steps.nodes
+    relative = between(true[nodes[:, 0]], true[nodes[:, 1]])
+    of_loops = between(true[problem.loops.nodes[:, 0]], true[later]) + (later > 170)[:, None] * 2.0 * LOOP_STD
+    deviations = np.tile(LOOP_STD, (len(later), 1))
+    problem = replace(
+        problem,
+        poses=true,
+        steps=RelativePoses.of_deviations(nodes, relative, np.tile(STEP_STD, (len(nodes), 1))),
+        loops=RelativePoses.of_deviations(problem.loops.nodes, of_loops, deviations),
+    )
+    weights = Robust(least_scale=least_scale).correct(problem).loop_weights
+    assert (weights[later > 170] > 0.5).all() == believed and (weights[later <= 170] > 0.5).all()
+
+
 def test_it_is_deterministic() -> None:
     problem, _ = square(3, 5, ROUND)
     one, other = Robust().correct(problem), Robust().correct(problem)

@@ -53,10 +53,12 @@ class Robust:
 
     Args:
         told: is told in a few words what has been done, as often as poses move.
+        least_scale: variances are not taken to be smaller than so many times the stated ones. Where edges err together,
+            as neighbouring scans do, small residuals do not say that covariances are stated too large.
     """
 
-    def __init__(self, told: Told = silent) -> None:
-        self._told = told
+    def __init__(self, told: Told = silent, least_scale: float = _LEAST_SCALE) -> None:
+        self._told, self._least_scale = told, least_scale
 
     def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
         """Solve a problem; see ``Corrector``.
@@ -69,23 +71,23 @@ class Robust:
             chain = chain_poses(problem.steps.relative, problem.poses[0])
             return CorrectedGraph(problem, chain, np.zeros(0), np.ones(len(problem.steps)), 0.0)
         if start is None or len(start.loop_weights) == 0:
-            return _from_nothing(problem, self._told)
-        warm = _warm(problem, start, self._told)
+            return _from_nothing(problem, self._told, self._least_scale)
+        warm = _warm(problem, start, self._told, self._least_scale)
         if loops < _GROWN * start.loops_from_nothing:
             return warm
-        anew = _from_nothing(problem, self._told)
+        anew = _from_nothing(problem, self._told, self._least_scale)
         better = truncated_cost(problem, warm.poses, anew.scale, anew.scale) < anew.cost
         return replace(warm, loops_from_nothing=loops) if better else anew
 
 
-def _from_nothing(problem: GraphProblem, told: Told) -> CorrectedGraph:
+def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> CorrectedGraph:
     """The better of two solutions that begin at the chain."""
     area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
     chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
     whole = bool((problem.loops.degrees == 3).all())
     if whole:
         scale, inlier_ratio = scale_and_inlier_ratio(ChainUncertainty(problem.steps), problem.loops, area)
-        scale = _noticed(scale)
+        scale = _noticed(scale, least_scale)
         scaled = _scaled(problem, scale, scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
     rows = np.argsort(-odds, kind="stable")
@@ -99,10 +101,10 @@ def _from_nothing(problem: GraphProblem, told: Told) -> CorrectedGraph:
     if whole:
         solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in solutions]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
-    solution = _polished(problem, best, scale, len(problem.loops))
+    solution = _polished(problem, best, scale, len(problem.loops), least_scale)
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
     if whole and scale not in (1.0, solution.loop_scale):
-        solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops))
+        solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops), least_scale)
     return solution
 
 
@@ -114,7 +116,7 @@ def _looked_again(problem: GraphProblem, poses: np.ndarray, area: float, inlier_
     return believe(nearest, poses, believed, area, inlier_ratio, told)[0]
 
 
-def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told) -> CorrectedGraph:
+def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale: float) -> CorrectedGraph:
     """The solution that the last one leads to."""
     nodes, old = len(start.poses), len(start.loop_weights)
     since = chain_poses(problem.steps.relative[nodes - 1 :], start.poses[-1])
@@ -126,7 +128,7 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told) -> Corrected
     asked = np.flatnonzero(believed | fits | (np.arange(len(believed)) >= old))
     part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked], similarity=None)
     poses, _ = believe(part, poses, believed[asked], map_area(poses), told=told)
-    return _polished(problem, poses, start.scale, start.loops_from_nothing)
+    return _polished(problem, poses, start.scale, start.loops_from_nothing, least_scale)
 
 
 def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
@@ -139,18 +141,21 @@ def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
         rows = rows[: int(_FEWER * len(rows))]
 
 
-def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int) -> CorrectedGraph:
+def _polished(
+    problem: GraphProblem, poses: np.ndarray, scale: float, loops: int, least_scale: float
+) -> CorrectedGraph:
     """The nearest solution of the truncated cost, with variances so many times as large as stated."""
     scaled = _scaled(problem, scale, scale)
     poses, loop_weights, step_weights = graduate(scaled, poses, _NEAR, steps_break=True)
     cost = truncated_cost(scaled, poses)
     solution = CorrectedGraph(problem, poses, loop_weights, step_weights, cost, scale, loops_from_nothing=loops)
     of_steps, of_loops = _found_scales(scaled, solution)
-    return replace(solution, step_scale=_noticed(scale * of_steps), loop_scale=_noticed(scale * of_loops))
+    of_steps, of_loops = (_noticed(scale * found, least_scale) for found in (of_steps, of_loops))
+    return replace(solution, step_scale=of_steps, loop_scale=of_loops)
 
 
-def _noticed(scale: float) -> float:
-    scale = max(scale, _LEAST_SCALE)
+def _noticed(scale: float, least: float) -> float:
+    scale = max(scale, least)
     return 1.0 if 1.0 / _MISSTATED < scale < _MISSTATED else scale
 
 

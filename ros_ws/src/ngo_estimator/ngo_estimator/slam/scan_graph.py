@@ -50,7 +50,7 @@ class ScanGraph(PoseGraph):
         self._finder = ScanLoopFinder(config.loops)
         self._selection = ScanLoopSelection(config)
         self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
-        self._corrector: Corrector = Robust()
+        self._corrector: Corrector = Robust(least_scale=1.0)
         # Loops when the graph was last solved without a warm start, and the scale of variances that was found.
         self._loops_from_nothing, self._scale = 0, np.ones(1)
         self._own_map = OwnMap(config)
