@@ -68,7 +68,7 @@ class Arguments:
     rows: tuple[str, ...] = tuple(row for row in ROWS if row != "robust_anew")
     """Rows to measure; odometry and right_loops are always measured. robust_anew solves each block from nothing."""
     limit_s: int = 300
-    """Computing time after which a peer is stopped; its answer is the odometry then."""
+    """Computing time after which a peer is stopped; its answer is the odometry then, which counts as not solved."""
     out: Path = records.ROOT / "training" / "results"
     """Folder that gets graphs.json."""
     docs: Path = records.ROOT / "docs"
@@ -94,7 +94,11 @@ def main(arguments: Arguments) -> dict[str, Any]:
         measure = _measure_online if graph.endswith(_ONLINE) else _measure
         measured = [measure(draw(seed), arguments.rows, arguments.limit_s) for seed in arguments.seeds]
         rows = result["tables"].setdefault(graph, {}).setdefault(cell, {})
-        rows.update({row: _intervals([each[row] for each in measured if row in each]) for row in measured[0]})
+        for row in measured[0]:
+            made = {"graphs": len(measured), "revision": result["revision"]}
+            rows[row] = {**_intervals([each[row] for each in measured]), **made}
+            if row in PEERS:
+                rows[row]["limit_s"] = arguments.limit_s
         print(f"{graph} {cell}: {json.dumps({row: _means(rows[row]) for row in measured[0]})}", flush=True)
         write_at_once(path, json.dumps(result, indent=2) + "\n")
         write_at_once(arguments.docs / "results_graphs.md", graphs_page.page(result))
@@ -137,16 +141,22 @@ def _measure(
     """The numbers of each row on one graph; ``correct`` stands in for the row robust."""
     problem, kept = judged.problem, judged.problem.loops[judged.right]
     right = GraphProblem(problem.poses, problem.steps, kept, np.ones(len(kept)))
-    found = {"odometry": (problem.poses, 0.0), "right_loops": _timed(graph_peers.least_squares, right, limit_s)}
+    found: dict[str, tuple[np.ndarray, float] | None] = {"odometry": (problem.poses, 0.0)}
+    found["right_loops"] = graph_peers.within(graph_peers.least_squares, right, limit_s)
     for row in rows:
         if row in ("robust", "robust_anew"):
             solve = correct if correct and row == "robust" else Robust().correct
             began = time.process_time()
             found[row] = (solve(problem).poses, time.process_time() - began)
         elif row in PEERS and not (row == "pcm" and problem.loops.degrees.min(initial=3) < 3):
-            found[row] = _timed(PEERS[row], problem, limit_s)
-    bar = max(_SOLVED * judged.ate_m(found["right_loops"][0]), judged.least_ate_m)
-    return {row: _numbers(judged, poses, seconds, bar) for row, (poses, seconds) in found.items()}
+            found[row] = graph_peers.within(PEERS[row], problem, limit_s)
+    answers = {row: (problem.poses, float(limit_s)) if answer is None else answer for row, answer in found.items()}
+    bar = max(_SOLVED * judged.ate_m(answers["right_loops"][0]), judged.least_ate_m)
+    numbers = {row: _numbers(judged, poses, seconds, bar) for row, (poses, seconds) in answers.items()}
+    for row in PEERS.keys() & found.keys():
+        numbers[row]["stopped"] = float(found[row] is None)
+        numbers[row]["solved"] *= float(found[row] is not None)
+    return numbers
 
 
 def _measure_online(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) -> dict[str, dict[str, float]]:
@@ -159,11 +169,6 @@ def _measure_online(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) 
     if "robust" in means:
         means["robust"]["changed"] = online.changed / max(online.verdicts, 1)
     return means
-
-
-def _timed(solve: graph_peers.Peer, problem: GraphProblem, limit_s: int) -> tuple[np.ndarray, float]:
-    answer = graph_peers.within(solve, problem, limit_s)
-    return (problem.poses, float(limit_s)) if answer is None else answer
 
 
 def _numbers(judged: JudgedProblem, poses: np.ndarray, seconds: float, bar: float) -> dict[str, float]:

@@ -65,10 +65,11 @@ def pcm(problem: GraphProblem) -> np.ndarray:
         ValueError: a loop has no whole relative pose.
     """
     loops = problem.loops
-    first, second = np.triu_indices(len(loops), 1)
-    off, _ = ChainUncertainty(problem.steps).off_pairs(loops, np.stack((first, second), axis=1))
-    agree = np.zeros((len(loops), len(loops)), bool)
-    agree[first, second] = off <= thresholds(loops)[0]
+    chain, limit, agree = ChainUncertainty(problem.steps), thresholds(loops)[0], np.zeros((len(loops),) * 2, bool)
+    for first in range(len(loops) - 1):
+        second = np.arange(first + 1, len(loops))
+        off, _ = chain.off_pairs(loops, np.stack((np.full(len(second), first), second), axis=1))
+        agree[first, second] = off <= limit
     agree |= agree.T
     kept = _clique(agree)
     return solve_with(None, problem.steps, loops[kept], problem.poses)

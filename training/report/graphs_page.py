@@ -8,17 +8,17 @@ from training.report.page import interval, markdown
 
 _HEAD = """# Pose graphs with wrong loops
 
-Made by `{command}` at revision {revision}. A graph counts as solved where its error (ATE after the best alignment) is
+Made by `{command}` at {revisions}. A graph counts as solved where its error (ATE after the best alignment) is
 below 1.5 times that of its right loops alone. Manhattan's truth is itself a solution, with its own loops: there an
-error below 0.5 m counts as solved. Means are over graphs, with intervals of 95 %. Times are computing
-times, so that a busy machine does not change them. A peer that computes for longer than its limit answers with the
-odometry. A cell's name is the kind of its wrong loops and their percentage. `_place`: loops know
-no relative pose, only "the same place". All peers get the stated covariances; those of Manhattan are far too large.
-Rows and cells that are missing were not measured. `_online`: loops come in blocks of 120, in the order of their later
-poses; numbers are means over the blocks. There `robust` goes on from its last solution, and `changed` is the share of
-its verdicts about known loops that changed; `robust_anew` begins anew in each block. `hard_` graphs have a poor
-odometry, and twice as many loops as `synthetic_` ones. A loop counts as believed where the poses fit it within its
-stated threshold.
+error below 0.5 m counts as solved. Means are over so many graphs as the second table says, with intervals of 95 %.
+Times are computing times, so that a busy machine does not change them. A peer that computes for longer than its limit
+is stopped: it counts as not solved, and its error is that of the odometry. A cell's name is the kind of its wrong
+loops and their percentage. `_place`: loops know no relative pose, only "the same place". All peers get the stated
+covariances; those of Manhattan are far too large. Rows and cells that are missing were not measured. `_online`: loops
+come in blocks of 120, in the order of their later poses; numbers are means over the blocks. There `robust` goes on
+from its last solution, and `changed` is the share of its verdicts about known loops that changed; `robust_anew`
+begins anew in each block. `hard_` graphs have a poor odometry, and twice as many loops as `synthetic_` ones. A loop
+counts as believed where the poses fit it within its stated threshold.
 
 | kind | wrong loops |
 |---|---|
@@ -32,7 +32,12 @@ stated threshold.
 
 def page(result: dict[str, Any]) -> str:
     """The page in Markdown."""
-    parts = [_HEAD.format(**result)]
+    known = (
+        row.get("revision") for cells in result["tables"].values() for cell in cells.values() for row in cell.values()
+    )
+    revisions = list(dict.fromkeys(revision for revision in known if revision)) or [result["revision"]]
+    said = ("revision " if len(revisions) == 1 else "revisions ") + ", ".join(revisions)
+    parts = [_HEAD.format(command=result["command"], revisions=said)]
     for graph, cells in result["tables"].items():
         rows = list(dict.fromkeys(row for cell in cells.values() for row in cell))
         parts.append(f"## {graph}\n\nShare solved, and in brackets the mean error in metres:\n")
@@ -49,16 +54,20 @@ def page(result: dict[str, Any]) -> str:
         if any("changed" in row for cell in cells.values() for row in cell.values()):
             keys.append("changed")
         lines = [
-            (name, row, *(interval(cell[row][key]) if key in cell[row] else "" for key in keys))
+            (name, row, str(of.get("graphs", "")), *(interval(of[key]) if key in of else "" for key in keys))
             for name, cell in cells.items()
-            for row in cell
+            for row, of in cell.items()
         ]
-        parts.append(markdown(("cell", "row", *keys), lines) + "\n")
+        parts.append(markdown(("cell", "row", "graphs", *keys), lines) + "\n")
     return "\n".join(parts).rstrip() + "\n"
 
 
 def _short(row: dict[str, Any] | None) -> str:
-    return "" if row is None else f"{row['solved']['mean']:.2f} ({row['ate_m']['mean']:.2f})"
+    if row is None:
+        return ""
+    stopped = row["stopped"]["mean"] if "stopped" in row else 0.0
+    late = f"; {stopped:.2f} did not end in {row['limit_s']} s" if stopped > 0.0 else ""
+    return f"{row['solved']['mean']:.2f} ({row['ate_m']['mean']:.2f}{late})"
 
 
 def _over_cells(cells: dict[str, Any], rows: list[str]) -> str:

@@ -1,6 +1,7 @@
 """Graphs with wrong loops, the peers that solve them, and the table's numbers."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,9 +93,29 @@ def test_the_table_has_every_row_and_keeps_other_cells(tmp_path: Path, monkeypat
     assert list(cells) == ["random_30", "local_30"]
     assert set(cells["local_30"]) == {"odometry", "right_loops", "robust", "gtsam_lm_cauchy"}
     robust = cells["random_30"]["robust"]
-    assert set(robust) == {"ate_m", "solved", "precision", "recall", "seconds"}
+    assert set(robust) == {"ate_m", "solved", "precision", "recall", "seconds", "graphs", "revision"}
     assert robust["solved"]["mean"] == 1.0 and robust["precision"]["mean"] > 0.9
     assert "| random_30 |" in (tmp_path / "results_graphs.md").read_text()
+
+
+def test_a_peer_that_was_stopped_counts_as_not_solved_and_the_page_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, easy: JudgedProblem
+) -> None:
+    def never_ends(problem: GraphProblem) -> np.ndarray:
+        while True:
+            problem.poses.sum()
+
+    easy = replace(easy, least_ate_m=1000.0)  # even the odometry is good enough
+    monkeypatch.setattr(results_graphs, "synthetic", lambda *_: easy)
+    monkeypatch.setitem(results_graphs.PEERS, "pcm", never_ends)
+    arguments = results_graphs.Arguments(
+        graphs=("hard_1000",), kinds=("random",), percents=(50,), seeds=(0,), rows=("pcm",), limit_s=1,
+        out=tmp_path, docs=tmp_path,
+    )  # fmt: skip
+    cell = results_graphs.main(arguments)["tables"]["hard_1000"]["random_50"]
+    assert cell["odometry"]["solved"]["mean"] == 1.0
+    assert cell["pcm"]["solved"]["mean"] == 0.0 and cell["pcm"]["stopped"]["mean"] == 1.0
+    assert "1.00 did not end in 1 s" in (tmp_path / "results_graphs.md").read_text()
 
 
 def test_an_unknown_row_is_refused() -> None:
@@ -118,4 +139,4 @@ def test_online_a_graph_comes_in_blocks_and_is_solved_in_each(tmp_path: Path, mo
     assert cell["robust"]["solved"]["mean"] == cell["robust_anew"]["solved"]["mean"] == 1.0
     assert cell["robust"]["changed"]["mean"] < 0.02
     page = (tmp_path / "results_graphs.md").read_text()
-    assert "| cell | row | seconds | precision | recall | changed |" in page
+    assert "| cell | row | graphs | seconds | precision | recall | changed |" in page
