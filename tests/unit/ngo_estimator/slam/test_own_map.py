@@ -4,11 +4,14 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.geometry.se2 import compose
+from ngo_estimator.loops.place_evidence import PlaceEvidence
 from ngo_estimator.nodes.trajectory_report import TrajectoryReport
+from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, between, outline, scan_at, way
@@ -16,6 +19,7 @@ from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, between, ou
 FIRST = way(*ROUND, ROUND[0], (4.0, 1.0))
 BACK = way((1.0, 6.0), ROUND[0], *ROUND[1:])  # another corner, from which it drives on
 OTHER = np.concatenate((outline((0, 0), (7, 0), (7, 11), (0, 11)), outline((2, 3), (5, 3), (5, 8), (3.5, 8), (2, 6))))
+ALIKE = way((1.0, 6.0), (1.0, 1.0), (6.0, 1.0), (6.0, 10.0))  # the second corridor fits another one of the hallway
 COVARIANCE = np.diag((0.01, 0.01, 0.004)) ** 2
 NOTHING = np.zeros(0, np.float32)
 
@@ -76,13 +80,26 @@ def test_a_robot_that_was_carried_is_lost_until_it_is_found_in_its_own_map() -> 
     assert position_std(updates[-1].covariance) < 0.1
 
 
-def test_a_robot_in_another_building_is_not_found() -> None:
-    poses = way((1.0, 1.0), (6.0, 1.0), (6.0, 10.0), (1.0, 10.0), (1.0, 2.0))
-    core = ScanTrajectory()
-    updates = driven(steps(OTHER, poses), core)
-    assert updates[-1].lost_since_ns is not None
+def joining_loops(core: ScanTrajectory) -> int:
     segment = core.graph.used_loops.pairs >= len(FIRST)
-    assert (segment[:, 0] == segment[:, 1]).all()
+    return int((segment[:, 0] != segment[:, 1]).sum())
+
+
+def test_a_robot_in_another_building_is_not_found() -> None:
+    core = ScanTrajectory()
+    updates = driven(steps(OTHER, ALIKE), core)
+    assert all(update.lost_since_ns is not None for update in updates[len(FIRST) - 1 :])
+    assert joining_loops(core) == 0
+
+
+def test_a_claim_that_later_scans_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(OwnMap, "_evidence", lambda *_: PlaceEvidence(99, 0.0, 1))
+    core = ScanTrajectory()
+    updates = driven(steps(OTHER, ALIKE), core)
+    lost = np.array([update.lost_since_ns is not None for update in updates[len(FIRST) - 1 :]])
+    assert lost[0] and not lost.all(), "without evidence it is found where it is not"
+    assert lost[-1] and joining_loops(core) == 0
+    assert position_std(updates[-1].covariance) > 50.0
 
 
 def test_a_key_scan_that_begins_a_segment_leaves_map_from_odom_as_it_was() -> None:

@@ -78,15 +78,16 @@ def seen_through(target: PlacedScans, source: PlacedScans, pose: Array) -> float
     """
     sensors = np.stack([compose(pose, sensor) for sensor in source.sensors])
     both = (
-        _sightings(target.sensors, target.profiles, transformed(pose, source.points)),
-        _sightings(sensors, source.profiles, target.points),
+        sightings(target.sensors, target.profiles, transformed(pose, source.points)).sum(0),
+        sightings(sensors, source.profiles, target.points).sum(0),
     )
     return max((through / (through + on) for through, on in both if through + on > 0), default=1.0)
 
 
 @njit(cache=True)
-def _sightings(sensors: Array, profiles: Array, points: Array) -> tuple[int, int]:
-    through, on = 0, 0
+def sightings(sensors: Array, profiles: Array, points: Array) -> Array:
+    """How many of the sensors ``(s, 3)`` see through each point, and how many see it ``(n, 2)``."""
+    seen = np.zeros((len(points), 2), np.int64)
     bins = profiles.shape[1]
     for s in range(len(sensors)):
         for k in range(len(points)):
@@ -97,7 +98,7 @@ def _sightings(sensors: Array, profiles: Array, points: Array) -> tuple[int, int
             if ray > 0.0:
                 margin = _MARGIN_M + _MARGIN_SHARE * away
                 if away < ray - margin:
-                    through += 1
+                    seen[k, 0] += 1
                 elif away < ray + margin:
-                    on += 1
-    return through, on
+                    seen[k, 1] += 1
+    return seen

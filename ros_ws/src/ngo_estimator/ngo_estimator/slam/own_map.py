@@ -2,8 +2,9 @@
 
 The key scans that are searched are those of parts of the map that no loop joins with the newest one, and those that are
 so far from it through the graph that it may be outside of the widest window. As in a saved map, a pose is claimed where
-sightings of several scans agree by the odometry between them, and no other pose has nearly as many. Each of these
-sightings is then a loop, which the corrector may still refuse.
+sightings of several scans agree by the odometry between them, and no other pose has nearly as many. Here the whole last
+stretch of the way must also agree with the place, in more walls than places have in common by chance. Each of these
+sightings is then a loop. The corrector may still refuse it, and the next scans may contradict it.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from ngo_estimator.data.state_arrays import require
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.loops.key_scan_views import KeyScanViews
+from ngo_estimator.loops.place_evidence import PlaceEvidence, evidence_of, last_stretch
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import laid_together
-from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, strongest_modes
+from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, fused, strongest_modes
 from ngo_estimator.slam.localisation import LocalisationConfig, may_claim
 from ngo_estimator.slam.scan_matcher import ScanMatcher
 from ngo_estimator.slam.sightings import Sightings
@@ -31,6 +34,12 @@ _REACH_M = 2.0
 
 _GROWN = 1.1
 """The map is laid out anew when so many times as many key scans are to be searched."""
+
+_LEAST_WALLS, _MOST_THROUGH = 8, 0.3
+"""A claim needs so many different walls, and no part of the way may look through more of the walls than this share."""
+
+_TRIAL_LOOKS, _CONTRADICTIONS = 40, 3
+"""Looks after a claim in which the newest scans may still contradict it, and how many in a row do."""
 
 
 class OwnMap:
@@ -45,11 +54,14 @@ class OwnMap:
         self._keys, self._poses = np.zeros(0, np.int64), np.zeros((0, 3))
         self._stale, self._parts = 1, 0  # whether they are to be laid out anew, and of how many parts they are
         self._matcher: ScanMatcher | None = None
+        # Looks for which the newest segment may still turn out to lie elsewhere, and how many in a row say so.
+        self._trial, self._against = 0, 0
 
     def follow(self, chain: KeyScanChain) -> None:
         """Take the step to the newest key scan; nobody knows it where that begins a segment."""
         if chain.segments[-1] == len(chain) - 1:
             self._forget_looks()
+            self._trial = self._against = 0
         else:
             self._window.move(chain.last_step, chain.step_covariance[-1])
 
@@ -93,9 +105,46 @@ class OwnMap:
         if not may_claim(self._claims, self._window, modes[0], modes[1:], place_m, since):
             return ScanLoops.none()
         agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
+        pose, _ = fused(hypotheses.where(agree), modes[0].pose_xyyaw)
+        evidence = self._evidence(pose, scans, views, chain)
+        if evidence.walls < _LEAST_WALLS or evidence.through > _MOST_THROUGH:
+            return ScanLoops.none()
         loops = self._loops(agree, self._looks[hypotheses.look], modes[0].support)
         self._forget_looks()
+        if (loops.pairs[:, 0] < chain.segments[-1]).any():
+            self._trial, self._against = _TRIAL_LOOKS, 0
         return loops
+
+    def _evidence(
+        self, pose: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain
+    ) -> PlaceEvidence:
+        """How the last stretch of the way agrees with the searched key scans, where the newest one is at a pose."""
+        stretch = last_stretch(chain.poses, int(chain.segments[-1]))
+        at = se2.compose(pose, se2.between(chain.poses[-1], chain.poses[stretch]))
+        return evidence_of(scans, views, (stretch, at), (self._keys, self._poses))
+
+    def contradicted(
+        self, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain, parts: np.ndarray
+    ) -> bool:
+        """Whether the key scans since the newest segment was joined show that it lies elsewhere.
+
+        Two places may be alike for as far as the robot went; what it sees next is alike in one place alone.
+        """
+        first, newest = int(chain.segments[-1]), len(chain) - 1
+        others = np.flatnonzero(parts[segment_of(chain.segments, np.arange(first))] == parts[-1])
+        others = others[~np.isin(others, list(views.forgotten))]
+        if self._trial == 0 or not len(others):
+            return False
+        last = np.arange(newest + 1 - self._config.loops.source_keys, newest + 1)
+        found = evidence_of(scans, views, (last, chain.poses[last]), (others, chain.poses[others]))
+        if found.said:
+            self._trial -= 1
+            self._against = self._against + 1 if found.through > _MOST_THROUGH else 0
+        if self._against < _CONTRADICTIONS:
+            return False
+        self._trial = self._against = 0
+        self._forget_looks()
+        return True
 
     def map_changed(self) -> None:
         """Lay out the map anew at the next look: scans are gone, or many poses were moved."""
@@ -144,7 +193,7 @@ class OwnMap:
         pairs = np.stack((self._keys[near], later[agree]), axis=1)
         return ScanLoops(pairs, np.stack(relative), np.stack(turned), evidence, np.ones(len(poses), bool))
 
-    SAVED = ("_window", "_looks", "_keys", "_poses", "_stale", "_parts")
+    SAVED = ("_window", "_looks", "_keys", "_poses", "_stale", "_parts", "_trial", "_against")
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""

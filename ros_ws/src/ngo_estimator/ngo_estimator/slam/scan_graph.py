@@ -143,6 +143,9 @@ class ScanGraph(PoseGraph):
                 surprises = self._selection.use(believed, self._finder.loops, chain)
                 self._waiting = max(self._waiting, self._wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
             self._parts = joined_parts(chain.segments, joining)
+            if self._own_map.contradicted(self._scans, self._finder.views, chain, self._parts):
+                self._part_newest_segment()
+                return
             self._claim(self._own_map.look(self._scans, self._finder.views, chain, windows, self._parts))
         self._waiting += self._waiting > 0
 
@@ -153,6 +156,12 @@ class ScanGraph(PoseGraph):
             self._selection.use(self._finder.add(loops), self._finder.loops, self._nodes)
             self._claimed = np.concatenate((self._claimed, np.arange(first, len(self._selection))))
             self._waiting = self._wait + 1
+
+    def _part_newest_segment(self) -> None:
+        """Take back what joined the newest segment with others: it lies elsewhere."""
+        first = self._nodes.frames.nodes[self._nodes.segments[-1]]
+        self._drop_loops(lambda frames: (frames < first).any(1) & (frames >= first).any(1))
+        self._waiting = self._wait + 1
 
     @property
     def _joining_pairs(self) -> np.ndarray:

@@ -1,0 +1,122 @@
+"""How a stretch of the way agrees with a place of the map: evidence for, or against, that both are the same.
+
+Scans that fit say little: a corridor with a corner is in every building. What counts is how many different walls both
+have, and whether either looks through walls of the other, anywhere on the stretch and not only where scans fit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ngo_estimator.geometry.key_scan import KeyScan
+from ngo_estimator.loops.key_scan_views import KeyScanViews
+from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, sightings
+
+_CELL_M = 0.15
+"""Of the points in a cell of this side one counts."""
+
+_THICK_M, _PARALLEL = 0.1, 0.95
+"""Points of one straight wall: how far from its line, and the cosine between their normals at least."""
+
+_WALL_POINTS = 4
+"""Points, one a cell, that make a wall."""
+
+_STRETCH_M, _PART = 20.0, 4
+"""The way that is compared, and of how many key scans a part of it is."""
+
+_NEAR_M, _MOST_SCANS = 8.0, 60
+"""The key scans that it is compared with: how far from it, and how many at most."""
+
+_MOST_POINTS = 2000
+"""Points at most that are compared with each other."""
+
+_SAID = 40
+"""Sightings from which on their share says something."""
+
+
+@dataclass(frozen=True)
+class PlaceEvidence:
+    """``walls``: different straight walls that both see. ``through``: the largest share of sightings through walls.
+
+    ``said``: in how many parts of the stretch there were sightings enough for a share.
+    """
+
+    walls: int
+    through: float
+    said: int
+
+
+NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)
+"""Of a stretch that comes nowhere near the place."""
+
+
+def evidence_of(
+    scans: Sequence[KeyScan],
+    views: KeyScanViews,
+    stretch: tuple[np.ndarray, np.ndarray],
+    others: tuple[np.ndarray, np.ndarray],
+) -> PlaceEvidence:
+    """How the key scans of a stretch agree with those of others near it; both are keys and their poses ``(n, 3)``."""
+
+    def together(keys: np.ndarray, poses: np.ndarray) -> PlacedScans:
+        chosen = keys.tolist()
+        return placed([scans[key] for key in chosen], [views.profiles[key] for key in chosen], poses)
+
+    keys, at = stretch
+    near = np.flatnonzero(np.isfinite(KDTree(at[:, :2]).query(others[1][:, :2], distance_upper_bound=_NEAR_M)[0]))
+    near = near[:: max(1, -(-len(near) // _MOST_SCANS))]
+    if not len(near):
+        return NO_EVIDENCE
+    parts = [slice(first, first + _PART) for first in range(0, len(keys), _PART)]
+    return place_evidence(together(others[0][near], others[1][near]), [together(keys[p], at[p]) for p in parts])
+
+
+def last_stretch(poses: np.ndarray, first: int) -> np.ndarray:
+    """The keys from ``first`` on that lie on the last stretch of the way of poses ``(keys, 3)``."""
+    to_end = np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0)[::-1].T))
+    return np.arange(len(poses) - 1 - int(np.searchsorted(to_end, _STRETCH_M)), len(poses))
+
+
+def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans]) -> PlaceEvidence:
+    """The evidence of the parts of a stretch, each of some scans, in the frame of the place's scans."""
+    place, shares, points, normals = _thinned(place), [], [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for part in map(_thinned, stretch):
+        ours = sightings(place.sensors, place.profiles, part.points)
+        its = sightings(part.sensors, part.profiles, place.points)
+        agree = ours[:, 1] > ours[:, 0]
+        points.append(part.points[agree])
+        normals.append(part.normals[agree])
+        # A wall that one side alone has is seen through by the other alone.
+        shares += [seen[0] / seen.sum() for seen in (ours.sum(0), its.sum(0)) if seen.sum() >= _SAID]
+    walls = distinct_walls(np.concatenate(points), np.concatenate(normals))
+    return PlaceEvidence(walls, max(shares, default=0.0), len(shares))
+
+
+def distinct_walls(points: np.ndarray, normals: np.ndarray) -> int:
+    """How many straight walls explain points ``(n, 2)`` that have normals ``(n, 2)``, those without one left out."""
+    known = (normals**2).sum(1) > 0.5
+    points, normals = points[known], normals[known]
+    one = _one_a_cell(points)
+    one = one[:: max(1, -(-len(one) // _MOST_POINTS))]
+    points, normals = points[one], normals[one]
+    off = np.abs(normals @ points.T - (normals * points).sum(1)[:, None])
+    on = (off <= _THICK_M) & (np.abs(normals @ normals.T) >= _PARALLEL)
+    walls = 0
+    while len(on) and (support := on.sum(1)).max() >= _WALL_POINTS:
+        walls += 1
+        left = ~on[support.argmax()]
+        on = on[np.ix_(left, left)]
+    return walls
+
+
+def _thinned(scans: PlacedScans) -> PlacedScans:
+    one = _one_a_cell(scans.points)
+    return replace(scans, points=scans.points[one], normals=scans.normals[one])
+
+
+def _one_a_cell(points: np.ndarray) -> np.ndarray:
+    """The first of the points ``(n, 2)`` in each cell, as rows."""
+    _, first = np.unique(np.floor(points / _CELL_M).astype(np.int64) @ (1 << 32, 1), return_index=True)
+    return np.sort(first)
