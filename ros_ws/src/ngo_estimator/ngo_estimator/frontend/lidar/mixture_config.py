@@ -35,13 +35,13 @@ class MixtureConfig:
     learn_rate: float = 0.05  # what one match counts at most
     learn_m: float = 0.2  # way and turn that make it count so much
     learn_rad: float = 0.2
-    certain_m: float = 4.0  # way and turn that the wheels' calibration counts as known at first
+    certain_m: float = 5.0  # way and turn that the wheels' calibration counts as known at first
     certain_rad: float = 3.0
     remembered_m: float = 100.0  # way after which it is forgotten
 
     # Search: windows cover all hypotheses, within limits.
-    least_m: float = 0.15  # no hypothesis is surer than this where the place is chosen
-    least_rad: float = 0.15
+    least_m: float = 0.07  # no hypothesis is surer than this where the place is chosen
+    least_rad: float = 0.07
     prior_weight: float = 0.04  # of the prior's logarithm against the mean score of search_points
     search_points: int = 120
     least_window_m: float = 0.4

@@ -1,9 +1,9 @@
 """The local estimator of a 2D lidar: a mixture of hypotheses, a search over all of them, registration, segments.
 
-Each scan is registered to the last key scans from where each hypothesis has it, and searched there under the mixture as
-its prior. What the search finds must fit better by more than a score's noise. Other modes widen the covariance. Where
-walls leave a direction open, the likeliest hypothesis is followed. A scan that fits nowhere is dead reckoned, and after
-a while begins a new segment with an empty submap: what is not known bends nothing.
+Each scan is registered to the last key scans under each hypothesis, from where that has it, and searched there under
+the mixture as its prior. What the search finds must fit better by more than a score's noise. Other modes widen the
+covariance. Where walls leave a direction open, the likeliest hypothesis is followed. A scan that fits nowhere is dead
+reckoned, and after a while begins a new segment with an empty submap: what is not known bends nothing.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
-from ngo_estimator.frontend.lidar.motion_mixture import MotionMixture
+from ngo_estimator.frontend.lidar.motion_mixture import ANY, MotionMixture
 from ngo_estimator.frontend.lidar.rolling_submap import RollingSubmap
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.mode_search import Mixture, SearchWindow, two_modes
@@ -150,7 +150,9 @@ class MixtureOdometry:
         points = _on_lines(other, self.config.search_points)
         if not len(points):
             return scan, found
-        refound = self._fit(other, points, found.pose, self._prior(), self._weight(points))
+        refound = self._sharpened(
+            other, points, self._fit(other, points, ANY, found.pose, self._prior(), self._weight(points))
+        )
         return (other, refound) if refound.score >= found.score else (scan, found)
 
     def _accepted(
@@ -209,7 +211,7 @@ class MixtureOdometry:
         # Few points contradict nothing: the prior decides.
         least = config.lost_share * self._usual if len(points) >= _FEWEST else 0.0
         prior, weight = self._prior(), self._weight(points)
-        fits = [self._fit(scan, points, mean, prior, weight) for mean in self._starts(prior)]
+        fits = [self._fit(scan, points, k, None, prior, weight) for k in self._starts()]
         for wide in (False, True):
             if wide:
                 prior = prior.widened(0.5 * config.most_window_m, 0.5 * math.radians(config.most_window_deg))
@@ -217,24 +219,44 @@ class MixtureOdometry:
                 self._submap.field, points, self._window(prior, wide), prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
             ):  # fmt: skip
-                fit = self._fit(scan, points, pose, prior, weight)
-                if not any(self._is_same(fit.pose, other.pose) for other in fits):
+                if not any(self._is_same(pose, other.pose) for other in fits):
+                    fit = self._fit(scan, points, ANY, pose, prior, weight)
                     fits.append(replace(fit, total=fit.total - config.noise * weight))
             fitting = sorted((fit for fit in fits if fit.score >= least), key=lambda fit: -fit.total)
             if fitting:
-                return _doubted(fitting, weight)
+                best = self._sharpened(scan, points, fitting[0])
+                return self._doubted([best, *fitting[1:]], weight)
         return None
+
+    def _doubted(self, fits: list[_Mode], weight: float) -> _Mode:
+        """The first mode with the covariance of all: a total is ``weight`` times a log likelihood."""
+        modes: list[_Mode] = []
+        for fit in fits:
+            if not any(self._is_same(fit.pose, mode.pose) for mode in modes):
+                modes.append(fit)
+        likelihoods = np.exp(np.array([mode.total - modes[0].total for mode in modes]) / weight)
+        covariance = modes[0].covariance
+        for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
+            away = mode.pose - modes[0].pose
+            away[2] = wrap(away[2])
+            covariance = covariance + share * np.outer(away, away)
+        return replace(modes[0], covariance=covariance)
 
     def _is_same(self, a: Array, b: Array) -> bool:
         off = between(a, b)
         return math.hypot(off[0], off[1]) < self.config.same_m and abs(off[2]) < self.config.same_rad
 
-    def _starts(self, prior: Mixture) -> list[Array]:
-        """Means of the hypotheses but anything, the likeliest first, without those that are much the same."""
-        starts: list[Array] = []
-        for k in np.argsort(-prior.log_weights[:-1]):
-            if not any(self._is_same(prior.means[k], start) for start in starts):
-                starts.append(prior.means[k])
+    def _starts(self) -> list[int]:
+        """The hypotheses but anything, without those that say no more than one before."""
+        mixture = self.mixture
+        starts: list[int] = []
+        for k in mixture.usable[:-1]:
+            if not any(
+                self._is_same(mixture.steps[k], mixture.steps[other])
+                and (mixture.deviations[k] < 2.0 * mixture.deviations[other]).all()
+                for other in starts
+            ):
+                starts.append(k)
         return starts
 
     def _window(self, prior: Mixture, wide: bool) -> SearchWindow:
@@ -255,24 +277,38 @@ class MixtureOdometry:
             math.radians(config.heading_step_deg),
         )
 
-    def _fit(self, scan: KeyScan, points: Array, pose: Array, prior: Mixture, weight: float) -> _Mode:
-        """A mode, registered under the hypothesis that is likeliest there."""
-        broad_mean = prior.means[int(prior.logs(pose).argmax())]
-        broad = np.diag(np.full(3, _BROAD**-2))
-        far = _FAR / max(squared_deviations(pose, broad_mean, broad), 1e-9)
-        near = self._icp(scan, pose, broad_mean, broad * min(1.0, far), self.config.icp)
-        walls = inverted(near.information + np.diag((1.0, 1.0, 1.0)))
-        sharp = self.mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0))
-        likeliest = self.mixture.likeliest(near.pose, sharp)
-        mean = compose(self._pose, self.mixture.steps[likeliest])
-        covariance = self.mixture.pose_covariance(likeliest, self._covariance, mean)
-        squared = squared_deviations(near.pose, mean, inverted(covariance + walls))
-        information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
-        found = self._icp(scan, near.pose, mean, information, self._last_steps)
+    def _fit(
+        self, scan: KeyScan, points: Array, hypothesis: int, start: Array | None, prior: Mixture, weight: float
+    ) -> _Mode:
+        """A mode, registered under a hypothesis from where that has it, or from ``start`` ``(3,)``."""
+        mean = compose(self._pose, self.mixture.steps[hypothesis])
+        if start is None:
+            start, information = mean, inverted(self.mixture.pose_covariance(hypothesis, self._covariance, mean))
+        else:
+            broad = np.diag(np.full(3, _BROAD**-2))
+            information = broad * min(1.0, _FAR / max(squared_deviations(start, mean, broad), 1e-9))
+        found = self._icp(scan, start, mean, information, self.config.icp)
         score = self._submap.field.score(points, found.pose)
-        total = score + weight * float(prior.logs(found.pose).max())
+        return self._mode(found, hypothesis, score, score + weight * float(prior.logs(found.pose).max()))
+
+    def _sharpened(self, scan: KeyScan, points: Array, mode: _Mode) -> _Mode:
+        """A mode registered under the hypothesis that is likeliest there."""
+        mixture = self.mixture
+        walls = turned_covariance(self._pose[2], mode.walls)
+        likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
+        if likeliest == mode.hypothesis != ANY:
+            return mode
+        mean = compose(self._pose, mixture.steps[likeliest])
+        covariance = mixture.pose_covariance(likeliest, self._covariance, mean)
+        squared = squared_deviations(mode.pose, mean, inverted(covariance + walls))
+        information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
+        found = self._icp(scan, mode.pose, mean, information, self._last_steps)
+        return self._mode(found, likeliest, self._submap.field.score(points, found.pose), mode.total)
+
+    def _mode(self, found: Registration, hypothesis: int, score: float, total: float) -> _Mode:
+        walls = inverted(found.information + np.diag((1.0, 1.0, 1.0)))
         turned = turned_covariance(-self._pose[2], walls)
-        return _Mode(found.pose, found.covariance, turned, likeliest, score, total, found.fitted)
+        return _Mode(found.pose, found.covariance, turned, hypothesis, score, total, found.fitted)
 
     def _icp(self, scan: KeyScan, start: Array, mean: Array, information: Array, config: IcpConfig) -> Registration:
         return icp(
@@ -285,15 +321,3 @@ def _on_lines(scan: KeyScan, most: int) -> Array:
     if len(points) < 2 * _FEWEST:
         points = scan.points
     return points[:: max(1, math.ceil(len(points) / most))]
-
-
-def _doubted(fits: list[_Mode], weight: float) -> _Mode:
-    """The best mode with the covariance of all: a total is ``weight`` times a log likelihood."""
-    best = fits[0]
-    covariance = best.covariance
-    for other in fits[1:]:
-        share = 1.0 / (1.0 + math.exp(min((best.total - other.total) / weight, 50.0)))
-        away = other.pose - best.pose
-        away[2] = wrap(away[2])
-        covariance = covariance + share * np.outer(away, away)
-    return replace(best, covariance=covariance)

@@ -32,7 +32,7 @@ class WheelCalibration:
 
     def __init__(self, config: MixtureConfig) -> None:
         self._config = config
-        first = np.diag((config.certain_m, config.certain_m, config.certain_rad)) ** 2
+        first = np.diag((config.certain_m, config.certain_m, config.certain_rad))
         self._squares, self._products = first, first.copy()
         self._matrix = np.eye(3)
 
@@ -43,7 +43,9 @@ class WheelCalibration:
 
     def learn(self, motion: Array, found: Array, share: float) -> None:
         """Take a motion ``(3,)`` of the wheels and what a match found; the ``share`` of it that is theirs counts."""
-        keep = 1.0 - share * min(0.1, math.hypot(motion[0], motion[1]) / self._config.remembered_m)
+        way = math.hypot(motion[0], motion[1])
+        keep = 1.0 - share * min(0.1, way / self._config.remembered_m)
+        share /= way + abs(float(motion[2])) + 1e-3  # errors grow with the root of the way
         self._squares = keep * self._squares + share * np.outer(motion, motion)
         self._products = keep * self._products + share * np.outer(motion, found)
         self._matrix = np.linalg.solve(self._squares, self._products)
@@ -81,6 +83,16 @@ class MotionMixture:
     def steps(self) -> Array:
         """Mean motions ``(6, 3)`` as foretold last."""
         return self._steps
+
+    @property
+    def usable(self) -> list[int]:
+        """The hypotheses that can be formed."""
+        return [int(k) for k in np.flatnonzero(self._usable)]
+
+    @property
+    def deviations(self) -> Array:
+        """Deviations ``(6, 2)`` of their motions (m, rad)."""
+        return self._deviations
 
     def foretell(
         self, yaw: float, by_wheels: Array | None, counted: Array | None, gap: float, stands: bool = False
