@@ -38,6 +38,7 @@ def test_the_best_mode_is_that_of_all_poses(seed: int) -> None:
     best, total = two_modes(field, points, window, prior, 0.04, (0.3, 0.1), 3.0)[0]
     cell = CONFIG.cell_m
     totals = {}
+    padded = np.pad(field.levels[0], 100, constant_values=round(255 * CONFIG.unknown))
     for turn in np.arange(-6, 7):
         # The search moves whole cells: points are rounded before they are moved.
         turned = transformed(window.centre + (0.0, 0.0, turn * math.radians(2.0)), points)
@@ -46,7 +47,7 @@ def test_the_best_mode_is_that_of_all_poses(seed: int) -> None:
             for y in range(-10, 11):
                 pose = window.centre + (x * cell, y * cell, turn * math.radians(2.0))
                 rows, columns = (cells[:, 1] + y).astype(int), (cells[:, 0] + x).astype(int)
-                score = field.levels[0][rows, columns].mean() / 255.0
+                score = padded[rows + 100, columns + 100].mean() / 255.0
                 totals[tuple(pose)] = score + 0.04 * prior.logs(pose).max()
     assert total == pytest.approx(max(totals.values()), abs=1e-9)
     np.testing.assert_allclose(best, max(totals, key=lambda pose: totals[pose]), atol=1e-9)

@@ -38,9 +38,7 @@ class Mixture:
 
     def logs(self, pose: Array) -> Array:
         """Logarithm ``(k,)`` of the density of each at a pose ``(3,)``."""
-        way = np.hypot(*(self.means[:, :2] - pose[:2]).T) / self.deviations[:, 0]
-        turn = np.abs(np.remainder(self.means[:, 2] - pose[2] + math.pi, 2.0 * math.pi) - math.pi)
-        result: Array = self.log_weights - 0.5 * (way**2 + (turn / self.deviations[:, 1]) ** 2)
+        result: Array = _logs(self.means, self.deviations, self.log_weights, pose)
         return result
 
 
@@ -96,6 +94,15 @@ def two_modes(
         (np.array((window.centre[0] + x * cell, window.centre[1] + y * cell, wrap(float(headings[int(a)])))), total)
         for total, a, x, y in found
     ]
+
+
+@njit(cache=True)
+def _logs(means: Array, deviations: Array, log_weights: Array, pose: Array) -> Array:
+    result = log_weights.copy()
+    for k in range(len(means)):
+        x, y, turn = means[k, 0] - pose[0], means[k, 1] - pose[1], wrap(means[k, 2] - pose[2])
+        result[k] -= 0.5 * ((x * x + y * y) / deviations[k, 0] ** 2 + (turn / deviations[k, 1]) ** 2)
+    return result
 
 
 @njit(cache=True)

@@ -19,6 +19,9 @@ Field = NDArray[np.uint8]
 _DEPTH = 3
 """Blocks have up to ``2 ** _DEPTH`` cells a side."""
 
+_MARGIN = 2 << _DEPTH
+"""Cells of the field round all that was seen: blocks that begin there may reach into it."""
+
 
 @dataclass(frozen=True)
 class ScoreFieldConfig:
@@ -47,12 +50,17 @@ class RayCounts:
         self.hits = np.zeros((config.side, config.side), np.int16)
         self.passes = np.zeros((config.side, config.side), np.int16)
         self._marks, self._mark = np.zeros((config.side, config.side), np.int32), 0
-        self._levels = np.empty((_DEPTH + 1, config.side, config.side), np.uint8)
         self._kernel = _kernel(config)
+        self._low, self._high = np.full(2, config.side), np.zeros(2, np.int64)  # row and column of what was seen
 
     def add(self, origin: Array, ends: Array, times: int = 1) -> None:
         """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``; ``times`` -1 takes them back."""
         self._mark += 2
+        low, high = (ends.min(axis=0), ends.max(axis=0)) if len(ends) else (origin, origin)
+        both = np.stack((np.minimum(low, origin), np.maximum(high, origin))) - self.corner
+        low, high = np.floor(both[:, ::-1] / self.config.cell_m).astype(np.int64)
+        self._low = np.clip(np.minimum(self._low, low - _MARGIN), 0, self.config.side)
+        self._high = np.clip(np.maximum(self._high, high + _MARGIN + 1), 0, self.config.side)
         _count(
             self.hits, self.passes, self._marks, origin - self.corner, ends - self.corner, self.config.cell_m, times,
             self._mark,
@@ -66,13 +74,17 @@ class RayCounts:
         return result
 
     def field(self, points: Array) -> "ScoreField":
-        """The field with walls at points ``(n, 2)``; it is good until the next one is asked for."""
-        config, levels = self.config, self._levels
-        np.multiply(self.passes <= 0, np.uint8(round(255 * config.unknown)), out=levels[0])
-        _draw(levels[0], points - self.corner, config.cell_m, self._kernel)
+        """The field with walls at points ``(n, 2)``."""
+        config = self.config
+        # What lies outside of all that was seen is unknown, as the field says of what is outside of it.
+        (top, left), (bottom, right) = self._low, self._high
+        levels = np.empty((_DEPTH + 1, bottom - top, right - left), np.uint8)
+        corner = self.corner + config.cell_m * np.array((left, top))
+        np.multiply(self.passes[top:bottom, left:right] <= 0, np.uint8(round(255 * config.unknown)), out=levels[0])
+        _draw(levels[0], points - corner, config.cell_m, self._kernel)
         for h in range(_DEPTH):
             _pool(levels[h], levels[h + 1], 1 << h)
-        return ScoreField(levels, self.corner, config)
+        return ScoreField(levels, corner, config)
 
 
 @dataclass(frozen=True, eq=False)

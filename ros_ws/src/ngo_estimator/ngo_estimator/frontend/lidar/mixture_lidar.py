@@ -188,7 +188,7 @@ class MixtureLidar:
         by_wheels = counted = None
         if self._wheels is not None:
             by_wheels = self._wheels.motion(self._last_s, at_s, self._core.mixture.calibration.matrix)
-            counted = self._wheels.motion(self._last_s, at_s, np.eye(3))
+            counted = self._wheels.counted(self._last_s, at_s)
         sweep = self._sweep(scan, at_s, gap_s)
         key = self._key_scan(scan, sweep)
         again = None if sweep is None else partial(self._swept_again, scan, sweep, gap_s)

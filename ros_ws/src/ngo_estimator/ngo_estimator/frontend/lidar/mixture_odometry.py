@@ -36,6 +36,9 @@ _FAR = 9.0
 _BROAD = 0.15
 """Deviation (m, rad) of the prior under which a mode is registered first."""
 
+_UNKNOWN = np.eye(3)
+"""Information without which the walls may leave a direction open."""
+
 _FEWEST = 12
 """Points without which a scan does not contradict what was seen."""
 
@@ -65,13 +68,19 @@ class ScanEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _Mode:
-    pose: Array
-    covariance: Array
-    walls: Array  # covariance by them alone, along the axes of the last pose
+    found: Registration
     hypothesis: int
     score: float
     total: float
-    fitted: int
+
+    @property
+    def pose(self) -> Array:
+        return self.found.pose
+
+    @property
+    def walls(self) -> Array:
+        """Covariance by the walls alone."""
+        return inverted(self.found.information + _UNKNOWN)
 
 
 class MixtureOdometry:
@@ -125,13 +134,14 @@ class MixtureOdometry:
             pose, covariance = self.mixture.foretold(before, self._covariance)
             self.mixture.take(self.mixture.heaviest, before, pose, covariance, None)
             return self._accepted(scan, pose, covariance, 0.0, True, silent or self._is_gone(pose, covariance), silent)
-        step = between(before, found.pose)
-        self.mixture.learn(step, found.walls)
-        self.mixture.take(found.hypothesis, before, found.pose, found.covariance, found.walls)
+        step, walls = between(before, found.pose), turned_covariance(-before[2], found.walls)
+        covariance = found.found.covariance
+        self.mixture.learn(step, walls)
+        self.mixture.take(found.hypothesis, before, found.pose, covariance, walls)
         self._reckoned = np.zeros(2)
         rate = min(0.1, math.hypot(step[0], step[1]) + abs(step[2])) if self._usual else 1.0
         self._usual += rate * (found.score - self._usual)
-        return self._accepted(scan, found.pose, found.covariance, found.score, False, False, False)
+        return self._accepted(scan, found.pose, covariance, found.score, False, False, False)
 
     def _is_gone(self, pose: Array, covariance: Array) -> bool:
         """Whether too much was dead reckoned to go on: by its way and turn, or by the deviation of where it led."""
@@ -235,12 +245,12 @@ class MixtureOdometry:
             if not any(self._is_same(fit.pose, mode.pose) for mode in modes):
                 modes.append(fit)
         likelihoods = np.exp(np.array([mode.total - modes[0].total for mode in modes]) / weight)
-        covariance = modes[0].covariance
+        covariance = modes[0].found.covariance
         for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
             away = mode.pose - modes[0].pose
             away[2] = wrap(away[2])
             covariance = covariance + share * np.outer(away, away)
-        return replace(modes[0], covariance=covariance)
+        return replace(modes[0], found=replace(modes[0].found, covariance=covariance))
 
     def _is_same(self, a: Array, b: Array) -> bool:
         off = between(a, b)
@@ -289,12 +299,12 @@ class MixtureOdometry:
             information = broad * min(1.0, _FAR / max(squared_deviations(start, mean, broad), 1e-9))
         found = self._icp(scan, start, mean, information, self.config.icp)
         score = self._submap.field.score(points, found.pose)
-        return self._mode(found, hypothesis, score, score + weight * float(prior.logs(found.pose).max()))
+        return _Mode(found, hypothesis, score, score + weight * float(prior.logs(found.pose).max()))
 
     def _sharpened(self, scan: KeyScan, points: Array, mode: _Mode) -> _Mode:
         """A mode registered under the hypothesis that is likeliest there."""
         mixture = self.mixture
-        walls = turned_covariance(self._pose[2], mode.walls)
+        walls = mode.walls
         likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
         if likeliest == mode.hypothesis != ANY:
             return mode
@@ -303,12 +313,7 @@ class MixtureOdometry:
         squared = squared_deviations(mode.pose, mean, inverted(covariance + walls))
         information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
         found = self._icp(scan, mode.pose, mean, information, self._last_steps)
-        return self._mode(found, likeliest, self._submap.field.score(points, found.pose), mode.total)
-
-    def _mode(self, found: Registration, hypothesis: int, score: float, total: float) -> _Mode:
-        walls = inverted(found.information + np.diag((1.0, 1.0, 1.0)))
-        turned = turned_covariance(-self._pose[2], walls)
-        return _Mode(found.pose, found.covariance, turned, hypothesis, score, total, found.fitted)
+        return _Mode(found, likeliest, self._submap.field.score(points, found.pose), mode.total)
 
     def _icp(self, scan: KeyScan, start: Array, mean: Array, information: Array, config: IcpConfig) -> Registration:
         return icp(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
-from ngo_estimator.geometry.planar_motion import Array, all_between, chained, wrap
+from ngo_estimator.geometry.planar_motion import Array, all_between, between, chained, wrap
 
 _KEPT = 1024
 _EXTRAPOLATED_S = 0.5
@@ -96,11 +96,16 @@ class StampedWheels:
         result: Array = chained(steps)[-1]
         return result
 
+    def counted(self, from_s: float, to_s: float) -> Array | None:
+        """The same without calibration."""
+        begin, end = self.pose_at(from_s), self.pose_at(to_s)
+        return None if begin is None or end is None else between(begin, end)
+
     def paused(self, from_s: float, to_s: float, longest_s: float) -> bool:
         """Whether the wheels told nothing for ``longest_s`` between two stamps (s since the epoch)."""
         rows, origin_s = self._rows[: self._count, 0], self._origin_ns * 1e-9
-        between = rows[(rows > from_s - origin_s) & (rows < to_s - origin_s)]
-        ends = np.concatenate(([from_s - origin_s], between, [to_s - origin_s]))
+        inside = rows[(rows > from_s - origin_s) & (rows < to_s - origin_s)]
+        ends = np.concatenate(([from_s - origin_s], inside, [to_s - origin_s]))
         return bool(np.diff(ends).max() > longest_s)
 
     def observe_turn(self, from_s: float, to_s: float, turn_rad: float) -> None:
