@@ -19,7 +19,7 @@ class MixtureConfig:
     first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 2.0, 3.0, 1.0)  # on the deviations below
     least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.3, 0.5, 1.0)
     most_factor: float = 6.0
-    least_weight: float = 0.01
+    least_weight: float = 0.1
     still_m: float = 0.01  # deviation of a motion's position where there is none; it grows with way and turn
     way_share: float = 0.08  # m for each m
     turn_m: float = 0.05  # m for each rad
