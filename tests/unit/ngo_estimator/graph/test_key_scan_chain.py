@@ -9,6 +9,7 @@ from ngo_estimator.data.relative_step import KeyScanStep
 from ngo_estimator.data.state_arrays import Arrays, StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.marginalisation import NeighbourTree
 
 STEP, COVARIANCE = np.array((1.0, 0.0, 0.0)), np.diag((0.1, 0.2, 0.3))
 FLOOR = np.diag((1e-4, 1e-4, 1e-6))
@@ -46,6 +47,22 @@ def test_a_step_in_the_same_key_scans_is_as_sure_as_its_registration() -> None:
     # The motion where another odometry goes on is that of the frames: nothing was registered.
     unknown = straight(joins=True).step_covariance[0]
     np.testing.assert_allclose(np.diagonal(unknown), np.array((0.2, 0.4 + 0.3, 0.6)) + np.diagonal(FLOOR))
+
+
+def test_no_frame_moves_when_nodes_go_and_those_in_the_gap_stay_as_they_were_corrected() -> None:
+    chain, corrected = straight(), np.array(((0.0, 0.0, 0.0), (2.4, 0.3, 0.1), (3.4, 0.2, 0.0)))
+    chain.move(np.arange(3), corrected, FLOOR)
+    frames, end = chain.frame_poses(), chain.newest()
+    bridge = NeighbourTree(np.array(((0, 2),)), corrected[None, 2], COVARIANCE[None])
+    chain.bridge(np.array((True, False, True)), bridge)
+    assert chain.frames.nodes.tolist() == [0, 3] and chain.borders.tolist() == [0, 1]
+    np.testing.assert_allclose(chain.frame_poses(), frames, atol=1e-12)
+    np.testing.assert_allclose(chain.newest()[0], end[0], atol=1e-12)
+    np.testing.assert_allclose(chain.newest()[1], end[1])
+    np.testing.assert_allclose(chain.step_covariance[0], COVARIANCE + FLOOR)
+    # Both ends move together: what was corrected in the gap moves along.
+    chain.move(np.arange(2), np.array(((1.0, 0.0, 0.0), (4.4, 0.2, 0.0))), FLOOR)
+    np.testing.assert_allclose(chain.frame_poses(), frames + (1.0, 0.0, 0.0), atol=1e-12)
 
 
 def test_a_chain_comes_back_from_its_state() -> None:

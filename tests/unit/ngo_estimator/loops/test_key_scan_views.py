@@ -1,4 +1,4 @@
-"""Key scans that look the same way are alike, and forgotten ones are like none."""
+"""Key scans that look the same way are alike."""
 
 import numpy as np
 
@@ -25,15 +25,12 @@ def test_the_key_scan_most_alike_looks_the_same_way() -> None:
     np.testing.assert_allclose(views.at(POSES), ((4.0, 0.0), (-4.0, 0.0), (4.1, 0.0)), atol=1e-12)
     assert views.most_alike(POSES, AHEAD, POSES[1]) == 1
     assert views.most_alike(POSES, AHEAD, POSES[0]) == 0
-    views.forget([0])
-    assert views.most_alike(POSES, AHEAD, POSES[0]) == 2
+    views.thin(np.array((False, True, True)))
+    assert views.most_alike(POSES[1:], AHEAD, POSES[0]) == 1
 
 
 def test_views_of_a_map_leave_those_of_its_first_scans_as_they_are() -> None:
     views, scans = seen(2), [scan(k) for k in range(3)]
-    views.forget([1])
     whole = views.of_map(scans)
-    assert len(whole) == 3 and len(views) == 2
-    whole.forget([2])
-    assert views.forgotten == {1} and whole.forgotten == {1, 2}
-    assert not whole.profiles[1].any() and whole.profiles[0].any()
+    whole.thin(np.array((True, False, True)))
+    assert len(whole) == len(views) == 2 and whole.profiles[1].any()

@@ -27,6 +27,11 @@ class GrowingRows:
         self._buffer[self._used] = row
         self._used += 1
 
+    def set(self, rows: np.ndarray) -> None:
+        """Have these rows instead."""
+        self._buffer = np.concatenate((rows, np.zeros((max(256, len(rows)), *rows.shape[1:]), self._buffer.dtype)))
+        self._used = len(rows)
+
     def state(self) -> Arrays:
         """All rows."""
         return {"rows": self.values.copy()}

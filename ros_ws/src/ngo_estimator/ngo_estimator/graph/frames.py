@@ -7,7 +7,8 @@ import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import require
-from ngo_estimator.geometry.planar_motion import between, compose, frames_between_nodes
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import between, chained, compose, frames_between_nodes
 
 
 class Frames:
@@ -68,6 +69,25 @@ class Frames:
         odometry goes on, the motion that nobody saw is the one that is corrected.
         """
         return frames_between_nodes(nodes, self.odometry, self.nodes, self._joins.values)
+
+    def thin(self, keep: np.ndarray, poses: np.ndarray) -> None:
+        """Let go of the nodes that are not among ``keep`` ``(nodes,)``; the first and the last are.
+
+        Frames around them stay as they lie to each other in ``poses`` ``(frames, 3)``.
+        """
+        frames, nodes = np.arange(len(self)), self.nodes[keep]
+        # The node before each frame, and whether one that goes is between it and the next that stays.
+        reached = np.maximum(np.searchsorted(nodes, frames) - 1, 0)
+        bridged = np.append(np.diff(np.flatnonzero(keep)) > 1, False)
+        relative = se2.between(self.odometry[nodes[reached]], self.odometry)
+        own = bridged[reached]
+        relative[own] = se2.between(poses[nodes[reached[own]]], poses[own])
+        at = chained(relative[nodes[1:]])
+        odometry = se2.compose(at[reached], relative)
+        odometry[nodes] = at
+        self._odometry.set(odometry)
+        self._joins.set(self.joins[~own[self.joins]])
+        self._nodes.set(nodes)
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""

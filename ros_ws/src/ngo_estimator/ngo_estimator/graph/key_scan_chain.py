@@ -10,6 +10,7 @@ from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.graph.marginalisation import NeighbourTree
 from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.sparsification import largest_variances
@@ -33,6 +34,7 @@ class KeyScanChain(NodeChain):
         self._step_variance = GrowingRows((), np.float64)  # the largest of each
         self._segments = GrowingRows((), np.int64)
         self._segments.append(0)
+        self._bridged = GrowingRows((), np.int64)  # nodes to which a step leads over others that are gone
         self._opens = 0  # whether a segment begins at the next node
         self._key_stamp_ns = 0
 
@@ -85,6 +87,38 @@ class KeyScanChain(NodeChain):
         """The same with covariances as they are published."""
         return RelativePoses.of_covariances(self.edges, self._steps.values, self._published_covariance.values)
 
+    @property
+    def borders(self) -> np.ndarray:
+        """The nodes ``(n,)`` from which on scans do not lie together with those before: nobody measured the step there,
+        or nodes before them are gone."""
+        return np.union1d(self.segments, self._bridged.values)
+
+    @property
+    def ends_of_segments(self) -> np.ndarray:
+        """The nodes ``(n,)`` between which nobody measured a step, and the last one: they stay."""
+        return np.concatenate((self.segments, self.segments[1:] - 1, [len(self) - 1]))
+
+    def bridge(self, keep: np.ndarray, bridges: NeighbourTree) -> None:
+        """Let go of nodes, as ``let_go``; ``bridges`` are the steps over the gaps, in their order."""
+        kept = np.flatnonzero(keep)
+        gaps, rows = np.diff(kept) > 1, kept[1:] - 1
+        given, published = self.step_covariance, self._published_covariance.values
+        # By how much deviations are larger as they are published, over each gap.
+        sums = [np.add.reduceat(np.diagonal(of, axis1=1, axis2=2), kept[:-1], axis=0) for of in (published, given)]
+        factors = np.sqrt(sums[0] / sums[1])[gaps]
+        steps, given, published = self._steps.values[rows], given[rows], published[rows]
+        steps[gaps], given[gaps] = bridges.relative, bridges.covariance + self._floor
+        published[gaps] = bridges.covariance * factors[:, :, None] * factors[:, None, :] + self._floor
+        number = np.cumsum(keep) - 1
+        before = self._bridged.values
+        self.let_go(keep)
+        self._steps.set(steps)
+        self._step_covariance.set(given)
+        self._published_covariance.set(published)
+        self._step_variance.set(largest_variances(given))
+        self._segments.set(number[self.segments])
+        self._bridged.set(np.union1d(number[before[keep[before]]], np.flatnonzero(gaps) + 1))
+
     def begin_at(self, stamp_ns: int) -> None:
         """Take the stamp of the first frame, which is a node."""
         self._key_stamp_ns = stamp_ns
@@ -131,7 +165,7 @@ class KeyScanChain(NodeChain):
 
     SAVED = (
         *NodeChain.SAVED, "_steps", "_step_covariance", "_published_covariance", "_step_variance", "_segments",
-        "_opens", "_key_stamp_ns",
+        "_bridged", "_opens", "_key_stamp_ns",
     )  # fmt: skip
 
     def check_state(self) -> None:
@@ -141,4 +175,5 @@ class KeyScanChain(NodeChain):
         of_steps = (self._steps, self._step_covariance, self._published_covariance, self._step_variance)
         require({len(rows) for rows in of_steps} == {keys - 1}, f"there are not {keys} key scans, and a step less")
         require_ascending(self.segments, "_segments", keys)
+        require_ascending(self._bridged.values, "_bridged", keys)
         require(len(self.segments) > 0 and self.segments[0] == 0, "no segment begins at the first key scan")

@@ -78,6 +78,13 @@ class NodeChain:
         self.poses[nodes] = poses
         self._end = end
 
+    def let_go(self, keep: np.ndarray) -> None:
+        """Let go of the nodes that are not among ``keep`` ``(nodes,)``; the first and the last are. No frame moves."""
+        self.frames.thin(keep, self.frame_poses())
+        left, number = keep[self._moved], np.cumsum(keep) - 1
+        self._moved, self._before = number[self._moved[left]], self._before[left]
+        self._poses.set(self.poses[keep])
+
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame, behind the last node by odometry, and its covariance ``(3, 3)``."""
         since = self.frames.since_node

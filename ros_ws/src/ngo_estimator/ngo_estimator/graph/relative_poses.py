@@ -51,6 +51,11 @@ class RelativePoses:
         """Some of these measurements."""
         return RelativePoses(self.nodes[rows], self.relative[rows], self.root[rows])
 
+    def extended(self, others: "RelativePoses") -> "RelativePoses":
+        """These measurements, then the others."""
+        columns = ((self.nodes, others.nodes), (self.relative, others.relative), (self.root, others.root))
+        return RelativePoses(*map(np.concatenate, columns))
+
     def scaled(self, variance: float) -> "RelativePoses":
         """The same with covariances so many times as large."""
         return RelativePoses(self.nodes, self.relative, self.root / np.sqrt(variance))

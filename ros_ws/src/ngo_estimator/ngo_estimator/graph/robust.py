@@ -141,9 +141,7 @@ def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
         rows = rows[: int(_FEWER * len(rows))]
 
 
-def _polished(
-    problem: GraphProblem, poses: np.ndarray, scale: float, loops: int, least_scale: float
-) -> CorrectedGraph:
+def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int, least_scale: float) -> CorrectedGraph:
     """The nearest solution of the truncated cost, with variances so many times as large as stated."""
     scaled = _scaled(problem, scale, scale)
     poses, loop_weights, step_weights = graduate(scaled, poses, _NEAR, steps_break=True)

@@ -1,11 +1,11 @@
 """What is kept of each key scan to find it again: how far it sees in each direction, and where it looks."""
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Sequence
 
 import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.data.state_arrays import Arrays, part, require, taken, taken_indices, taken_integer, under
+from ngo_estimator.data.state_arrays import Arrays, part, require, taken, under
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.loops.walls_seen_through import PROFILE_BINS, range_profile
 
@@ -19,32 +19,25 @@ class KeyScanViews:
     def __init__(self) -> None:
         self._profiles: list[np.ndarray] = []
         self._middles = GrowingRows((2,), np.float64)
-        self._forgotten: set[int] = set()
 
     def __len__(self) -> int:
         return len(self._profiles)
 
     @property
     def profiles(self) -> Sequence[np.ndarray]:
-        """Range profile ``(360,)`` of each; zeros where the scan is gone."""
+        """Range profile ``(360,)`` of each."""
         return self._profiles
-
-    @property
-    def forgotten(self) -> Set[int]:
-        """The keys whose scans are gone."""
-        return self._forgotten
 
     def append(self, scan: KeyScan) -> None:
         """Add the next key scan."""
         self._profiles.append(_profile(scan))
         self._middles.append(_middle(scan.points))
 
-    def forget(self, keys: Iterable[int]) -> None:
-        """Drop what is kept of these keys, whose scans are gone."""
-        nothing = np.zeros(PROFILE_BINS, np.float32)
-        for key in keys:
-            self._profiles[key] = nothing
-            self._forgotten.add(key)
+    def thin(self, keep: np.ndarray) -> None:
+        """Drop what is kept of the key scans that are not among ``keep`` ``(keys,)``."""
+        stays = np.flatnonzero(keep[: len(self)])
+        self._profiles = [self._profiles[key] for key in stays]
+        self._middles.set(self._middles.values[stays])
 
     def of_map(self, scans: Sequence[KeyScan]) -> "KeyScanViews":
         """Those of all key scans of a map, of which these are the first."""
@@ -54,11 +47,10 @@ class KeyScanViews:
             other._middles.append(middle)
         for scan in scans[len(self) :]:
             other._middles.append(_middle(scan.points))
-        other._forgotten = set(self._forgotten)
         return other
 
     def of_keys(self, keys: Sequence[int]) -> "KeyScanViews":
-        """Those of some key scans, none of them forgotten."""
+        """Those of some key scans."""
         other = KeyScanViews()
         other._profiles = [self._profiles[key] for key in keys]
         for key in keys:
@@ -74,34 +66,24 @@ class KeyScanViews:
 
         A scanner does not see what is behind it. ``poses`` ``(keys, 3)`` are those of all key scans.
         """
-        known = np.array([k for k in range(len(poses)) if k not in self._forgotten], np.int64)
         view = _placed(_middle(points)[None], pose[None])
-        away = np.linalg.norm(poses[known, :2] - pose[:2], axis=1)
-        difference = np.linalg.norm(_placed(self._middles.values[known], poses[known]) - view, axis=1)
-        return int(known[(difference + 0.5 * away).argmin()])
+        away = np.linalg.norm(poses[:, :2] - pose[:2], axis=1)
+        difference = np.linalg.norm(_placed(self._middles.values, poses) - view, axis=1)
+        return int((difference + 0.5 * away).argmin())
 
     def state(self) -> Arrays:
         """All that is kept, for ``restore``."""
-        profiles = [profile for key, profile in enumerate(self._profiles) if key not in self._forgotten]
         return {
-            "keys": np.array(len(self._profiles)),
-            "profiles": np.array(profiles, np.float32).reshape(-1, PROFILE_BINS),
+            "profiles": np.array(self._profiles, np.float32).reshape(-1, PROFILE_BINS),
             **under("middles", self._middles.state()),
-            "forgotten": np.array(sorted(self._forgotten), np.int64),
         }
 
     def restore(self, arrays: Arrays) -> None:
         """Take a ``state()``, in place of what is here; raises ``StateError``."""
-        count = taken_integer(arrays, "keys")
+        profiles = taken(arrays, "profiles", np.float32, -1, PROFILE_BINS)
         self._middles.restore(part(arrays, "middles"))
-        require(len(self._middles) == count, f"there are not {count} middles of key scans")
-        forgotten = taken_indices(arrays, "forgotten", count)
-        self._forgotten = set(forgotten.tolist())
-        known = np.setdiff1d(np.arange(count), forgotten)
-        profiles = taken(arrays, "profiles", np.float32, len(known), PROFILE_BINS)
-        self._profiles = [np.zeros(PROFILE_BINS, np.float32)] * count
-        for key, profile in zip(known.tolist(), profiles, strict=True):
-            self._profiles[key] = profile
+        require(len(self._middles) == len(profiles), f"there are not {len(profiles)} middles of key scans")
+        self._profiles = list(profiles)
 
 
 def within(points: np.ndarray, range_m: float) -> np.ndarray:

@@ -57,17 +57,17 @@ def loop_candidates(
     config: ScanLoopConfig, views: KeyScanViews, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]
 ) -> list[LoopCandidate]:
     """Where to look for loops of the last key, best first; see ``ScanLoopFinder.find`` for what is given."""
-    key, forgotten = len(poses) - 1, views.forgotten
+    key = len(poses) - 1
     path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))))
     last = int(np.searchsorted(path, path[-1] - config.least_gap_m)) - config.submap_keys // 2
     last = min(last, key - config.source_keys - config.submap_keys // 2)
     steps = range(0, max(0, last), config.place_step)
-    places = [place for place in steps if place not in forgotten and windows[place, 0] < math.inf]
+    places = [place for place in steps if windows[place, 0] < math.inf]
     if len(places) == 0:
         return []
     seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)
     around = np.array((config.match_m, config.match_m, math.pi))
-    chosen = [LoopCandidate(p, np.zeros(3), around, windows[p]) for p in seen if p not in forgotten]
+    chosen = [LoopCandidate(p, np.zeros(3), around, windows[p]) for p in seen]
     near = nearest_places(
         views.at(poses), poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys,
         most=config.most_per_key,

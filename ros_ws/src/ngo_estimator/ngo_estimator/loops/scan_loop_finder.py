@@ -5,7 +5,7 @@ keys before it are searched in a submap of an earlier key. A loop is accepted wh
 a neighbouring loop agrees. No loop is better than a wrong one.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class ScanLoopFinder:
             scans: of all keys, in their order; each call has one more than the call before, or more.
             poses: of all keys in the map ``(keys, 3)``.
             windows: half widths of the search around each key's pose, as seen from the last ``(keys, 3)`` (m, m, rad).
-            segments: keys with which segments of the map begin; None: there is one.
+            segments: keys from which on scans do not lie together with those before; None: all do.
             matches: earlier keys that look like the last one, best first. They go before those near the pose, and are
                 searched in all directions.
 
@@ -82,9 +82,11 @@ class ScanLoopFinder:
         known, self.loops = len(self.loops), self.loops.extended(loops)
         return np.arange(known, len(self.loops))
 
-    def forget(self, keys: Iterable[int]) -> None:
-        """Look for no more loops at these keys, whose scans are gone."""
-        self.views.forget(keys)
+    def thin(self, keep: np.ndarray, loops: ScanLoops) -> None:
+        """Let go of the keys that are not among ``keep`` ``(keys,)``; ``loops`` are those between the others."""
+        self.views.thin(keep)
+        self._submaps = ScanSubmaps(self.config)
+        self.loops = loops
 
     SAVED = ("views", "loops", "_submaps")
 

@@ -37,11 +37,13 @@ class ScanLoopSelection:
         """Take out for good the loops that ``which`` chooses among rows ``(n,)``; returns how many were used."""
         used = self.rows.copy()
         kept = used[~which(used)]
-        self._used = GrowingRows((), np.int64)
-        for row in kept:
-            self._used.append(row)
-        self.doubted = self.doubted[~which(self.doubted)]
+        self.replace(kept, self.doubted[~which(self.doubted)])
         return len(used) - len(kept)
+
+    def replace(self, used: np.ndarray, doubted: np.ndarray) -> None:
+        """Have these rows instead, as loops are numbered otherwise."""
+        self._used.set(used)
+        self.doubted = doubted
 
     def believed(self, fresh: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> np.ndarray:
         """Those of the newly accepted loops that the graph may use, and of others that have waited.

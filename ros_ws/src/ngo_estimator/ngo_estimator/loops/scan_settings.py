@@ -127,7 +127,7 @@ class ScanGraphConfig:
     step_deg: float = 0.15
     """Deviation added to each step's heading (degrees)."""
     most_scans: int = 4000
-    """Key scans that are kept, about, at least 100; places that many of them show lose some first. Poses stay."""
+    """Key scans from which on, at least 100, old ones leave the graph where newer ones show the same. Poses stay."""
 
     def __post_init__(self) -> None:
         _check(self, "keys_between", "at least 1", lambda x: x >= 1)

@@ -49,7 +49,8 @@ class OwnMap:
         self._config = config
         self._claims = claims or LocalisationConfig()
         self._window = HypothesisWindow(self._claims.window)
-        self._looks = np.zeros(0, np.int64)  # the key scan of each look in the window
+        self.looks = np.zeros(0, np.int64)
+        """The key scan of each look in the window."""
         # The key scans that are searched, and where they lie: parts of the map beside each other.
         self._keys, self._poses = np.zeros(0, np.int64), np.zeros((0, 3))
         self._stale, self._parts = 1, 0  # whether they are to be laid out anew, and of how many parts they are
@@ -67,11 +68,11 @@ class OwnMap:
 
     def fits(self, keys: int) -> bool:
         """Whether all key scans that it names are among the first so many."""
-        return all(bool(((named >= 0) & (named < keys)).all()) for named in (self._looks, self._keys))
+        return all(bool(((named >= 0) & (named < keys)).all()) for named in (self.looks, self._keys))
 
     def _forget_looks(self) -> None:
         self._window.clear()
-        self._looks = self._looks[:0]
+        self.looks = self.looks[:0]
 
     def look(
         self, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain, windows: np.ndarray, parts: np.ndarray
@@ -86,7 +87,6 @@ class OwnMap:
         config, newest = self._config.loops, len(chain) - 1
         first = newest + 1 - config.source_keys
         far = np.flatnonzero(windows[:, 0] >= self._config.windows.most_m)
-        far = far[~np.isin(far, list(views.forgotten))]
         if first < chain.segments[-1] or len(far) < config.submap_keys:
             return ScanLoops.none()
         self._lay_out(far, parts[segment_of(chain.segments, far)], chain.poses)
@@ -95,7 +95,7 @@ class OwnMap:
             return ScanLoops.none()
         source = laid_together(scans[first:], views.profiles[first:], chain.poses[first:])
         self._window.add(matcher.search(source))
-        self._looks = np.append(self._looks, newest)[-self._claims.window :]
+        self.looks = np.append(self.looks, newest)[-self._claims.window :]
         hypotheses, place_m = self._window.hypotheses(), matcher.place_m
         modes = strongest_modes(hypotheses, place_m)
         if not modes:
@@ -109,7 +109,7 @@ class OwnMap:
         evidence = self._evidence(pose, scans, views, chain)
         if evidence.walls < _LEAST_WALLS or evidence.through > _MOST_THROUGH:
             return ScanLoops.none()
-        loops = self._loops(agree, self._looks[hypotheses.look], modes[0].support)
+        loops = self._loops(agree, self.looks[hypotheses.look], modes[0].support)
         self._forget_looks()
         if (loops.pairs[:, 0] < chain.segments[-1]).any():
             self._trial, self._against = _TRIAL_LOOKS, 0
@@ -132,7 +132,6 @@ class OwnMap:
         """
         first, newest = int(chain.segments[-1]), len(chain) - 1
         others = np.flatnonzero(parts[segment_of(chain.segments, np.arange(first))] == parts[-1])
-        others = others[~np.isin(others, list(views.forgotten))]
         if self._trial == 0 or not len(others):
             return False
         last = np.arange(newest + 1 - self._config.loops.source_keys, newest + 1)
@@ -145,6 +144,13 @@ class OwnMap:
         self._trial = self._against = 0
         self._forget_looks()
         return True
+
+    def thin(self, keep: np.ndarray) -> None:
+        """Take that the key scans that are not among ``keep`` ``(keys,)`` are gone."""
+        left, number = keep[self._keys], np.cumsum(keep) - 1
+        self._keys, self._poses = number[self._keys[left]], self._poses[left]
+        self.looks = number[self.looks]
+        self.map_changed()
 
     def map_changed(self) -> None:
         """Lay out the map anew at the next look: scans are gone, or many poses were moved."""
@@ -193,11 +199,11 @@ class OwnMap:
         pairs = np.stack((self._keys[near], later[agree]), axis=1)
         return ScanLoops(pairs, np.stack(relative), np.stack(turned), evidence, np.ones(len(poses), bool))
 
-    SAVED = ("_window", "_looks", "_keys", "_poses", "_stale", "_parts", "_trial", "_against")
+    SAVED = ("_window", "looks", "_keys", "_poses", "_stale", "_parts", "_trial", "_against")
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
-        require(len(self._looks) == len(self._window), f"{len(self._window)} looks are not of as many key scans")
+        require(len(self.looks) == len(self._window), f"{len(self._window)} looks are not of as many key scans")
         require(len(self._keys) == len(self._poses), f"{len(self._keys)} key scans do not have as many poses")
 
 

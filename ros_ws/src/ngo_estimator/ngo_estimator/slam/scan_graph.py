@@ -12,6 +12,7 @@ from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
 from ngo_estimator.graph.key_scan_chain import OPEN, KeyScanChain
+from ngo_estimator.graph.redundant_nodes import redundant_nodes
 from ngo_estimator.graph.relative_poses import BELIEVED, RelativePoses
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.graph.segments import joined_parts, segment_of
@@ -21,6 +22,7 @@ from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
+from ngo_estimator.loops.thinned_loops import without_nodes
 from ngo_estimator.loops.walls_seen_through import profile_rays
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
@@ -136,8 +138,8 @@ class ScanGraph(PoseGraph):
             chain, joining = self._nodes, self._joining_pairs
             distances = graph_distances(chain.poses, joining, self.keys - 1, chain.segments)
             windows = distance_windows(self.config.windows, distances)
-            fresh = self._finder.find(self._scans, chain.poses, windows, segments=chain.segments)
-            self._save_memory()
+            fresh = self._finder.find(self._scans, chain.poses, windows, segments=chain.borders)
+            self._scans.compact()
             believed = self._selection.believed(fresh, self._finder.loops, chain)
             if len(believed):
                 surprises = self._selection.use(believed, self._finder.loops, chain)
@@ -178,20 +180,48 @@ class ScanGraph(PoseGraph):
         last = int(known[-1]) if len(known) else 0  # of the segments that are joined with the first
         return None if last == len(segments) - 1 else int(self._nodes.frames.nodes[segments[last + 1]])
 
-    def _save_memory(self) -> None:
-        """Bound the memory of scans that the finder has seen."""
-        self._scans.compact()
-        most = self.config.most_scans
-        if self._scans.kept > most + most // 10:
-            newest = self.config.loops.submap_keys
-            self._finder.forget(self._scans.forget(self._scans.kept - most, self._nodes.poses, newest))
-            self._own_map.map_changed()
+    def _thin(self) -> None:
+        """Let go of key scans whose places newer ones show; what their edges said goes to their neighbours."""
+        chain, loops, count = self._nodes, self.used_loops, self.keys
+        stays = np.arange(count) >= count - self._newest
+        stays[chain.ends_of_segments] = stays[self._own_map.looks] = True
+        part = self._parts[segment_of(chain.segments, np.arange(count))]
+        leaves = redundant_nodes(chain.poses, chain.borders, part, stays, count - self.config.most_scans)
+        if leaves.any():
+            thinned = without_nodes(chain.poses, chain.steps, loops, self.closed.weight, leaves)
+            found, rows = self._finder.loops, self._selection.rows
+            # Others may still agree with one that comes, where they are new.
+            newest = (found.pairs[:, 1] >= count - self._newest) & ~leaves[found.pairs].any(1)
+            newest[rows] = False
+            unused = np.flatnonzero(newest)
+            number = np.cumsum(~leaves) - 1
+            kept = replace(thinned.loops, pairs=number[thinned.loops.pairs])
+            others = replace(found[unused], pairs=number[found.pairs[unused]])
+            doubted = len(kept) + np.flatnonzero(np.isin(unused, self._selection.doubted))
+            chain.bridge(~leaves, thinned.bridges)
+            self._scans.thin(~leaves)
+            self._finder.thin(~leaves, kept.extended(others))
+            self._selection.replace(np.arange(len(kept)), doubted)
+            self._own_map.thin(~leaves)
+            self._loops_from_nothing = min(self._loops_from_nothing, len(kept))
+            self._close(kept, thinned.weights)
+
+    @property
+    def _newest(self) -> int:
+        """So many of the newest key scans stay: loops to come are measured with them, or agree with theirs."""
+        loops = self.config.loops
+        return max(loops.submap_keys, loops.source_keys, loops.neighbour_keys + 1)
+
+    def _close(self, loops: ScanLoops, weights: np.ndarray) -> None:
+        """Say what is thought of the loops that are used ``(n,)``."""
+        variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
+        self.closed = ClosedLoops(self._nodes.frames.nodes[loops.pairs], loops.relative, np.sqrt(variance), weights)
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
-        return ScanMatcher(
-            self._scans[:], origin.poses(self._nodes.poses.copy()), self._finder.views, self.config.loops
-        )
+        scans, chain = self._scans[:], self._nodes
+        poses = origin.poses(chain.poses.copy())
+        return ScanMatcher(scans, poses, self._finder.views, self.config.loops, borders=chain.borders)
 
     @property
     def used_loops(self) -> ScanLoops:
@@ -236,12 +266,12 @@ class ScanGraph(PoseGraph):
         require_sound(solution.poses, end)
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
         self._nodes.move(np.arange(self.keys), solution.poses, end)
-        weights = solution.loop_weights
-        variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
-        self.closed = ClosedLoops(self._nodes.frames.nodes[loops.pairs], loops.relative, np.sqrt(variance), weights)
+        self._close(loops, solution.loop_weights)
         self._parts = joined_parts(self._nodes.segments, self._joining_pairs)
         if self.largest_move_m > _MOVED_M:
             self._own_map.map_changed()
+        if self.keys > self.config.most_scans + self.config.most_scans // 10:
+            self._thin()
 
     def _corrected(self, poses: np.ndarray, anew: bool = False) -> CorrectedGraph:
         """The solution from these poses ``(keys, 3)`` on; ``anew``, without what the last one believed."""

@@ -36,6 +36,7 @@ class ScanMatcher:
         views: of these scans, or of the first of them.
         config: how a loop is searched and tested.
         reach_m: how far the robot is from one of the map's key scans at most. Anywhere, infinity, costs ten times more.
+        borders: key scans from which on scans do not lie together with those before; None: all do.
     """
 
     place_m = 1.0
@@ -48,12 +49,13 @@ class ScanMatcher:
         views: KeyScanViews,
         config: ScanLoopConfig,
         reach_m: float = math.inf,
+        borders: np.ndarray | None = None,
     ) -> None:
         points = [transformed(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)]
         if sum(map(len, points)) == 0:
             raise ValueError("no key scan of the map has a point; expected a map with walls")
         self._scans, self._poses, self._views = scans, poses, views.of_map(scans)
-        self._config = config
+        self._config, self._borders = config, borders
         self._submaps = ScanSubmaps(config)
         together = np.concatenate(points)
         if reach_m < math.inf:  # a map that grows is made again and again
@@ -124,7 +126,7 @@ class ScanMatcher:
         The tests are those of a loop, but for neighbours and the graph's pose.
         """
         place = self._views.most_alike(self._poses, source.points, expected)
-        submap = self._submaps.around(place, self._scans, self._views.profiles, self._poses)
+        submap = self._submaps.around(place, self._scans, self._views.profiles, self._poses, self._borders)
         found = fit(self._config, submap, source, between(self._poses[place], expected), _AROUND)
         if found is None:
             return None
