@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
@@ -85,7 +86,7 @@ def seen_through(target: PlacedScans, source: PlacedScans, pose: Array) -> float
 
 
 @njit(cache=True)
-def sightings(sensors: Array, profiles: Array, points: Array) -> Array:
+def sightings(sensors: Array, profiles: Array, points: Array) -> NDArray[np.int64]:
     """How many of the sensors ``(s, 3)`` see through each point, and how many see it ``(n, 2)``."""
     seen = np.zeros((len(points), 2), np.int64)
     bins = profiles.shape[1]
