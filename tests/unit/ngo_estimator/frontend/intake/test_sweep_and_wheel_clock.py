@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ngo_estimator.frontend.intake import sweep
 from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
@@ -99,6 +100,20 @@ def test_the_direction_and_the_time_of_a_sweep_are_measured(factor: float, turn_
 
 
 STILL = drive(240)
+
+
+def test_a_sweep_that_is_known_is_seldom_measured_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    fits: list[float] = []
+    fit = sweep._fit
+    monkeypatch.setattr(sweep, "_fit", lambda first, second, time_s: fits.append(time_s) or fit(first, second, time_s))
+    measured, stamp_ns, last, mounting = sweep.MeasuredSweep(), BEGIN_NS, STILL[0], Mounting(SENSOR)
+    scans = [record for record in records(STILL) if isinstance(record, LidarScan)] * 8
+    for number, scan in enumerate(scans):
+        pose = STILL[number % (len(STILL) - 1)]
+        assert measured.correct(replace(scan, stamp_ns=stamp_ns)).time_increment == 0.0
+        measured.observe(stamp_ns, between(last, pose), None, STEP_NS * 1e-9, mounting)
+        stamp_ns, last = stamp_ns + STEP_NS, pose
+    assert 24 <= len(fits) < 0.1 * len(scans)
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 2.0, -1.3, 1.7e9])

@@ -6,8 +6,10 @@ counts as long as nothing contradicts it.
 """
 
 import math
+import statistics
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,8 +44,9 @@ _NEAR = 0.45
 _DILUTED = 0.3
 """Share of its time at which a sweep may be measured: errors of the motion make it shorter, never longer."""
 
-_ONCE_KNOWN = 8
-"""One scan in so many is measured where the sweep is known."""
+_ONCE_KNOWN = 60
+_TRIED = 150
+"""One scan in so many is measured where the sweep is known, or so many others did not tell it."""
 
 _KERNEL_M = 0.03
 _GATES_M = (0.4, 0.4, 0.25, 0.15, 0.15, 0.1)
@@ -52,12 +55,15 @@ _SOURCES, _TARGETS = 160, 480
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    stamp_ns: int
+    scan: LidarScan
+    mounting: Mounting
     pose: Array  # in odom
-    points: Array  # in the base frame, as if the robot stood
-    share: Array  # of the sweep at which each point was measured
-    normals: Array
-    twist: Array | None = None
+    twist: Array
+
+    @cached_property
+    def seen(self) -> tuple[Array, Array, Array]:
+        """Points ``(n, 2)`` in the base frame as if the robot stood, their share of the sweep, and normals."""
+        return _seen(self.scan, self.mounting)
 
 
 class MeasuredSweep:
@@ -72,16 +78,13 @@ class MeasuredSweep:
         """Factor on the driver's times."""
         self._last_ns: int | None = None
         self._gaps: deque[float] = deque(maxlen=30)
+        self._period_s = 0.0
         self._scans: dict[int, LidarScan] = {}
         self._taken: deque[_Taken] = deque(maxlen=_KEPT + 2)
         self._pose = np.zeros(3)
         self._found: deque[tuple[float, float]] = deque(maxlen=_PAIRS)
-        self._count = 0
-
-    @property
-    def period_s(self) -> float:
-        """From scan to scan (s); 0 where it is not known."""
-        return float(np.median(self._gaps)) if len(self._gaps) > 2 else 0.0
+        self._since = self._tried = 0
+        self._known = False
 
     def interrupt(self) -> None:
         """What comes is not measured against what came; what was learned stays."""
@@ -92,12 +95,14 @@ class MeasuredSweep:
     def forget(self) -> None:
         """Measure anew: the motions that it was measured by were wrong."""
         self._found.clear()
+        self._tried, self._known = 0, False
         self.reversed, self.known_s = False, None
 
     def correct(self, scan: LidarScan) -> LidarScan:
         """The scan with its rays in the order in which they were measured, and with their time."""
         if self._last_ns is not None and scan.stamp_ns > self._last_ns:
             self._gaps.append((scan.stamp_ns - self._last_ns) * 1e-9)
+            self._period_s = statistics.median(self._gaps) if len(self._gaps) > 2 else 0.0
         self._last_ns = scan.stamp_ns
         self._scans[scan.stamp_ns] = scan
         while len(self._scans) > 4 * _KEPT:
@@ -124,7 +129,7 @@ class MeasuredSweep:
 
     def _given_s(self, scan: LidarScan) -> float:
         """The time of the sweep as the driver says it, in a unit in which it can be; else 0."""
-        given_s, period_s = scan.time_increment * len(scan.ranges), self.period_s
+        given_s, period_s = scan.time_increment * len(scan.ranges), self._period_s
         if given_s == 0.0 or period_s == 0.0:
             return given_s
         for unit in _UNITS:
@@ -135,6 +140,11 @@ class MeasuredSweep:
 
     def observe(self, stamp_ns: int, step: Array, motion: Array | None, elapsed_s: float, mounting: Mounting) -> None:
         """Take the motion ``(3,)`` that led to a scan: by the scans, and by the wheels where there are any."""
+        self._since += 1
+        every = _ONCE_KNOWN if self._known or self._tried > _TRIED else 2
+        if self._since < every - _KEPT:
+            self._taken.clear()
+            return
         self._pose = compose(self._pose, step)
         scan = self._scans.get(stamp_ns)
         if scan is None or elapsed_s <= 0.0:
@@ -143,12 +153,11 @@ class MeasuredSweep:
         velocity = (step if motion is None else motion) / elapsed_s
         if self._taken:  # the robot moved so before and after the scan before
             last = self._taken.pop()
-            before = velocity if last.twist is None else last.twist
-            self._taken.append(replace(last, twist=0.5 * (before + velocity)))
-            self._count += 1
-            if self._count % (_ONCE_KNOWN if len(self._found) >= 3 * _FEWEST else 2) == 0:
+            self._taken.append(replace(last, twist=0.5 * (last.twist + velocity)))
+            if self._since >= every:
+                self._since = 0
                 self._measure()
-        self._taken.append(_taken(scan, self._pose, mounting, velocity))
+        self._taken.append(_Taken(scan, mounting, self._pose, velocity))
 
     def remark(self) -> str:
         """What the driver says wrongly of the sweep, in words; nothing where it is right."""
@@ -160,16 +169,11 @@ class MeasuredSweep:
         return f"its times from ray to ray are taken times {self.unit:g}" if self.unit != 1.0 else ""
 
     def _measure(self) -> None:
-        newest, period_s = self._taken[-1], self.period_s
+        newest, period_s = self._taken[-1], self._period_s
         best, bend = None, _LEAST_BEND_M
         for other in list(self._taken)[:-1]:
             off = between(other.pose, newest.pose)
-            if (
-                math.hypot(off[0], off[1]) > _FAR_M
-                or abs(off[2]) > _FAR_RAD
-                or other.twist is None
-                or newest.twist is None
-            ):
+            if math.hypot(off[0], off[1]) > _FAR_M or abs(off[2]) > _FAR_RAD:
                 continue
             change = np.abs(newest.twist - other.twist)
             size = period_s * (math.hypot(change[0], change[1]) + 3.0 * change[2])
@@ -177,7 +181,8 @@ class MeasuredSweep:
                 best, bend = other, size
         if best is None:
             return
-        start_s = abs(self._given_s(self._scans[newest.stamp_ns])) or period_s
+        self._tried += 1
+        start_s = abs(self._given_s(newest.scan)) or period_s
         fits = [fit for sign in (1.0, -1.0) if (fit := _fit(best, newest, sign * start_s)) is not None]
         if fits:
             cost, time_s, deviation_s = min(fits)
@@ -189,26 +194,27 @@ class MeasuredSweep:
         if len(self._found) < _FEWEST:
             return
         times, deviations = np.array(self._found).T
-        weights = 1.0 / (deviations**2 + (0.1 * self.period_s) ** 2)
+        weights = 1.0 / (deviations**2 + (0.1 * self._period_s) ** 2)
         order = np.argsort(times)
         share = np.cumsum(weights[order]) / weights.sum()
         low, measured, high = np.interp((0.25, 0.5, 0.75), share, times[order])
         spread = max(0.74 * (high - low), float(1.0 / math.sqrt(weights.sum() / len(times)))) / math.sqrt(len(times))
-        scan = self._scans[self._taken[-1].stamp_ns]
+        scan = self._taken[-1].scan
         believed_s = self._time_s(scan)
-        if abs(measured - believed_s) < max(_DEVIATIONS * spread, _OFF * self.period_s):
+        self._known = _DEVIATIONS * spread < _OFF * self._period_s  # more of them would decide the same
+        if abs(measured - believed_s) < max(_DEVIATIONS * spread, _OFF * self._period_s):
             return
         if believed_s != 0.0 and _DILUTED <= measured / believed_s <= 1.0:
             return
         given_s = self._given_s(scan)
-        full_s = self.period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
-        near = [t for t in (given_s, -given_s, full_s, -full_s, 0.0) if abs(t - measured) < _NEAR * self.period_s]
+        full_s = self._period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
+        near = [t for t in (given_s, -given_s, full_s, -full_s, 0.0) if abs(t - measured) < _NEAR * self._period_s]
         known_s = near[0] if near else float(measured)
         self.reversed = known_s == -given_s
         self.known_s = None if abs(known_s) == abs(given_s) else known_s
 
 
-def _taken(scan: LidarScan, pose: Array, mounting: Mounting, twist: Array) -> _Taken:
+def _seen(scan: LidarScan, mounting: Mounting) -> tuple[Array, Array, Array]:
     angles, ranges = scan.angles, scan.ranges.astype(np.float64)
     largest = scan.range_max if 0.0 < scan.range_max < math.inf else 1000.0
     seen = np.flatnonzero((ranges > max(scan.range_min, 0.0)) & (ranges < largest))
@@ -225,21 +231,20 @@ def _taken(scan: LidarScan, pose: Array, mounting: Mounting, twist: Array) -> _T
         across = np.stack((-unit[:, 1], unit[:, 0]), axis=-1)
         flat = close & (np.abs((middle * across).sum(axis=1)) < 0.03)
         normals[2:-2][flat] = across[flat]
-    return _Taken(scan.stamp_ns, pose, points, seen / max(len(scan.ranges), 1), normals, twist)
+    return points, seen / max(len(scan.ranges), 1), normals
 
 
 def _fit(first: _Taken, second: _Taken, time_s: float) -> tuple[float, float, float] | None:
     """Mean cost of the registration, the time of the sweep (s) and its deviation, from a first guess of it."""
-    assert first.twist is not None and second.twist is not None
-    on_line = np.flatnonzero(first.normals.any(axis=1))
+    (target, target_share, normal), (source, source_share, _) = first.seen, second.seen
+    on_line = np.flatnonzero(normal.any(axis=1))
     on_line = on_line[:: max(1, len(on_line) // _TARGETS)]
-    chosen = np.arange(0, len(second.points), max(1, len(second.points) // _SOURCES))
+    chosen = np.arange(0, len(source), max(1, len(source) // _SOURCES))
     if len(on_line) < 30 or len(chosen) < 30:
         return None
-    target, normal = first.points[on_line], first.normals[on_line]
-    source = second.points[chosen]
-    target_rate = first.share[on_line, None] * _velocities(first.twist, target)
-    source_rate = second.share[chosen, None] * _velocities(second.twist, source)
+    target, normal, source = target[on_line], normal[on_line], source[chosen]
+    target_rate = target_share[on_line, None] * _velocities(first.twist, target)
+    source_rate = source_share[chosen, None] * _velocities(second.twist, source)
     pose, cost, information, noise = between(first.pose, second.pose), math.inf, 0.0, 1.0
     for gate in _GATES_M:
         there, here = target + time_s * target_rate, source + time_s * source_rate
