@@ -43,5 +43,14 @@ if [ "$(cat "$VENV/ngo_underlay")" = wheels ]; then
     # A workaround for the wheels' CMake files.
     cmake_args+=("-DCMAKE_PROJECT_INCLUDE=$ROOT/ros_ws/wheels/drop_missing_python_includes.cmake")
 fi
-step "build the workspace" colcon build --symlink-install --base-paths "${paths[@]}" --cmake-args "${cmake_args[@]}"
+skipped=()
+[ "$(find_purpose)" = all ] || skipped=(--packages-skip ngo_sim)  # which needs libraries that a lidar does not
+step "build the workspace" colcon build --symlink-install --base-paths "${paths[@]}" "${skipped[@]}" \
+    --cmake-args "${cmake_args[@]}"
+# What was compiled lies beside the modules, which are linked.
+unset NGO_ENV_UNDERLAY_ONLY
+. "$ROOT/env.sh"
+weights=()
+[ "$(find_purpose)" = lidar ] || weights=(src/ngo_estimator/weights/maze{2d,3d})
+step "compile what estimators run" env OMP_NUM_THREADS=1 "$VENV/bin/python" -m ngo_estimator.offline.compile_ahead "${weights[@]}"
 echo "$key" >install/ngo_key

@@ -54,6 +54,17 @@ find_underlay() {
     fi
 }
 
+# Prints what .venv is for: `lidar`, without PyTorch and the simulators, or `all`. What make was told (FOR=) comes before
+# what .venv was made for.
+find_purpose() {
+    local purpose="${FOR-}"
+    [ -n "$purpose" ] || purpose="$(cat "$VENV/ngo_for" 2>/dev/null || echo all)"
+    case "$purpose" in
+    all | lidar) echo "$purpose" ;;
+    *) die "FOR=$purpose was asked for; expected 'lidar' (no PyTorch, no simulators) or 'all'" ;;
+    esac
+}
+
 # Prints the interpreter to make .venv with: $PYTHON if given, python3 if it fits, else the newest on PATH that does.
 # An installed ROS 2 has compiled parts for the system's own python3, so that is the one there.
 find_python() {

@@ -7,8 +7,12 @@ set -euo pipefail
 
 cd "$ROOT/requirements"
 command -v uv >/dev/null || die "lock: there is no uv on PATH"
-whole="$(mktemp)"
-trap 'rm -f "$whole"' EXIT
-uv pip compile --universal --python-version 3.10 --no-python-downloads --generate-hashes --no-header --no-annotate \
-    --quiet --output-file "$whole" ros.txt runtime.txt test.txt
-python3 "$ROOT/scripts/split_lock.py" "$whole" "$@"
+made="$(mktemp -d)"
+trap 'rm -rf "$made"' EXIT
+compile() { # OUTPUT REQUIREMENTS...
+    uv pip compile --universal --python-version 3.10 --no-python-downloads --no-header --no-annotate --quiet \
+        --output-file "$@"
+}
+compile "$made/whole" --generate-hashes ros.txt runtime.txt test.txt
+compile "$made/lidar" ros.txt lidar.txt
+python3 "$ROOT/scripts/split_lock.py" "$made/whole" "$made/lidar" "$@"

@@ -42,7 +42,9 @@ fi
 
 if [ ! -d "$VENV" ]; then
     free_mib="$(df -Pm "$ROOT" | awk 'NR == 2 {print $4}')"
-    [ "$free_mib" -ge 4096 ] || lack "4 GiB of free disk space for .venv: $ROOT has $free_mib MiB"
+    need_mib=4096
+    [ "$(find_purpose)" = all ] || need_mib=1024
+    [ "$free_mib" -ge "$need_mib" ] || lack "$need_mib MiB of free disk space for .venv: $ROOT has $free_mib MiB"
 fi
 
 [ "$missing" = 0 ] || die "the tools listed above are missing"

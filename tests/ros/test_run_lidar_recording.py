@@ -4,6 +4,7 @@ import gzip
 import json
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,27 @@ from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 pytestmark = pytest.mark.processes
 
 ROS2 = Path(__file__).parents[2] / "tools" / "ros2"
+LEFT_OUT = ("gymnasium", "lightning", "networkx", "pymunk", "stable_baselines3", "torch", "tqdm", "vizdoom")
 ANGLES = np.radians(np.arange(-90.0, 91.0))
+
+
+# Compiles as `make build` does, runs the command, and prints what that compiled or loaded besides.
+COMPILED_AHEAD = """
+import sys
+from numba.core.registry import CPUDispatcher
+from ngo_estimator.offline import compile_ahead
+
+def compiled():
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("ngo_estimator")]
+    found = {f for module in modules for f in vars(module).values() if isinstance(f, CPUDispatcher)}
+    return {f"{f.__module__}.{f.__name__}{signature}" for f in found for signature in f.signatures}
+
+compile_ahead.main([])
+before = compiled()
+from ngo_estimator.nodes import run_recording
+run_recording.main()
+print("compiled besides:", sorted(compiled() - before))
+"""
 
 
 def carmen_log(path: Path) -> np.ndarray:
@@ -36,16 +57,56 @@ def carmen_log(path: Path) -> np.ndarray:
     return np.array(poses[:-1])
 
 
-def run_recording(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [str(ROS2), "run", "ngo_estimator", "run_recording", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=170, env={**os.environ, "COLUMNS": "200"})
+def run(*words: object, python_path: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """A command whose Python looks into ``python_path`` first."""
+    paths = [*([str(python_path)] if python_path else []), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "COLUMNS": "200", "PYTHONPATH": os.pathsep.join(paths)}
+    return subprocess.run([*map(str, words)], capture_output=True, text=True, timeout=170, env=environment)
 
 
-def test_a_carmen_log_without_named_weights(tmp_path: Path) -> None:
-    true = carmen_log(tmp_path / "drive.clf.gz")
+def run_recording(*arguments: object, python_path: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return run(ROS2, "run", "ngo_estimator", "run_recording", *arguments, python_path=python_path)
+
+
+@pytest.fixture
+def for_lidar(tmp_path: Path) -> Path:
+    """A folder that hides what `make venv FOR=lidar` leaves out, where Python looks into it first."""
+    folder = tmp_path / "hidden"
+    folder.mkdir()
+    for name in LEFT_OUT:
+        (folder / f"{name}.py").write_text(f"raise ModuleNotFoundError('hidden: {name}', name='{name}')\n")
+    return folder
+
+
+def test_nodes_of_a_lidar_need_no_networks(for_lidar: Path) -> None:
+    modules = ("local_node", "lidar_input", "ngo_node", "ngo_map", "view_node", "run_recording", "recorded_output")
+    lines = [f"import ngo_estimator.nodes.{module}" for module in (*modules, "join_sessions", "optimize_graph")]
+    lines += [
+        "from ngo_estimator.frontend.lidar.front_ends import load_front_end",
+        "from ngo_estimator.nodes.run_recording import get_package_share_directory as share, Path",
+        "from ngo_estimator.slam.scan_trajectory import ScanTrajectory",
+        "folder = Path(share('ngo_estimator'), 'weights', 'scan')",
+        "print(load_front_end(folder, 'scan'), ScanTrajectory.load(folder, 'scan'))",
+    ]
+    done = run(sys.executable, "-c", "\n".join(lines), python_path=for_lidar)
+    assert done.returncode == 0 and "Trajectory" in done.stdout, done.stderr
+    for node, options in (("local_node", ("-p", "world:=maze2d")), ("ngo_node", ("-p", "world:=maze3d"))):
+        done = run(ROS2, "run", "ngo_estimator", node, "--ros-args", *options, python_path=for_lidar)
+        assert done.returncode != 0 and "PyTorch is not installed" in done.stderr, done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_carmen_log_without_named_weights(tmp_path: Path, for_lidar: Path) -> None:
+    """The first time nothing is left to compile. The second time what a lidar does not need is not there."""
+    log = tmp_path / "drive.clf.gz"
+    true = carmen_log(log)
     outputs = []
     for name in ("first", "again"):
-        done = run_recording(tmp_path / "drive.clf.gz", "--out", tmp_path / name)
+        if name == "first":
+            done = run(sys.executable, "-c", COMPILED_AHEAD, log, "--out", tmp_path / name)
+            assert "compiled besides: []" in done.stdout, done.stdout + done.stderr
+        else:
+            done = run_recording(log, "--out", tmp_path / name, python_path=for_lidar)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "Traceback" not in done.stderr and "wheel" in done.stdout
         outputs.append([(tmp_path / name / file).read_bytes() for file in ("corrected.tum", "map.pgm", "map.yaml")])
@@ -62,6 +123,14 @@ def test_a_carmen_log_without_named_weights(tmp_path: Path) -> None:
     picture = (tmp_path / "first" / "plot.png").read_bytes()
     width, height = (int.from_bytes(picture[at : at + 4], "big") for at in (16, 20))
     assert picture.startswith(b"\x89PNG") and width > 2.2 * height  # a panel each: odometry, corrected, walls
+
+
+def test_images_without_pytorch_are_one_line(tmp_path: Path, for_lidar: Path) -> None:
+    carmen_log(tmp_path / "drive.clf.gz")
+    arguments = (tmp_path / "drive.clf.gz", "--world", "maze2d", "--out", tmp_path / "out")
+    done = run_recording(*arguments, python_path=for_lidar)
+    (line,) = done.stderr.strip().splitlines()
+    assert done.returncode == 2 and "PyTorch is not installed: run make venv FOR=all" in line
 
 
 def test_a_damaged_log_is_one_line(tmp_path: Path) -> None:

@@ -86,11 +86,14 @@ def test_a_package_declares_what_it_imports_and_no_more(name: str, monkeypatch: 
     assert declared_for_ros(folder) == of_ros | ros_packages_in_launch_files(folder) - forwarded - {name}
     of_pip = {module if module in SOURCES else distribution(module) for module in imported if not is_of_ros(module)}
     declared = setup_of(folder, monkeypatch)
-    on_request = set(declared["extras_require"].get("view", []))
-    assert set(declared.get("install_requires", [])) == of_pip - on_request
-    assert on_request <= of_pip & required("view.txt") - required("runtime.txt", "test.txt")
-    of_pip -= on_request
-    assert of_pip - set(SOURCES) <= required("runtime.txt"), "requirements/runtime.txt has all that is imported"
+    view, networks = (set(declared["extras_require"].get(extra, [])) for extra in ("view", "networks"))
+    assert set(declared.get("install_requires", [])) == of_pip - view - networks
+    assert view <= of_pip & required("view.txt") - required("lidar.txt", "runtime.txt", "test.txt")
+    assert networks <= of_pip & required("runtime.txt")
+    needed, files = of_pip - view - networks - set(SOURCES), ["lidar.txt"]
+    if name == "ngo_sim":  # which a robot does not need
+        files.append("runtime.txt")
+    assert needed <= required(*files), f"{files} have all that is imported"
 
 
 def test_programs_import_what_the_requirements_have() -> None:
@@ -99,7 +102,7 @@ def test_programs_import_what_the_requirements_have() -> None:
     local = {path.stem for path in (ROOT / "tests").rglob("*.py")} | OWN
     modules = {module for module in imported - local if not is_of_ros(module)}
     names = {distribution(module) for module in modules}
-    assert names <= required("runtime.txt", "test.txt", "build.txt")
+    assert names <= required("lidar.txt", "runtime.txt", "test.txt", "build.txt")
 
 
 def pins(*files: str) -> set[tuple[str, str, str]]:
@@ -115,23 +118,31 @@ def pins(*files: str) -> set[tuple[str, str, str]]:
 
 def test_every_pin_is_locked_with_hashes_and_nothing_else_is() -> None:
     """`make venv` installs the locked files alone, each of whose packages needs the hashes of its files."""
-    locked = pins("locked", "locked_ros", "locked_gpu")
-    given = pins("constraints", "runtime", "test", "build", "ros")
+    locked = pins("locked", "locked_lidar", "locked_ros", "locked_gpu")
+    given = pins("constraints", "lidar", "runtime", "test", "build", "ros")
     assert given - locked == set(), "run scripts/lock.sh"
     windows = {"coloredlogs", "humanfriendly", "pyreadline3", "pywin32"}
     libraries = {package for package, *_ in pins("locked_gpu")}  # of PyTorch's build for GPUs
     assert {package for package, *_ in locked - given} <= windows | libraries, (
         "run scripts/lock.sh, and add them to constraints.txt"
     )
-    for name in ("locked", "locked_ros", "locked_gpu", "locked_cpu"):
+    for name in ("locked", "locked_lidar", "locked_ros", "locked_gpu", "locked_cpu"):
         entries = re.split(r"(?m)^(?=\w)", (ROOT / "requirements" / f"{name}.txt").read_text())[1:]
         assert entries and all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries), name
+
+
+def test_the_container_is_made_as_the_documents_say() -> None:
+    container, contributing = ((ROOT / name).read_text() for name in ("Dockerfile", "CONTRIBUTING.md"))
+    needed = {"python3", "python3-venv", "python3-dev", "g++", "cmake", "git", "make"}
+    for text in (container, contributing, (ROOT / ".ci/run").read_text()):
+        assert needed <= set(re.findall(r"[\w+-]+", text))
+    assert "RUN make build FOR=$FOR" in container and 'CMD ["make", "demo"]' in container
 
 
 def test_licences_of_all_requirements_are_listed_and_the_gpl_stays_in_the_tests() -> None:
     page = (ROOT / "docs" / "reference" / "licences.md").read_text()
     listed = set(re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE))
-    assert required("runtime.txt", "test.txt", "build.txt") <= listed
+    assert required("lidar.txt", "runtime.txt", "test.txt", "build.txt") <= listed
     outside = [*SOURCES.values(), *(ROOT / folder for folder in PROGRAMS if folder != "tests")]
     assert not [folder for folder in outside if "evo" in imports_below(folder)]
     assert "evo" in imports_below(ROOT / "tests"), "otherwise this test says nothing"

@@ -29,7 +29,6 @@ setup(
         "rosbags",
         "safetensors",
         "scipy",
-        "torch",
         "tyro",
     ],
     zip_safe=False,
@@ -37,7 +36,8 @@ setup(
     maintainer_email="maintainers@ngo.invalid",
     description="Local odometry and the Neural Graph Optimizer, and the nodes that run them.",
     license="Apache-2.0",
-    extras_require={"test": ["pytest"], "view": ["rerun-sdk"]},
+    # A lidar needs no networks.
+    extras_require={"networks": ["torch"], "test": ["pytest"], "view": ["rerun-sdk"]},
     entry_points={
         "console_scripts": [
             "join_sessions = ngo_estimator.nodes.join_sessions:main",

@@ -1,6 +1,7 @@
 """The file ``lidar.json`` in a folder of weights: it says that a lidar's estimators are run, and their settings."""
 
 import json
+from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,6 +22,16 @@ class LidarFileError(ValueError):
 def is_lidar(weights: Path) -> bool:
     """Whether the folder holds the settings of a lidar's estimators, and no networks of its own."""
     return (weights / LIDAR_FILE).is_file()
+
+
+def require_torch() -> None:
+    """Raise ``ValueError`` where PyTorch is not installed, which all weights but a lidar's need."""
+    try:
+        import_module("torch")
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            "these weights are networks, and PyTorch is not installed: run make venv FOR=all, or pip install torch"
+        ) from error
 
 
 def read_lidar_file(weights: Path, section: str, kind: type[Config], world: str | None = None) -> Config:

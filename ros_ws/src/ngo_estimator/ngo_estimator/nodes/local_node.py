@@ -17,7 +17,7 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import StartError, run_node
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
-from ngo_estimator.data.lidar_file import is_lidar
+from ngo_estimator.data.lidar_file import is_lidar, require_torch
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
@@ -68,6 +68,10 @@ class LocalNode(Node):
             raise StartError(
                 f"parameter 'robot_odometry' is '{settings.robot_odometry}'; expected 'none': these weights take images"
             )
+        try:
+            require_torch()
+        except ValueError as error:
+            raise StartError(str(error)) from error
         from ngo_estimator.nodes.image_input import ImageInput
 
         return ImageInput(self, settings, self._publish)

@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ngo_common.files import folder_whole
-from ngo_estimator.data.lidar_file import is_lidar
+from ngo_estimator.data.lidar_file import is_lidar, require_torch
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.nodes.command import run_command
 from ngo_estimator.offline.compiling import compiling
@@ -240,6 +240,7 @@ def _write(
 def _networks(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":
     """Networks for images or resampled scans."""
     # Imported here because torch takes seconds: a file that is not there is said at once.
+    require_torch()
     import torch
 
     from ngo_estimator.frontend.camera.local_odometry import LocalOdometry

@@ -8,7 +8,7 @@ from ament_index_python.packages import get_package_share_directory
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from ngo_common.nodes.process import StartError
-from ngo_estimator.data.lidar_file import is_lidar
+from ngo_estimator.data.lidar_file import is_lidar, require_torch
 from ngo_estimator.nodes.settings import EstimatorSettings, NgoNodeSettings, StepSettings
 from ngo_estimator.offline.compiling import compiling
 
@@ -29,11 +29,12 @@ def weights_folder(settings: StepSettings) -> Path:
 def load_core(load: Callable[[Path, str], Core], settings: EstimatorSettings) -> Core:
     """Load a core as ``settings`` say; raises ``StartError`` where its weights cannot be used."""
     folder = weights_folder(settings)
-    if not is_lidar(folder):
-        import torch
-
-        torch.set_num_threads(settings.threads)
     try:
+        if not is_lidar(folder):
+            require_torch()
+            import torch
+
+            torch.set_num_threads(settings.threads)
         return load(folder, settings.world)
     except ValueError as error:
         raise StartError(str(error)) from error
