@@ -22,8 +22,8 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes.messages import to_ns, to_time, transform_message
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.association import ros_pose
+from ngo_recordings.laser_scan import scan_of
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.scan_stream import scan_of
 from ngo_recordings.transform_buffer import TransformBuffer
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 

@@ -54,6 +54,31 @@ def compressed(stamp_ns: int, pixels: np.ndarray, kind: str, quality: int = 95) 
     return make("sensor_msgs/msg/CompressedImage", header(stamp_ns), f"rgb8; {kind} compressed", data)
 
 
+def cloud(
+    stamp_ns: int,
+    fields: dict[str, np.ndarray],
+    frame: str = "lidar",
+    height: int = 1,
+    padding: int = 0,
+    big: bool = False,
+) -> Any:
+    """A PointCloud2 whose fields ``(points,)`` lie one after the other, with ``padding`` bytes behind each point."""
+    codes = {"f4": 7, "f8": 8, "u2": 4, "u4": 6}
+    order = ">" if big else "<"
+    kind = np.dtype([(name, order + values.dtype.str[1:]) for name, values in fields.items()] + [("", f"V{padding}")])
+    points = np.zeros(len(fields["x"]), kind)
+    for name, values in fields.items():
+        points[name] = values
+    described = [
+        make("sensor_msgs/msg/PointField", name, kind.fields[name][1], codes[values.dtype.str[1:]], 1)
+        for name, values in fields.items()
+    ]
+    width, step = len(points) // height, kind.itemsize
+    data = np.frombuffer(points.tobytes(), np.uint8)
+    values = (height, width, described, big, step, step * width, data, True)
+    return make("sensor_msgs/msg/PointCloud2", header(stamp_ns, frame), *values)
+
+
 def scan(stamp_ns: int, ranges: np.ndarray, angle_min: float = -1.0, increment: float = 0.5, high: float = 10.0) -> Any:
     angle_max = angle_min + (len(ranges) - 1) * increment
     values = (angle_min, angle_max, increment, 0.0, 0.1, 0.05, high)

@@ -11,11 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ngo_recordings.errors import RecordingError
+from ngo_recordings.laser_scan import LidarScan, scan_angles
 from ngo_recordings.lidar_description import describe_lidar
 from ngo_recordings.mounting import find_mounting
 from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import open_recording
-from ngo_recordings.scan_stream import BAD_SCAN, BAD_WHEELS, LidarScan, WheelPose, scan_angles, scan_stream
+from ngo_recordings.scan_stream import BAD_SCAN, BAD_WHEELS, WheelPose, scan_stream
 from ngo_recordings.topics import GroundTruth, RecordingTopics, TopicArguments, WheelSource, choose_topics
 
 from . import messages as m

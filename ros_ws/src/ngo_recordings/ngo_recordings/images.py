@@ -15,7 +15,9 @@ from ngo_recordings.errors import RecordingError
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 SENSOR_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE, SCAN_TYPE)
+"""Of messages that networks take."""
 
 MAX_PIXELS = 2**25
 """Most pixels of a picture that is decoded where its size is not known, 8K video: a few bytes may declare any size."""
@@ -76,6 +78,8 @@ def picture(
         RecordingError: an encoding that is not supported, data of another size than the message says, or a compressed
             picture that is too large.
     """
+    if type_name not in SENSOR_TYPES:
+        raise RecordingError(f"topic {topic} is {type_name}; expected {', '.join(SENSOR_TYPES)}")
     if type_name == SCAN_TYPE:
         return _scan(message, topic)
     if type_name == COMPRESSED_TYPE:

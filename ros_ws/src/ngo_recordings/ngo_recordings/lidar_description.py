@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
 
 import numpy as np
 
-from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import SCAN_TYPE
+from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
+from ngo_recordings.laser_scan import LidarScan, ScanAngles, scan_angles
 from ngo_recordings.mounting import Mounting, find_mounting
 from ngo_recordings.recording import Recording
-from ngo_recordings.scan_stream import ScanAngles, scan_angles
+from ngo_recordings.space_scan import scan_reader
 from ngo_recordings.topics import RecordingTopics, WheelSource, wheel_candidates
 
 _LOOK = 200
@@ -68,30 +67,34 @@ class LidarDescription:
         ]
 
 
-def _first_scans(recording: Recording, topic: str) -> tuple[list[Any], ScanAngles, int]:
-    """The first usable scans, the angles of the first one, and how many beside them are damaged."""
-    usable, angles, damaged, last_error = [], None, 0, RecordingError(f"topic {topic} has no message")
+def _first_scans(recording: Recording, topic: str) -> tuple[LidarScan, ScanAngles, list[int], int]:
+    """The first usable scan, its angles, the stamps of the first ones, and how many beside them are damaged."""
+    first, angles, damaged, last_error = None, None, 0, RecordingError(f"topic {topic} has no message")
+    read, stamps = scan_reader(recording, topic), []
     for message in islice(recording.messages([topic]), _LOOK):
         try:
-            found = scan_angles(message.value, topic)
-            header_stamp_ns(message.value)
+            scan = read(message.value)
         except RecordingError as error:
             damaged, last_error = damaged + 1, error
             continue
-        usable.append(message.value)
-        angles = angles or found
-    if angles is None:
+        stamps.append(scan.stamp_ns)
+        if first is None or angles is None:
+            of_laser = recording.topics[topic].type_name == SCAN_TYPE
+            angles = scan_angles(message.value, topic) if of_laser else ScanAngles(scan.angle_min, scan.angle_increment)
+            first = scan
+    if first is None or angles is None:
         raise last_error
-    return usable, angles, damaged
+    return first, angles, stamps, damaged
 
 
 def _others(recording: Recording, topics: RecordingTopics) -> list[str]:
     """A sentence on other scans, and one on other odometries, each with its rate."""
-    scans = [name for name, info in recording.topics.items() if info.type_name == SCAN_TYPE and info.count]
+    kinds = (SCAN_TYPE, CLOUD_TYPE)
+    scans = [name for name, info in recording.topics.items() if info.type_name in kinds and info.count]
     wheels = wheel_candidates(recording, topics.image, topics.ground_truth)
     notes = []
-    if len(scans) > len(topics.scans):
-        others = ", ".join(_with_rate(recording, name) for name in scans if name not in topics.scans)
+    if more := [name for name in scans if name not in topics.scans]:
+        others = ", ".join(_with_rate(recording, name) for name in more)
         used = ", ".join(topics.scans)
         notes.append(f"scans of {used} are used; others are {others}: --image names another one, --scan-topics several")
     if len(wheels) > 1:
@@ -111,13 +114,11 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
     """Scans, mounting, wheels and stamps of a recording; reads its first 200 scans and what the mounting takes.
 
     Raises:
-        RecordingError: topics.image is no LaserScan, or its first scan is damaged.
+        RecordingError: topics.image holds no scans, or they are damaged.
     """
     info = recording.topics[topics.image]
-    if info.type_name != SCAN_TYPE:
-        raise RecordingError(f"topic {topics.image} is {info.type_name}; expected {SCAN_TYPE}")
-    first, angles, damaged = _first_scans(recording, topics.image)
-    stamps = np.array([header_stamp_ns(value) for value in first], np.int64)
+    first, angles, stamps_ns, damaged = _first_scans(recording, topics.image)
+    stamps = np.array(stamps_ns, np.int64)
     steps = np.diff(stamps)
     notes = [*recording.notes, *([] if angles.note is None else [angles.note])]
     if damaged:
@@ -134,12 +135,12 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
     wheels = topics.wheels
     return LidarDescription(
         scan_topic=topics.image,
-        scan_frame=str(first[0].header.frame_id).strip("/"),
+        scan_frame=first.frame_id,
         scans=info.count,
-        rays=len(first[0].ranges),
+        rays=len(first.ranges),
         angles=angles,
-        field_of_view=abs(angles.angle_increment) * (len(first[0].ranges) - 1),
-        range_max=float(first[0].range_max),
+        field_of_view=abs(angles.angle_increment) * (len(first.ranges) - 1),
+        range_max=first.range_max,
         rate_hz=rate,
         mounting=find_mounting(recording, topics),
         wheels=wheels,

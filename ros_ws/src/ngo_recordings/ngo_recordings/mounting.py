@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ngo_recordings.poses import Pose
 from ngo_recordings.recording import Recording
+from ngo_recordings.space_scan import is_optical
 from ngo_recordings.topics import RecordingTopics, transform_topics
 from ngo_recordings.transform_buffer import TransformBuffer, is_named
 
@@ -20,6 +22,8 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 # How much of /tf is looked through for a scanner that /tf_static does not know.
 _LOOK_NS = 600_000_000_000
 
+
+_OPTICAL_FROM_BODY = Pose(np.zeros(3), Rotation.from_matrix([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 
 _NEAR_M, _NEAR_RAD = 0.01, math.radians(0.5)
 """Mountings that differ by less are the same."""
@@ -130,6 +134,7 @@ def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str, source: st
         ):
             continue
         if (pose := tree.newest_lookup(base, scan_frame)) is not None:
+            pose = pose @ _OPTICAL_FROM_BODY if is_optical(scan_frame) else pose
             return _mounting(base, scan_frame, pose, source)
     return None
 

@@ -3,79 +3,30 @@
 from __future__ import annotations
 
 import heapq
-import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ngo_recordings.association import RESTART_NS, header_stamp_ns
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import SCAN_TYPE
+from ngo_recordings.laser_scan import LEAST_INCREMENT, LidarScan, is_increment
 from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import Message, Recording
+from ngo_recordings.space_scan import scan_reader
 from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
+
+__all__ = ["BAD_SCAN", "BAD_WHEELS", "LidarScan", "WheelPose", "scan_stream"]
 
 BAD_SCAN = "damaged scan"
 BAD_WHEELS = "wheel pose that is no number"
 
 # How late a message may be recorded after one with a later stamp, and still come in order.
 _WAIT_NS = 1_000_000_000
-_FULL_TURN = 2.0 * math.pi
 # Between the stamps of scans and wheels that were recorded at once: of one clock they are not so far apart.
 _OTHER_CLOCK_NS = 10_000_000_000
-# Rad; scanners have 50 times this, and a message with a finer one could cost its reader without bound.
-_LEAST_INCREMENT = 1e-5
-# Rad; a scan of more than a turn with a wider one is no scan of a scanner that turns on.
-_WIDEST_INCREMENT = 0.1
-# Rays by which the ends of a scan may contradict its increment: some drivers count one ray more or less.
-_SLACK_RAYS = 1.5
-
-
-@dataclass(frozen=True)
-class LidarScan:
-    """A scan in the scanner's frame.
-
-    angle_min, angle_increment: of the rays in the message's order, counter-clockwise about the frame's z; the increment
-    is negative where rays run clockwise. ranges ``(rays,)``: float32, m, as recorded, so holes, NaN and values out of
-    range_min and range_max (m) are there. time_increment: from ray to ray, s, 0 where unknown. offsets_s ``(rays,)``:
-    when each ray was measured, after the stamp, where that is not even; None: as time_increment says. topic: where it
-    came from.
-    """
-
-    stamp_ns: int
-    angle_min: float
-    angle_increment: float
-    ranges: np.ndarray
-    range_min: float
-    range_max: float
-    time_increment: float
-    frame_id: str
-    offsets_s: np.ndarray | None = None
-    topic: str = ""
-
-    @property
-    def angles(self) -> np.ndarray:
-        """Angles of the rays ``(rays,)``, rad."""
-        angles: np.ndarray = self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
-        return angles
-
-    @property
-    def ray_offsets_s(self) -> np.ndarray:
-        """When each ray was measured, after the stamp, ``(rays,)``, s."""
-        if self.offsets_s is not None:
-            return self.offsets_s
-        return self.time_increment * np.arange(len(self.ranges), dtype=np.float64)
-
-    @property
-    def sweep_s(self) -> float:
-        """From the first ray to the last, s; 0 where it is not known."""
-        if self.offsets_s is not None:
-            return float(self.offsets_s.max() - self.offsets_s.min())
-        return abs(self.time_increment) * len(self.ranges)
 
 
 @dataclass(frozen=True)
@@ -84,67 +35,6 @@ class WheelPose:
 
     stamp_ns: int
     pose_xyyaw: np.ndarray
-
-
-@dataclass(frozen=True)
-class ScanAngles:
-    """The angles of a scan's rays, and a note where the message contradicts itself or is likely wrong.
-
-    likely_increment: what the increment probably is where the message's is doubtful, else None; it is not used unless
-    a caller gives it to `scan_stream`. rays: how many count, from the first on; None: all.
-    """
-
-    angle_min: float
-    angle_increment: float
-    note: str | None = None
-    likely_increment: float | None = None
-    rays: int | None = None
-
-
-def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
-    """The angles of a LaserScan, by this rule.
-
-    The message's increment counts while ``angle_min + (n - 1) * increment`` is within 1.5 rays of angle_max. Otherwise,
-    and where it is 0 or no number, ``(angle_max - angle_min) / (n - 1)`` counts, if that is an increment. An increment
-    that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg)
-    contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts.
-
-    Raises:
-        RecordingError: neither gives angles within a full turn.
-    """
-    count = len(message.ranges)
-    low, high, increment = float(message.angle_min), float(message.angle_max), float(message.angle_increment)
-    if not count or not math.isfinite(low) or abs(low) > 2.0 * _FULL_TURN:
-        raise RecordingError(f"a scan of {topic} has {count} rays from {low:g} rad on; expected rays, and an angle")
-    if _FULL_TURN < 0.99 * abs(increment) * (count - 1) <= 2.0 * _FULL_TURN and abs(increment) < _WIDEST_INCREMENT:
-        turn = math.ceil(_FULL_TURN / abs(increment) - 1e-3)
-        note = f"a scan of {topic} has {count} rays, more than a full turn: the first {turn} count"
-        return ScanAngles(low, increment, note, rays=turn)
-    implied = (high - low) / (count - 1) if count > 1 and math.isfinite(high) else 0.0
-    if not _spans(increment, count):
-        if not _spans(implied, count):
-            raise RecordingError(
-                f"a scan of {topic} has {count} rays {increment:g} rad apart from {low:g} to {high:g} rad; expected "
-                "angles within a full turn"
-            )
-        note = f"the increment of {topic} is {increment:g} rad: its ends count, {math.degrees(implied):.4f} deg"
-        return ScanAngles(low, implied, note)
-    apart = abs(low + (count - 1) * increment - high)
-    given_deg, implied_deg = math.degrees(increment), math.degrees(implied)
-    if count > 1 and apart > _SLACK_RAYS * abs(increment) and _spans(implied, count):
-        note = f"the increment of {topic} is {given_deg:.4f} deg and contradicts its ends: {implied_deg:.4f} deg counts"
-        return ScanAngles(low, implied, note)
-    if not math.isfinite(high) or (count > 1 and apart > 0.5 * abs(increment)):
-        note = f"angle_max of {topic} is {math.degrees(high):.2f} deg, not that of its last ray: the increment counts"
-        return ScanAngles(low, increment, note)
-    likely = math.copysign(abs(high - low) / count, increment)
-    if count > 1 and _is_round(likely) and not _is_round(increment):
-        note = (
-            f"{topic} has {count} rays over {math.degrees(abs(high - low)):.2f} deg, {given_deg:.4f} deg apart: likely "
-            f"are {math.degrees(likely):.4f} deg, and its field of view one ray less"
-        )
-        return ScanAngles(low, increment, note, likely)
-    return ScanAngles(low, increment)
 
 
 def scan_stream(
@@ -167,13 +57,11 @@ def scan_stream(
             poses that are no numbers are left out.
 
     Raises:
-        RecordingError: topics.image is no LaserScan, scans have no stamps, or one is damaged.
+        RecordingError: topics.image holds no scans, scans have no stamps, or one is damaged.
     """
-    type_name = recording.topics[topics.image].type_name
-    if type_name != SCAN_TYPE:
-        raise RecordingError(f"topic {topics.image} is {type_name}; expected {SCAN_TYPE}")
-    if angle_increment is not None and not _spans(angle_increment, 1):
-        raise RecordingError(f"the increment is {angle_increment:g} rad; expected at least {_LEAST_INCREMENT:g} rad")
+    readers = {topic: scan_reader(recording, topic, angle_increment) for topic in topics.scans}
+    if angle_increment is not None and not is_increment(angle_increment, 1):
+        raise RecordingError(f"the increment is {angle_increment:g} rad; expected at least {LEAST_INCREMENT:g} rad")
     wheels = None if topics.wheels is None else _Wheels(recording, topics.wheels, topics.image)
     names = {*topics.scans, *(wheels.names if wheels is not None else ())}
     lost: Counter[str] = Counter() if skipped is None else skipped
@@ -185,7 +73,7 @@ def scan_stream(
         is_scan = message.topic in topics.scans
         try:
             found: list[LidarScan | WheelPose] = (
-                [scan_of(message.value, message.topic, angle_increment)]
+                [readers[message.topic](message.value)]
                 if is_scan
                 else list(wheels.read(message, lost) if wheels else ())
             )
@@ -239,36 +127,3 @@ class _Wheels:
             yield WheelPose(stamp_ns, found.planar()[0])
         if self._tf.bad > bad:
             lost[BAD_WHEELS] += self._tf.bad - bad
-
-
-def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> LidarScan:
-    """A LaserScan message as a record; its angles are those of `scan_angles`, the increment one's own where given.
-
-    Raises:
-        RecordingError: the scan has no angles, or no stamp.
-    """
-    angles = scan_angles(value, topic)
-    time_increment = float(value.time_increment)
-    return LidarScan(
-        header_stamp_ns(value),
-        angles.angle_min,
-        angles.angle_increment if angle_increment is None else angle_increment,
-        np.asarray(value.ranges, np.float32)[: angles.rays],
-        float(value.range_min),
-        float(value.range_max),
-        time_increment if math.isfinite(time_increment) else 0.0,
-        str(value.header.frame_id).strip("/"),
-        topic=topic,
-    )
-
-
-def _spans(increment: float, count: int) -> bool:
-    """Whether rays so far apart are an increment, within a full turn."""
-    return abs(increment) >= _LEAST_INCREMENT and abs(increment) * (count - 1) <= 1.01 * _FULL_TURN  # not NaN
-
-
-def _is_round(increment: float) -> bool:
-    """Whether an increment divides a degree, or is a multiple of a quarter of one, as scanners' are."""
-    degrees = abs(math.degrees(increment))
-    quarters, parts = degrees * 4.0, 1.0 / degrees
-    return any(value > 0.5 and abs(value - round(value)) < 1e-3 * value for value in (quarters, parts))

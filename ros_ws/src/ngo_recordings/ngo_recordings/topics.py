@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, SCAN_TYPE, SENSOR_TYPES
+from ngo_recordings.images import CLOUD_TYPE, COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, SCAN_TYPE, SENSOR_TYPES
 from ngo_recordings.recording import Recording
 from ngo_recordings.transform_buffer import TransformBuffer, is_named
 
@@ -20,6 +20,7 @@ POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 _NONE = "none"
+_SCANS = (SCAN_TYPE, CLOUD_TYPE, IMAGE_TYPE)  # of depth
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _ODOMETRY_FRAME = "odom"
 _GLOBAL_FRAMES = ("map", "world", "earth")
@@ -95,7 +96,7 @@ class TopicArguments:
     """What a person says about topics on the command line; a field that is not given is chosen, `none` uses nothing."""
 
     image: str | None = None
-    """Topic of the pictures or scans: Image, CompressedImage or LaserScan."""
+    """Topic of the pictures or scans: Image, CompressedImage or LaserScan; for a lidar PointCloud2, and depth, too."""
     depth: str | None = None
     """Topic of a depth image (32FC1, 16UC1) that becomes one more channel of the pictures; none unless given."""
     action: str | None = None
@@ -111,7 +112,7 @@ class TopicArguments:
     twist_tolerance_s: float = 0.5
     """How old a velocity may be that is used for a step during which none came, s."""
     scan_topics: tuple[str, ...] = ()
-    """Topics of several laser scanners, whose scans are put together; the first one is the image."""
+    """Topics of several scanners, whose scans are put together; the first one is the image."""
     wheels: str | None = None
     """Wheel odometry: a topic of Odometry, or tf:PARENT:CHILD; chosen for scans alone."""
 
@@ -123,9 +124,9 @@ class TopicArguments:
 class RecordingTopics:
     """What is used for what; None: nothing. `choose_topics` makes one that fits the recording.
 
-    image: Image, CompressedImage or LaserScan. depth: Image of depth, one more channel. action: DiscreteAction. twist:
-    Twist, TwistStamped or Odometry. wheels: wheel odometry, for `scan_stream`. more_scans: those of other
-    scanners. The times are those of TopicArguments.
+    image: Image, CompressedImage, LaserScan or PointCloud2. depth: Image of depth, one more channel. action:
+    DiscreteAction. twist: Twist, TwistStamped or Odometry. wheels: wheel odometry, for `scan_stream`. more_scans: those
+    of other scanners. The times are those of TopicArguments.
     """
 
     image: str
@@ -153,7 +154,7 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
 
     Not given, the image is the only colour or grey Image, else the only CompressedImage, else `choose_scan`; the action
     is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped; the
-    ground truth an Odometry or pose topic whose name says so. Where the image is a LaserScan, the wheels are the first
+    ground truth an Odometry or pose topic whose name says so. Where the image is of scans, the wheels are the first
     of `wheel_candidates`, if it is the only one or its name says so; where there is none, the transform from odom to
     the robot. Nothing else is guessed.
 
@@ -161,9 +162,9 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
     """
     given = given or TopicArguments()
-    scans: list[str | None] = [_given(recording, "scans", name, (SCAN_TYPE,)) for name in given.scan_topics]
+    scans: list[str | None] = [_given(recording, "scans", name, _SCANS) for name in given.scan_topics]
     first, *more = scans or [given.image]
-    image = _given(recording, "image", first, SENSOR_TYPES) or _choose_image(recording)
+    image = _given(recording, "image", first, (*SENSOR_TYPES, CLOUD_TYPE)) or _choose_image(recording)
     action = _given(recording, "action", given.action, (ACTION_TYPE,))
     if given.action is None:
         action = _only(name for name in _filled(recording, (ACTION_TYPE,)) if not name.endswith("command"))
@@ -180,14 +181,19 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
         tolerance_s=given.tolerance_s,
         interpolation_s=given.interpolation_s,
         twist_tolerance_s=given.twist_tolerance_s,
-        wheels=_choose_wheels(recording, given.wheels, image, truth),
+        wheels=_choose_wheels(recording, given.wheels, image, truth, bool(scans)),
         more_scans=tuple(name for name in more if name is not None),
     )
 
 
 def choose_scan(recording: Recording) -> str | None:
-    """The topic of laser scans, of several the one called scan in the shortest namespace; None: there is none."""
+    """The topic of laser scans, of several the one called scan in the shortest namespace; None: there is none.
+
+    Where there are no laser scans, that of point clouds, if it is the only one.
+    """
     names = _filled(recording, (SCAN_TYPE,))
+    if not names:
+        return _only(_filled(recording, (CLOUD_TYPE,)))
     return min(
         names,
         key=lambda name: (not name.endswith("/scan"), name.count("/"), -recording.topics[name].count, name),
@@ -289,7 +295,7 @@ def _choose_truth(recording: Recording, given: str | None) -> GroundTruth | None
 
 
 def _choose_wheels(
-    recording: Recording, given: str | None, image: str, truth: GroundTruth | None
+    recording: Recording, given: str | None, image: str, truth: GroundTruth | None, scans: bool
 ) -> WheelSource | None:
     if given == _NONE:
         return None
@@ -302,7 +308,7 @@ def _choose_wheels(
         if truth is not None and str(wheels) == str(truth):
             raise RecordingError(f"wheel odometry and ground truth are both {wheels}: name another, or {_NONE}")
         return wheels
-    if recording.topics[image].type_name != SCAN_TYPE:
+    if recording.topics[image].type_name not in (SCAN_TYPE, CLOUD_TYPE) and not scans:
         return None
     if candidates := wheel_candidates(recording, image, truth):
         clear = len(candidates) == 1 or any(names.search(candidates[0]) for names in _WHEEL_NAMES)

@@ -10,7 +10,7 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import CameraInfo, Image, LaserScan, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
@@ -25,13 +25,15 @@ from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
+from ngo_recordings.laser_scan import LidarScan, scan_of
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
 from ngo_recordings.odometry_poses import OdometryPoses
-from ngo_recordings.scan_stream import LidarScan, scan_of
+from ngo_recordings.space_scan import cloud_scan, depth_scan, info_topic
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
 _DEPTH = 1000
+_TYPES = {"LaserScan": LaserScan, "PointCloud2": PointCloud2, "depth": Image}
 _MOUNTING_WAIT_NS = 2_000_000_000
 _MOST_HELD = 200
 _NO_POSE = "pose has values that are not finite, or no orientation"
@@ -59,6 +61,7 @@ class LidarInput:
         self._on_tf = OdometryOnTf(self._transforms, self._odom_frame, self._base_frame)
         self._odometry = OdometryPoses()
         self._said = ""
+        self._infos: dict[str, CameraInfo] = {}
         self._held: deque[LidarScan] = deque(maxlen=_MOST_HELD)
         self._mountings: dict[str, KnownMounting | None] = {}  # by frame; None: taken to be the base frame
         self._topics = settings.scan_topics or (settings.scan_topic,)
@@ -74,7 +77,7 @@ class LidarInput:
             "tf": f"odometry from {self._odom_frame} to {self._base_frame} on TF",
         }[self._settings.robot_odometry]
         topics = "', '".join(map(self._node.resolve_topic_name, self._topics))
-        return f"LaserScan on '{topics}', {own}"
+        return f"{self._settings.scan_type} on '{topics}', {own}"
 
     def listen(self, listening: Listening, status: NodeStatus) -> None:
         """Subscribe to scans, odometry and the scanner's mounting."""
@@ -83,7 +86,9 @@ class LidarInput:
         scans = QoSProfile(depth=settings.image_depth, reliability=reliability)
         for topic in self._topics:
             # Each scanner on a topic may have a driver of its own.
-            listening.to(LaserScan, topic, partial(self._on_scan, topic), scans, each_frame=True)
+            listening.to(_TYPES[settings.scan_type], topic, partial(self._on_scan, topic), scans, each_frame=True)
+            if settings.scan_type == "depth":
+                listening.to_all(CameraInfo, info_topic(topic), partial(self._on_info, topic), scans)
         if settings.robot_odometry == "topic":
             listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
         # Every node on a robot publishes transforms: no single publisher is held on to.
@@ -109,9 +114,17 @@ class LidarInput:
                 self._look_for_mounting(frame)
         self._update()
 
-    def _on_scan(self, topic: str, message: LaserScan) -> None:
+    def _on_info(self, topic: str, message: CameraInfo) -> None:
+        self._infos[topic] = message
+
+    def _on_scan(self, topic: str, message: LaserScan | PointCloud2 | Image) -> None:
         try:
-            scan = scan_of(message, topic)
+            if isinstance(message, PointCloud2):
+                scan = cloud_scan(message, topic)
+            elif isinstance(message, Image):
+                scan = depth_scan(message, self._infos.get(topic), topic)
+            else:
+                scan = scan_of(message, topic)
         except ValueError as error:
             self._status.dropped("scan", error)
             return

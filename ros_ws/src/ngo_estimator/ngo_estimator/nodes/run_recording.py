@@ -36,7 +36,7 @@ from ngo_estimator.nodes.command import run_command
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
-from ngo_recordings.images import SCAN_TYPE
+from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, choose_topics
 
@@ -110,7 +110,7 @@ class Arguments:
         shipped = Path(get_package_share_directory("ngo_estimator"), "weights")
         world = self.world
         if world is None and self.weights is None:
-            if not any(info.type_name == SCAN_TYPE and info.count for info in recording.topics.values()):
+            if not any(info.type_name in (SCAN_TYPE, CLOUD_TYPE) and info.count for info in recording.topics.values()):
                 raise ValueError("expected --world (but scan) or --weights FOLDER: there are no laser scans")
             world = LIDAR_WORLD
         folder = self.weights if self.weights is not None else shipped / str(world)
@@ -279,8 +279,8 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     odometry = load_front_end(folder, arguments.world)
     online = ScanTrajectory.load(folder, arguments.world, arguments.iterations_per_step)
     given = replace(arguments.topics, action="none", twist="none")
-    if given.image is None and not given.scan_topics:
-        given = replace(given, image=choose_scan(recording))
+    if not given.scan_topics and (scans := given.image or choose_scan(recording)) is not None:
+        given = replace(given, scan_topics=(scans,))
     topics = choose_topics(recording, given)
     described = describe_lidar(recording, topics)
     if arguments.scan_yaw_deg != 0.0:

@@ -68,6 +68,12 @@ class LocalNodeSettings(EstimatorSettings):
         (),
         "Topics of several scanners, each with its pose on TF, whose scans are put together; in place of scan_topic.",
     )
+    scan_type: str = setting(
+        "LaserScan",
+        "Type of the scans of a lidar: LaserScan; PointCloud2, of which the sensor's own height counts; or depth: an "
+        "Image, with its CameraInfo on camera_info beside it.",
+        choices=("LaserScan", "PointCloud2", "depth"),
+    )
     min_range: float = setting(
         0.0,
         "Nearer ranges of a scanner are not used, m: for a robot that its scanner sees.",

@@ -14,8 +14,8 @@ from ngo_estimator.view.tracks import (
     position_rmse_m,
 )
 from ngo_recordings.images import picture
+from ngo_recordings.laser_scan import scan_of
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.scan_stream import scan_of
 from ngo_recordings.transform_buffer import TransformBuffer
 
 _ARROW_SHARE = 0.06

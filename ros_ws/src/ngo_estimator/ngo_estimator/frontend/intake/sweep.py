@@ -99,7 +99,12 @@ class MeasuredSweep:
         self.reversed, self.known_s = False, None
 
     def correct(self, scan: LidarScan) -> LidarScan:
-        """The scan with its rays in the order in which they were measured, and with their time."""
+        """The scan with its rays in the order in which they were measured, and with their time.
+
+        Times of single rays are believed, and not measured.
+        """
+        if scan.offsets_s is not None:
+            return scan
         if self._last_ns is not None and scan.stamp_ns > self._last_ns:
             self._gaps.append((scan.stamp_ns - self._last_ns) * 1e-9)
             self._period_s = statistics.median(self._gaps) if len(self._gaps) > 2 else 0.0

@@ -1,0 +1,173 @@
+"""Point clouds and depth images as scans: what stands at the sensor's own height, by the angle at which it is seen.
+
+Points count in the sensor's body axes (REP-103: x ahead, y to the left, z up), also those of optical frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ngo_recordings.association import header_stamp_ns
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.images import CLOUD_TYPE, IMAGE_TYPE, SCAN_TYPE, picture
+from ngo_recordings.laser_scan import LidarScan, scan_of
+from ngo_recordings.recording import Recording
+
+_RAYS = 1440
+_LOW_M, _HIGH_M = -0.2, 0.2
+_HIGH_SHARE = 0.03
+"""Points so far below and above the sensor count, and above it this share of their range: rings spread. Nothing below,
+where the floor is."""
+_SURFACE_M = 0.1
+"""Points of a ray so far behind its nearest one are of the same surface."""
+_NEAREST_M, _FARTHEST_M = 0.05, 1000.0
+_FARTHEST_DEPTH_M = 5.0
+"""Errors of depth grow with its square: there they are 4 cm (Khoshelham and Elberink 2012)."""
+
+_TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "ts")
+_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+_LONGEST_S = 1.0
+_SAME_CLOCK_S = 10.0
+_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def is_optical(frame: str) -> bool:
+    """Whether a frame has the axes of optics: z ahead, x to the right."""
+    return frame.endswith(("_optical_frame", "_optical"))
+
+
+def cloud_scan(message: Any, topic: str) -> LidarScan:
+    """The scan in a PointCloud2 of any layout; each ray has the time of its points where these have one.
+
+    Raises:
+        RecordingError: it has no x, y and z, no stamp, or data of another size than it says.
+    """
+    values = _records(message, topic)
+    names = values.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
+    points = np.stack([values[name].astype(np.float64) for name in "xyz"], axis=-1)
+    frame = str(message.header.frame_id).strip("/")
+    if is_optical(frame):
+        points = points[:, (2, 0, 1)] * (1.0, -1.0, -1.0)
+    stamp_ns = header_stamp_ns(message)
+    time = next((name for name in _TIMES if name in names), None)
+    offsets_s = None if time is None else _offsets_s(values[time].astype(np.float64), stamp_ns * 1e-9)
+    return _scan(points, offsets_s, _FARTHEST_M, stamp_ns, frame, topic)
+
+
+def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
+    """The scan in a depth Image, whose camera a CameraInfo describes.
+
+    Raises:
+        RecordingError: it is no depth image, has no stamp, or the CameraInfo is not of such a camera.
+    """
+    if info is None:
+        raise RecordingError(f"no CameraInfo came on {info_topic(topic)}, which says how {topic} was taken")
+    depth, _ = picture(message, IMAGE_TYPE, topic)
+    matrix = np.asarray(getattr(info, "k", getattr(info, "K", ())), np.float64)
+    if depth.dtype != np.float32 or depth.shape[2] != 1:
+        raise RecordingError(f"images of {topic} are {message.encoding!r}; expected depth, 16UC1 or 32FC1")
+    height, width = depth.shape[:2]
+    if matrix.size != 9 or not (matrix[0] > 0.0 and matrix[4] > 0.0) or (info.height, info.width) != (height, width):
+        raise RecordingError(
+            f"an image of {topic} is {width} x {height}; its CameraInfo is of {info.width} x {info.height}, k {matrix}"
+        )
+    ahead = depth[..., 0].astype(np.float64)
+    ahead[~(ahead < _FARTHEST_DEPTH_M)] = np.nan
+    left = (matrix[2] - np.arange(width)) / matrix[0] * ahead
+    up = ((matrix[5] - np.arange(height)) / matrix[4])[:, None] * ahead
+    points = np.stack((ahead, left, up), axis=-1).reshape(-1, 3)
+    frame = str(message.header.frame_id).strip("/")
+    return _scan(points, None, _FARTHEST_DEPTH_M, header_stamp_ns(message), frame, topic)
+
+
+def info_topic(depth_topic: str) -> str:
+    """The topic of the CameraInfo beside that of an image."""
+    return depth_topic.rpartition("/")[0] + "/camera_info"
+
+
+def scan_reader(recording: Recording, topic: str, angle_increment: float | None = None) -> Callable[[Any], LidarScan]:
+    """What makes scans of the messages of a topic; a LaserScan may have another increment than it says.
+
+    Raises:
+        RecordingError: they become no scans, or are depth without a CameraInfo.
+    """
+    type_name, info = recording.topics[topic].type_name, info_topic(topic)
+    if type_name == SCAN_TYPE:
+        return partial(scan_of, topic=topic, angle_increment=angle_increment)
+    if type_name == CLOUD_TYPE:
+        return partial(cloud_scan, topic=topic)
+    if type_name == IMAGE_TYPE and info in recording.topics and recording.topics[info].count:
+        return partial(depth_scan, info=recording.first(info).value, topic=topic)
+    raise RecordingError(
+        f"topic {topic} is {type_name}; expected {SCAN_TYPE}, {CLOUD_TYPE}, or depth with a CameraInfo on {info}"
+    )
+
+
+def _records(message: Any, topic: str) -> np.ndarray:
+    """The points of a cloud, one record each."""
+    height, width = int(message.height), int(message.width)
+    step, row = int(message.point_step), int(message.row_step)
+    known = [field for field in message.fields if field.datatype in _FORMATS and int(field.count) <= 1]
+    order = ">" if message.is_bigendian else "<"
+    formats = [order + _FORMATS[field.datatype] for field in known]
+    ends = [field.offset + np.dtype(each).itemsize for field, each in zip(known, formats, strict=True)]
+    data = np.frombuffer(message.data, np.uint8)
+    if height == 1:
+        row = step * width
+    if max(ends, default=0) > step or row < step * width or len(data) < row * (height - 1) + step * width:
+        raise RecordingError(
+            f"a cloud of {topic} has {len(data)} bytes; expected {height} rows of {row} bytes, {width} points of {step}"
+        )
+    names = [str(field.name) for field in known]
+    if len(set(names)) < len(names):
+        raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names)}; expected each name once")
+    kind = np.dtype({"names": names, "formats": formats, "offsets": [f.offset for f in known], "itemsize": step})
+    return np.ndarray((height, width), kind, data, 0, (row, step)).reshape(-1)
+
+
+def _offsets_s(times: np.ndarray, stamp_s: float) -> np.ndarray | None:
+    """When each point was measured, after the stamp (s); None where they all have one time."""
+    good = np.isfinite(times)
+    if not good.any():
+        return None
+    low, high = float(times[good].min()), float(times[good].max())
+    unit = next((unit for unit in _UNITS if (high - low) * unit <= _LONGEST_S), None)
+    if unit is None or high <= low:
+        return None
+    times = np.where(good, times, low) * unit
+    if abs(low * unit - stamp_s) < _SAME_CLOCK_S:
+        return times - stamp_s
+    return times if abs(low * unit) <= _LONGEST_S else times - low * unit
+
+
+def _scan(
+    points: np.ndarray, offsets_s: np.ndarray | None, farthest_m: float, stamp_ns: int, frame: str, topic: str
+) -> LidarScan:
+    """The nearest surface at each angle; angles at which no point was seen say nothing."""
+    reach = np.hypot(points[:, 0], points[:, 1])
+    high = np.maximum(_HIGH_M, _HIGH_SHARE * reach)
+    counts = (reach > _NEAREST_M) & (reach < farthest_m) & (points[:, 2] >= _LOW_M) & (points[:, 2] <= high)
+    index = np.flatnonzero(counts)
+    angle = np.arctan2(points[index, 1], points[index, 0])
+    step = math.tau / _RAYS
+    ray = np.minimum(((angle + math.pi) / step).astype(np.int64), _RAYS - 1)
+    nearest = np.full(_RAYS, np.inf)
+    np.minimum.at(nearest, ray, reach[index])
+    surface = reach[index] <= nearest[ray] + _SURFACE_M
+    index, ray = index[surface], ray[surface]
+    number = np.bincount(ray, minlength=_RAYS)
+    seen = number > 0
+    ranges = np.full(_RAYS, np.nan, np.float32)
+    ranges[seen] = (np.bincount(ray, reach[index], _RAYS) / np.maximum(number, 1))[seen]
+    offsets = None
+    if offsets_s is not None and seen.any():
+        mean = np.bincount(ray, offsets_s[index], _RAYS) / np.maximum(number, 1)
+        offsets = np.interp(np.arange(_RAYS), np.flatnonzero(seen), mean[seen])
+    return LidarScan(stamp_ns, 0.5 * step - math.pi, step, ranges, _NEAREST_M, farthest_m, 0.0, frame, offsets, topic)

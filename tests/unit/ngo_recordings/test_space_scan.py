@@ -1,0 +1,163 @@
+"""Point clouds and depth images become the scans that a laser scanner in their place would have."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.laser_scan import LidarScan
+from ngo_recordings.lidar_description import describe_lidar
+from ngo_recordings.recording import open_recording
+from ngo_recordings.scan_stream import WheelPose, scan_stream
+from ngo_recordings.space_scan import cloud_scan, depth_scan
+from ngo_recordings.topics import TopicArguments, choose_topics
+from tests.unit.ngo_recordings import messages as m
+from tests.unit.ngo_recordings.test_scan_stream import odometry, static
+
+BEGIN_NS = 10**12
+ROOM_M = np.array((4.0, 3.0))  # half of its sides
+HEIGHT_M = 0.5  # of the sensor above the floor
+
+
+def in_room(azimuths: np.ndarray, elevations: np.ndarray) -> np.ndarray:
+    """Where rays from the middle of a room meet walls or the floor, ``(rays, 3)``."""
+    along = np.stack((np.cos(azimuths), np.sin(azimuths)), axis=-1)
+    with np.errstate(divide="ignore"):
+        reach = (ROOM_M / np.abs(along)).min(axis=-1)
+        floor = np.where(elevations < 0.0, HEIGHT_M / np.tan(-elevations), np.inf)
+    reach = np.minimum(reach, floor)
+    return np.concatenate((reach[:, None] * along, (reach * np.tan(elevations))[:, None]), axis=1)
+
+
+def turning(rings: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a lidar with so many rings over 30 degrees, and when each is measured (s), in a tenth of a second."""
+    azimuths, elevations = np.meshgrid(
+        np.radians(np.arange(-180.0, 180.0, 0.2)), np.radians(np.linspace(-15.0, 15.0, rings)), indexing="ij"
+    )
+    times = np.repeat(np.linspace(0.0, 0.1, len(azimuths), endpoint=False), rings)
+    return in_room(azimuths.ravel(), elevations.ravel()), times
+
+
+def fields(points: np.ndarray, kind: str = "f4") -> dict[str, np.ndarray]:
+    return {name: points[:, k].astype(kind) for k, name in enumerate("xyz")}
+
+
+def off_walls(scan: LidarScan) -> np.ndarray:
+    """How far the ends of the rays that saw something are off the walls (m)."""
+    seen = np.isfinite(scan.ranges)
+    ends = scan.ranges[seen, None] * np.stack((np.cos(scan.angles), np.sin(scan.angles)), axis=-1)[seen]
+    return np.abs(np.abs(ends) - ROOM_M).min(axis=1)
+
+
+@pytest.mark.parametrize(
+    "layout", [{}, {"height": 1800}, {"padding": 10}, {"big": True}, {"kind": "f8"}, {"shuffled": True}, {"rings": 32}]
+)
+def test_any_layout_of_rings_is_the_scan_at_the_sensors_height(layout: dict[str, Any]) -> None:
+    """Neither floor nor ceiling is in it, and most angles saw a wall."""
+    points, _ = turning(layout.pop("rings", 16))
+    if layout.pop("shuffled", False):
+        points = np.random.default_rng(0).permutation(points)
+        points[::7] = np.nan
+    made = cloud_scan(m.cloud(BEGIN_NS, fields(points, layout.pop("kind", "f4")), **layout), "/points")
+    assert (made.stamp_ns, made.frame_id, made.offsets_s) == (BEGIN_NS, "lidar", None)
+    assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "factor", "begin_s"),
+    [
+        ("time", "f4", 1.0, 0.0),  # Velodyne
+        ("t", "u4", 1e9, 0.0),  # Ouster
+        ("timestamp", "f8", 1.0, BEGIN_NS * 1e-9),  # Hesai, RoboSense
+        ("timestamp", "f8", 1e9, BEGIN_NS * 1e-9),  # Livox
+        ("timestamp", "f8", 1.0, 1.7e9),  # of another clock
+        ("offset_time", "u4", 1e6, 0.0),
+    ],
+)
+def test_the_time_of_each_point_is_that_of_its_ray(name: str, kind: str, factor: float, begin_s: float) -> None:
+    points, times = turning()
+    cloud = m.cloud(BEGIN_NS, {**fields(points), name: ((times + begin_s) * factor).astype(kind)})
+    made = cloud_scan(cloud, "/points")
+    assert made.offsets_s is not None and made.sweep_s == pytest.approx(0.1, abs=1e-3)
+    np.testing.assert_allclose(made.offsets_s, (made.angles + math.pi) / math.tau * 0.1, atol=2e-4)
+
+
+def test_a_cloud_that_has_one_time_has_no_sweep() -> None:
+    points, times = turning()
+    assert cloud_scan(m.cloud(BEGIN_NS, {**fields(points), "time": np.zeros(len(times), "f4")}), "/p").offsets_s is None
+
+
+def depth_image(encoding: str) -> tuple[Any, Any]:
+    """A camera in the room that looks ahead with 90 degrees, and its CameraInfo."""
+    width, height, focal = 160, 120, 80.0
+    left = (79.5 - np.arange(width)) / focal
+    up = (59.5 - np.arange(height))[:, None] / focal + np.zeros(width)
+    azimuths, elevations = np.arctan(left) + np.zeros((height, 1)), np.arctan(up / np.hypot(1.0, left))
+    depth = in_room(azimuths.ravel(), elevations.ravel())[:, 0].reshape(height, width, 1)
+    pixels = (depth * 1000.0).round().astype("u2") if encoding == "16UC1" else depth.astype("f4")
+    image = m.image(BEGIN_NS, pixels, encoding)
+    image.header.frame_id = "camera_optical_frame"
+    k = np.array((focal, 0.0, 79.5, 0.0, focal, 59.5, 0.0, 0.0, 1.0))
+    roi = m.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+    rest = ("plumb_bob", np.zeros(5), k, np.eye(3).ravel(), np.zeros(12), 0, 0, roi)
+    return image, m.make("sensor_msgs/msg/CameraInfo", m.header(BEGIN_NS), height, width, *rest)
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_depth_is_a_scan_ahead_as_far_as_depth_is_exact(encoding: str) -> None:
+    made = depth_scan(*depth_image(encoding), "/depth")
+    seen = np.isfinite(made.ranges)
+    assert off_walls(made).max() < 0.03 and made.range_max == 5.0
+    assert np.abs(made.angles[seen]).max() == pytest.approx(math.radians(45.0), abs=0.01) and seen.sum() > 120
+
+
+def test_a_camera_without_its_description_is_named() -> None:
+    image, info = depth_image("16UC1")
+    with pytest.raises(RecordingError, match="no CameraInfo came on /camera/camera_info"):
+        depth_scan(image, None, "/camera/depth")
+    info.width = 80
+    with pytest.raises(RecordingError, match="its CameraInfo is of 80 x 120"):
+        depth_scan(image, info, "/depth")
+
+
+def test_a_recording_of_clouds_is_a_stream_of_scans(tmp_path: Path) -> None:
+    """In an optical frame, as those of cameras are, that looks to the left."""
+    points, _ = turning()
+    turned = np.stack((-points[:, 1], -points[:, 2], points[:, 0]), axis=-1)
+    optical = static("base_link", "camera_optical_frame", 0.1, 0.0, 0.0)
+    rotation = optical.transform.rotation  # the camera looks along y of the robot
+    rotation.x, rotation.y, rotation.z, rotation.w = -math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)
+    entries: list[m.Entry] = [("/tf_static", 1, m.transforms(optical))]
+    for k in range(3):
+        stamp_ns = BEGIN_NS + k * 10**8
+        entries.append(("/odom", stamp_ns, odometry(stamp_ns, 0.0, 0.0, 0.0)))
+        entries.append(("/points", stamp_ns, m.cloud(stamp_ns, fields(turned), "camera_optical_frame")))
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        topics = choose_topics(recording)
+        assert (topics.image, str(topics.wheels)) == ("/points", "/odom")
+        found = list(scan_stream(recording, topics))
+        described = describe_lidar(recording, topics)
+    scans = [each for each in found if isinstance(each, LidarScan)]
+    assert len(scans) == 3 and sum(isinstance(each, WheelPose) for each in found) == 3
+    assert off_walls(scans[0]).max() < 0.02
+    assert described.mounting is not None and not described.mounting.upside_down
+    np.testing.assert_allclose(described.mounting.base_from_scan_xyyaw, (0.1, 0.0, math.pi / 2), atol=1e-9)
+    assert described.mounting.tilt_rad < 1e-6
+
+
+def test_depth_is_a_scan_where_it_is_asked_for(tmp_path: Path) -> None:
+    image, info = depth_image("32FC1")
+    entries = [("/camera/camera_info", BEGIN_NS, info), ("/camera/depth", BEGIN_NS, image)]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        topics = choose_topics(recording, TopicArguments(scan_topics=("/camera/depth",)))
+        (made,) = scan_stream(recording, topics)
+        assert isinstance(made, LidarScan) and off_walls(made).max() < 0.03
+    without = [m.write_mcap(tmp_path / "b.mcap", entries[1:])]
+    with (
+        open_recording(without) as recording,
+        pytest.raises(RecordingError, match="or depth with a CameraInfo on /camera"),
+    ):
+        list(scan_stream(recording, choose_topics(recording, TopicArguments(scan_topics=("/camera/depth",)))))
