@@ -19,7 +19,7 @@ class MixtureConfig:
     first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 2.0, 3.0, 1.0)  # on the deviations below
     least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.3, 0.5, 1.0)
     most_factor: float = 6.0
-    least_weight: float = 0.1
+    least_weight: float = 0.01
     still_m: float = 0.01  # deviation of a motion's position where there is none; it grows with way and turn
     way_share: float = 0.08  # m for each m
     turn_m: float = 0.05  # m for each rad
@@ -42,7 +42,8 @@ class MixtureConfig:
     # Search: windows cover all hypotheses, within limits.
     least_m: float = 0.07  # no hypothesis is surer than this where the place is chosen
     least_rad: float = 0.07
-    prior_weight: float = 0.04  # of the prior's logarithm against the mean score of search_points
+    least_share: float = 0.1  # and none rarer
+    prior_weight: float = 0.025  # of the prior's logarithm against the mean score of search_points
     search_points: int = 120
     least_window_m: float = 0.4
     least_window_deg: float = 10.0

@@ -39,6 +39,9 @@ _BROAD = 0.15
 _UNKNOWN = np.eye(3)
 """Information without which the walls may leave a direction open."""
 
+_KNOWN = np.array((0.02, 0.02, 0.01)) ** 2
+"""Variances (m, m, rad) up to which walls measure a pose that is compared with hypotheses."""
+
 _FEWEST = 12
 """Points without which a scan does not contradict what was seen."""
 
@@ -161,7 +164,9 @@ class MixtureOdometry:
         if not len(points):
             return scan, found
         refound = self._sharpened(
-            other, points, self._fit(other, points, ANY, found.pose, self._prior(), self._weight(points))
+            other,
+            points,
+            self._fit(other, points, ANY, found.pose, self._prior(self.config.least_share), self._weight(points)),
         )
         return (other, refound) if refound.score >= found.score else (scan, found)
 
@@ -200,9 +205,10 @@ class MixtureOdometry:
             estimate = replace(estimate, walls=self._submap.walls(transformed(pose, scan.points)))
         return estimate
 
-    def _prior(self) -> Mixture:
-        """The prior of where the place is chosen."""
-        return self.mixture.prior(self._pose, self._covariance, None, (self.config.least_m, self.config.least_rad))
+    def _prior(self, share: float) -> Mixture:
+        """The prior of where the place is chosen, without a hypothesis below a ``share``."""
+        least = self.config.least_m, self.config.least_rad
+        return self.mixture.prior(self._pose, self._covariance, None, least, share)
 
     def _weight(self, points: Array) -> float:
         """Weight of a log likelihood against a score, which is a mean: of few points it says less."""
@@ -220,7 +226,7 @@ class MixtureOdometry:
             return None
         # Few points contradict nothing: the prior decides.
         least = config.lost_share * self._usual if len(points) >= _FEWEST else 0.0
-        prior, weight = self._prior(), self._weight(points)
+        prior, weight = self._prior(config.least_share), self._weight(points)
         fits = [self._fit(scan, points, k, None, prior, weight) for k in self._starts()]
         for wide in (False, True):
             if wide:
@@ -239,12 +245,14 @@ class MixtureOdometry:
         return None
 
     def _doubted(self, fits: list[_Mode], weight: float) -> _Mode:
-        """The first mode with the covariance of all: a total is ``weight`` times a log likelihood."""
+        """The first mode with the covariance of all: a score is ``weight`` times a log likelihood."""
         modes: list[_Mode] = []
         for fit in fits:
             if not any(self._is_same(fit.pose, mode.pose) for mode in modes):
                 modes.append(fit)
-        likelihoods = np.exp(np.array([mode.total - modes[0].total for mode in modes]) / weight)
+        prior = self._prior(0.0)
+        logs = np.array([mode.score / weight + float(prior.logs(mode.pose).max()) for mode in modes])
+        likelihoods = np.exp(np.minimum(logs - logs[0], 0.0))
         covariance = modes[0].found.covariance
         for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
             away = mode.pose - modes[0].pose
@@ -305,7 +313,11 @@ class MixtureOdometry:
         """A mode registered under the hypothesis that is likeliest there."""
         mixture = self.mixture
         walls = mode.walls
-        likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
+        # Where the walls leave the pose open, the mode has it from its own hypothesis: it speaks for no other.
+        known = np.minimum(np.diag(walls), _KNOWN)
+        likeliest = mixture.likeliest(
+            mode.pose, mixture.prior(self._pose, self._covariance, np.diag(known), (0.0, 0.0))
+        )
         if likeliest == mode.hypothesis != ANY:
             return mode
         mean = compose(self._pose, mixture.steps[likeliest])

@@ -132,9 +132,11 @@ class MotionMixture:
         heading = math.radians(c.still_deg) + c.turn_share * turn + c.way_rad * way
         return np.stack((position, heading), axis=-1)
 
-    def prior(self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float]) -> Mixture:
+    def prior(
+        self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float], share: float = 0.0
+    ) -> Mixture:
         """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``, as ``walls`` ``(3, 3)`` would
-        measure them; no deviation is below ``least`` (m, rad)."""
+        measure them; no deviation is below ``least`` (m, rad), and no weight below ``share``."""
         usable = self._usable
         variances = self._deviations**2 + (0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2])
         for k in (LAST, VELOCITY):
@@ -143,7 +145,8 @@ class MotionMixture:
         if walls is not None:
             variances += (0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])
         deviations = np.sqrt(variances[usable] + np.square(least))
-        weights = self._prior_weights[usable] / self._prior_weights[usable].sum()
+        weights = np.maximum(self._prior_weights[usable], share)
+        weights /= weights.sum()
         logs = np.log(weights) - 2.0 * np.log(deviations[:, 0]) - np.log(deviations[:, 1])
         peak = -2.0 * math.log(least[0]) - math.log(least[1]) if min(least) > 0.0 else 0.0
         means = np.array([compose(pose, step) for step in self._steps[usable]])
