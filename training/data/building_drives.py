@@ -68,10 +68,14 @@ def poor_wheels_drive(seed: int, length_m: float, most_scans: int = 100_000) -> 
 
 
 def two_buildings(seeds: tuple[int, int], length_m: float, most_scans: int = 100_000) -> tuple[LidarDrive, LidarDrive]:
-    """A drive of ``length_m`` through each of two buildings, by the scanner and the wheels that the first one draws."""
+    """A drive of ``length_m`` through each of two buildings, by the scanner and the wheels that the first one draws.
+
+    Of one seed, it is another drive through the same building: another start, another way, doors as they are then.
+    """
     first = Building2d(FloorPlanConfig())
     drives = [first.record(seeds[0], length_m, most_scans)]
-    drives.append(Building2d(FloorPlanConfig(), first.scanner, first.wheels).record(seeds[1], length_m, most_scans))
+    again = Building2d(FloorPlanConfig(), first.scanner, first.wheels)
+    drives.append(again.record(seeds[1], length_m, most_scans, drive=int(seeds[0] == seeds[1])))
     words = f"scanner of {seeds[0]}, {length_m:g} m, at most {most_scans} scans"
     one, other = (
         lidar_drive(drive, f"building_{seed}", f"building seed {seed}, {words}")

@@ -97,15 +97,16 @@ class SensorLog:
         """The log whose wheels go other steps ``(poses - 1, 3)`` from their first pose on."""
         return replace(self, wheel_poses=chained(np.concatenate((self.wheel_poses[:1], steps)))[1:])
 
-    def followed_by(self, other: SensorLog, pause_s: float) -> SensorLog:
+    def followed_by(self, other: SensorLog, pause_s: float, away_m: float = FAR_AWAY_M) -> SensorLog:
         """Both logs as one drive whose wheels go on where they were, as if the robot had been carried.
 
-        In the truth the other place lies ``FAR_AWAY_M`` from the first. Mounting and scanner are those of the first.
+        In the truth the other place lies ``away_m`` from the first; 0 where both are drives through one place. Mounting
+        and scanner are those of the first.
         """
         later_ns = int(self.stamps_ns[-1] - other.stamps_ns[0] + pause_s * 1e9)
         truth = None
         if self.true_poses is not None and other.true_poses is not None:
-            truth = np.concatenate((self.true_poses, other.true_poses + (FAR_AWAY_M, 0.0, 0.0)))
+            truth = np.concatenate((self.true_poses, other.true_poses + (away_m, 0.0, 0.0)))
         both = replace(
             self,
             stamps_ns=np.concatenate((self.stamps_ns, other.stamps_ns + later_ns)),

@@ -48,8 +48,10 @@ deviations of the truth.""",
 robot's position at the last loop, seen from where it was at the same place before.""",
     "joins": """## Wrong joins
 
-Drives among rooms that look alike, and drives that are put together from two buildings. Counts are means over the
-drives. A loop is wrong by more than 0.5 m or 5 deg. It is believed if its weight in the graph is over one half.""",
+Drives among rooms that look alike, drives that are put together from two buildings, and from two drives through the
+same building. Numbers are means over the drives. A loop is wrong by more than 0.5 m or 5 deg. It is believed if its
+weight in the graph is over one half. `lost_at_end` is the share of drives in whose end no loop tells where the robot is
+in the map: right of two buildings, and wrong of the same one where the second drive meets the first.""",
     "car": """## A car's loop
 
 There is no truth. The second visit is the last 20 m of the way. `metres` is how far it lies from where its scans fit

@@ -78,7 +78,7 @@ def visit_facts(drive: LidarDrive, poses: np.ndarray) -> dict[str, float]:
 
 
 def join_row() -> Row:
-    """Our whole pipeline, and how many of its loops are wrong."""
+    """Our whole pipeline, how many of its loops are wrong, and whether the robot is lost in the end."""
     pipeline = Pipeline()
     return Row(partial(_ours_with_joins, pipeline=pipeline), pipeline, code=(front_ends, scan_trajectory))
 
@@ -88,7 +88,11 @@ def _ours_with_joins(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
     graph, truth = run.online.graph, _truth(runs.drive)
     rows = np.searchsorted(truth.stamps_ns, run.trajectory.stamps_ns[graph.closed.pairs])
     wrong = wrong_joins(truth.poses_xyyaw, rows, graph.closed.relative)
-    facts = {"wrong_loops": wrong.sum(), "wrong_believed": (wrong & (graph.closed.weight > BELIEVED)).sum()}
+    facts = {
+        "wrong_loops": wrong.sum(),
+        "wrong_believed": (wrong & (graph.closed.weight > BELIEVED)).sum(),
+        "lost_at_end": float(graph.lost_since is not None),
+    }
     return dataclasses.replace(found, facts={**found.facts, **facts})
 
 

@@ -13,7 +13,7 @@ from training.data import building_drives, lidar_changes
 from training.data.building_drives import building_drive, poor_wheels_drive, two_buildings
 from training.data.lidar_changes import CHANGES, changed
 from training.data.lidar_drives import LidarDrive
-from training.data.sensor_log import SensorLog
+from training.data.sensor_log import FAR_AWAY_M, SensorLog
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_identity, read_drive
 from training.scoring.lidar_rows import ROWS, Row
@@ -68,7 +68,10 @@ def loops(size: Size) -> StressTable:
 
 
 def joins(size: Size) -> StressTable:
-    """Drives where loops tend to be wrong: 200 m among rooms that look alike, and 100 m in each of two buildings."""
+    """Drives where loops tend to be wrong: 200 m among rooms that look alike, and 100 m in each of two buildings.
+
+    In 100 m and 100 m more of one building, from another start, the robot is to be found again.
+    """
     length_m, first = 100.0 * size.factor, size.first + 2000
     aliased = [
         _source(f"aliased_{seed}", size, partial(building_drive, seed, 2.0 * length_m, True, _MOST_SCANS))
@@ -78,8 +81,12 @@ def joins(size: Size) -> StressTable:
         _source(f"two_buildings_{seed}", size, partial(_put_together, (seed, seed + 1000), length_m))
         for seed in range(first + 1000, first + 1000 + size.drives)
     ]
-    groups = {"aliased": aliased, "two_buildings": halves}
-    return StressTable(groups, {"ours": join_row()}, ("loops", "wrong_loops", "wrong_believed"))
+    again = [
+        _source(f"same_building_{seed}", size, partial(_put_together, (seed, seed), length_m))
+        for seed in range(first + 3000, first + 3000 + size.drives)
+    ]
+    groups = {"aliased": aliased, "two_buildings": halves, "same_building": again}
+    return StressTable(groups, {"ours": join_row()}, ("loops", "wrong_loops", "wrong_believed", "lost_at_end"))
 
 
 def car(path: Path) -> StressTable:
@@ -106,5 +113,6 @@ def _building(seed: int, length_m: float) -> SensorLog:
 
 def _put_together(seeds: tuple[int, int], length_m: float) -> LidarDrive:
     one, other = map(SensorLog.of_drive, two_buildings(seeds, length_m, _MOST_SCANS // 2))
-    name = f"two_buildings_{seeds[0]}"
-    return one.followed_by(other, _PAUSE_S).drive(name, name)
+    same = seeds[0] == seeds[1]
+    name = f"{'same_building' if same else 'two_buildings'}_{seeds[0]}"
+    return one.followed_by(other, _PAUSE_S, 0.0 if same else FAR_AWAY_M).drive(name, name)

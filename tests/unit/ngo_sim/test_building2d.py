@@ -36,6 +36,15 @@ def test_the_same_seed_gives_the_same_drive_to_the_byte() -> None:
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
 
 
+def test_another_drive_through_a_building_is_later_and_another_way() -> None:
+    first, second, again = (Building2d(PLAN).record(2, 5.0, drive=drive) for drive in (0, 1, 1))
+    np.testing.assert_array_equal(first.plan.segments_m, second.plan.segments_m)
+    assert (first.scanner, first.wheels) == (second.scanner, second.wheels)
+    assert second.stamps_s[0] > first.stamps_s[-1]
+    assert np.hypot(*(second.true_poses_xyyaw - first.true_poses_xyyaw[0])[:, :2].T).min() > 0.1
+    np.testing.assert_array_equal(second.ranges_m, again.ranges_m)
+
+
 def test_steps_equal_the_recording(drive: BuildingDrive) -> None:
     world = Building2d(PLAN, SCANNER, WheelsConfig(wheel_noise=0.0))
     world.reset(1)

@@ -20,6 +20,7 @@ from ngo_sim.routes import RouteMap
 from ngo_sim.wheels import WheelOdometry, WheelsConfig, draw_wheels
 
 _CHUNK = 512  # scans that a recording casts at once
+_FRAMES_BETWEEN = 100_000  # from the begin of one drive through a building to that of the next
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,8 @@ class Building2d:
 
     plan, driver: what is drawn from the seed and who drives. scanner, wheels: None draws each from the seed.
 
-    reset(seed) makes everything a function of the seed and the configs, to the byte. step() gives one frame after the
+    reset(seed) makes everything a function of the seed and the configs, to the byte. Another drive through the same
+    building, at another time, has another number. step() gives one frame after the
     other, the first one at the start; record() gives the same frames as arrays. A frame's rays are cast while the robot
     drives on, so step() moves the robot by one period.
     """
@@ -84,7 +86,7 @@ class Building2d:
         self.wheels: WheelsConfig
         self._driver: BuildingDriver | CommandedDriver | None = None
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int, drive: int = 0) -> None:
         """Draw the building, the robot and where it starts; the robot stands.
 
         Raises ValueError where the robot has no place in it, or a plan's file is no map.
@@ -94,6 +96,8 @@ class Building2d:
             read_floor_plan(Path(config.plan).expanduser(), seed) if config.plan else draw_floor_plan(seed, config)
         )
         streams = [np.random.default_rng((int(seed), 2, part)) for part in range(6)]
+        if drive:
+            streams[2:] = [np.random.default_rng((int(seed), 2, part, drive)) for part in range(2, 6)]
         drawn = draw_scanner(streams[0])
         self.scanner = self._scanner_config if self._scanner_config is not None else drawn
         self.wheels = self._wheels_config if self._wheels_config is not None else draw_wheels(streams[1])
@@ -104,7 +108,7 @@ class Building2d:
         self._people = People(routes, self._plan_config.people, streams[3])
         self._odometry = WheelOdometry(self.wheels, self.period_s, streams[4])
         self._noise = streams[5]
-        self._index = 0
+        self._index = _FRAMES_BETWEEN * drive
 
     def _make_driver(self, routes: RouteMap, rng: np.random.Generator) -> BuildingDriver | CommandedDriver:
         config = self._driver_config
@@ -141,13 +145,13 @@ class Building2d:
             drive.twists[0],
         )
 
-    def record(self, seed: int, length_m: float, most_scans: int = 100_000) -> BuildingDrive:
+    def record(self, seed: int, length_m: float, most_scans: int = 100_000, drive: int = 0) -> BuildingDrive:
         """Reset and drive until the robot has gone length_m, or until there are most_scans."""
         if not 0.0 < length_m <= 100_000.0:
             raise ValueError(f"length_m is {length_m!r}; it must be above 0 and at most 100000")
         if most_scans < 1:
             raise ValueError(f"most_scans is {most_scans!r}; it must be 1 or more")
-        self.reset(seed)
+        self.reset(seed, drive)
         return self._drive(most_scans, length_m)
 
     def _drive(self, most_scans: int, length_m: float = np.inf) -> BuildingDrive:

@@ -60,3 +60,5 @@ def test_logs_that_are_put_together_go_on_elsewhere() -> None:
     assert not both.wheel_poses[:, 1:].any()
     assert both.true_poses is not None
     assert both.true_poses[4:, 0].tolist() == [FAR_AWAY_M + x for x in (0, 1, 2, 5)]
+    here = log.followed_by(turned, 1e-7, 0.0).true_poses
+    assert here is not None and here[4:, 0].tolist() == [0, 1, 2, 5]
