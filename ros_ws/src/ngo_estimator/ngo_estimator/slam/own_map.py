@@ -35,7 +35,7 @@ _REACH_M = 2.0
 _GROWN = 1.1
 """The map is laid out anew when so many times as many key scans are to be searched."""
 
-_LEAST_WALLS, _MOST_THROUGH = 8, 0.3
+_LEAST_WALLS, _MOST_THROUGH = 8, 0.33
 """A claim needs so many different walls, and no part of the way may look through more of the walls than this share."""
 
 _TRIAL_LOOKS, _CONTRADICTIONS = 40, 3
