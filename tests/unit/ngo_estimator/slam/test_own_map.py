@@ -80,6 +80,15 @@ def test_a_robot_that_was_carried_is_lost_until_it_is_found_in_its_own_map() -> 
     assert position_std(updates[-1].covariance) < 0.1
 
 
+def test_a_robot_that_drives_the_other_way_is_found() -> None:
+    poses = way((1.0, 2.0), (1.0, 7.0), (4.0, 7.0))
+    core = ScanTrajectory()
+    newest = driven(steps(HALLWAY, poses), core)[-1]
+    assert newest.lost_since_ns is None
+    off = between(between(FIRST[:1], poses[-1:]), newest.pose_xyyaw[None])[0]
+    assert np.hypot(off[0], off[1]) < 0.1
+
+
 def joining_loops(core: ScanTrajectory) -> int:
     segment = core.graph.used_loops.pairs >= len(FIRST)
     return int((segment[:, 0] != segment[:, 1]).sum())
