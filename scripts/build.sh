@@ -43,10 +43,7 @@ if [ "$(cat "$VENV/ngo_underlay")" = wheels ]; then
     # A workaround for the wheels' CMake files.
     cmake_args+=("-DCMAKE_PROJECT_INCLUDE=$ROOT/ros_ws/wheels/drop_missing_python_includes.cmake")
 fi
-skipped=()
-[ "$(find_purpose)" = all ] || skipped=(--packages-skip ngo_sim)  # which needs libraries that a lidar does not
-step "build the workspace" colcon build --symlink-install --base-paths "${paths[@]}" "${skipped[@]}" \
-    --cmake-args "${cmake_args[@]}"
+step "build the workspace" colcon build --symlink-install --base-paths "${paths[@]}" --cmake-args "${cmake_args[@]}"
 # What was compiled lies beside the modules, which are linked.
 unset NGO_ENV_UNDERLAY_ONLY
 . "$ROOT/env.sh"
