@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, thresholds
+from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, thresholds, truncated_cost
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
 from training.common import records
@@ -44,6 +44,8 @@ PEERS: dict[str, graph_peers.Peer] = {
 ROWS = ("odometry", *PEERS, "robust", "robust_anew", "right_loops")
 _SOLVED = 1.5
 """A graph is solved where its error is below so many times that of the right loops."""
+
+_ROUNDING = 1.0 + 1e-6
 
 
 Correct = Callable[[GraphProblem], CorrectedGraph]
@@ -153,6 +155,9 @@ def _measure(
     answers = {row: (problem.poses, float(limit_s)) if answer is None else answer for row, answer in found.items()}
     bar = max(_SOLVED * judged.ate_m(answers["right_loops"][0]), judged.least_ate_m)
     numbers = {row: _numbers(judged, poses, seconds, bar) for row, (poses, seconds) in answers.items()}
+    least = _ROUNDING * truncated_cost(problem, answers["right_loops"][0])
+    for row, (poses, _) in answers.items():
+        numbers[row]["cheapest"] = float(truncated_cost(problem, poses) <= least)
     for row in PEERS.keys() & found.keys():
         numbers[row]["stopped"] = float(found[row] is None)
         numbers[row]["solved"] *= float(found[row] is not None)

@@ -8,17 +8,19 @@ from training.report.page import interval, markdown
 
 _HEAD = """# Pose graphs with wrong loops
 
-Made by `{command}` at {revisions}. A graph counts as solved where its error (ATE after the best alignment) is
-below 1.5 times that of its right loops alone. Manhattan's truth is itself a solution, with its own loops: there an
-error below 0.5 m counts as solved. Means are over so many graphs as the second table says, with intervals of 95 %.
-Times are computing times, so that a busy machine does not change them. A peer that computes for longer than its limit
-is stopped: it counts as not solved, and its error is that of the odometry. A cell's name is the kind of its wrong
-loops and their percentage. `_place`: loops know no relative pose, only "the same place". All peers get the stated
+Made by `{command}` at {revisions}. A graph counts as solved where its error (ATE after the best alignment) is below
+1.5 times that of its right loops alone. Manhattan's truth is itself a solution, with its own loops: there an error
+below 0.5 m counts as solved. Means are over so many graphs as the second table says, with intervals of 95 %. Times
+are computing times, so that a busy machine does not change them. A peer that computes for longer than its limit is
+stopped: it counts as not solved, and its error is that of the odometry. A cell's name is the kind of its wrong loops
+and their percentage. `_place`: loops know no relative pose, only "the same place". All peers get the stated
 covariances; those of Manhattan are far too large. Rows and cells that are missing were not measured. `_online`: loops
 come in blocks of 120, in the order of their later poses; numbers are means over the blocks. There `robust` goes on
 from its last solution, and `changed` is the share of its verdicts about known loops that changed; `robust_anew`
 begins anew in each block. `hard_` graphs have a poor odometry, and twice as many loops as `synthetic_` ones. A loop
-counts as believed where the poses fit it within its stated threshold.
+counts as believed where the poses fit it within its stated threshold. `cheapest` is the share of graphs where the
+truncated cost of what was found is not above that of the right loops' solution. A graph that is not solved there has
+a cheaper wrong solution: no search for a lower cost would find the right one.
 
 | kind | wrong loops |
 |---|---|
@@ -51,8 +53,9 @@ def page(result: dict[str, Any]) -> str:
             parts.append(f"{_over_cells(cells, rows)}\n")
         parts.append("Time in seconds, precision and recall of the loops that are believed:\n")
         keys = ["seconds", "precision", "recall"]
-        if any("changed" in row for cell in cells.values() for row in cell.values()):
-            keys.append("changed")
+        keys += [
+            key for key in ("cheapest", "changed") if any(key in row for of in cells.values() for row in of.values())
+        ]
         lines = [
             (name, row, str(of.get("graphs", "")), *(interval(of[key]) if key in of else "" for key in keys))
             for name, cell in cells.items()

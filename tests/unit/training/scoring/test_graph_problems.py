@@ -58,14 +58,18 @@ def test_our_corrector_finds_what_gtsam_finds_in_a_clean_graph(easy: JudgedProbl
     np.testing.assert_allclose(between(ours.poses, theirs), 0.0, atol=1e-3)
 
 
-def test_a_hard_graph_is_solved_though_its_chain_rules_out_loops_that_are_right() -> None:
-    """Seven of ten loops are wrong, between stretches that look alike, and the odometry is 9 m off."""
-    judged = synthetic("lookalike", 70.0, 1000, True, 0, hard=True)
+@pytest.mark.parametrize(
+    ("kind", "percent", "metric", "seed"), [("lookalike", 70, True, 0), ("random", 80, False, 105)]
+)
+def test_a_hard_graph_is_solved_though_its_chain_rules_out_loops_that_are_right(
+    kind: str, percent: int, metric: bool, seed: int
+) -> None:
+    """Most loops are wrong, and the odometry is 9 m off; of places, only the ways between them say which."""
+    judged = synthetic(kind, percent, 1000, metric, seed, hard=True)
     problem, kept = judged.problem, judged.problem.loops[judged.right]
     right = graph_peers.least_squares(GraphProblem(problem.poses, problem.steps, kept, np.ones(len(kept))))
-    assert (
-        judged.ate_m(Robust().correct(problem).poses) < 1.2 * judged.ate_m(right) < 0.02 * judged.ate_m(problem.poses)
-    )
+    off = judged.ate_m(Robust().correct(problem).poses)
+    assert off < 1.2 * judged.ate_m(right) < 0.1 * judged.ate_m(problem.poses)
 
 
 def test_a_peer_that_takes_too_long_or_fails_has_no_answer(easy: JudgedProblem) -> None:
@@ -93,7 +97,7 @@ def test_the_table_has_every_row_and_keeps_other_cells(tmp_path: Path, monkeypat
     assert list(cells) == ["random_30", "local_30"]
     assert set(cells["local_30"]) == {"odometry", "right_loops", "robust", "gtsam_lm_cauchy"}
     robust = cells["random_30"]["robust"]
-    assert set(robust) == {"ate_m", "solved", "precision", "recall", "seconds", "graphs", "revision"}
+    assert set(robust) == {"ate_m", "solved", "precision", "recall", "seconds", "cheapest", "graphs", "revision"}
     assert robust["solved"]["mean"] == 1.0 and robust["precision"]["mean"] > 0.9
     assert "| random_30 |" in (tmp_path / "results_graphs.md").read_text()
 
@@ -139,4 +143,4 @@ def test_online_a_graph_comes_in_blocks_and_is_solved_in_each(tmp_path: Path, mo
     assert cell["robust"]["solved"]["mean"] == cell["robust_anew"]["solved"]["mean"] == 1.0
     assert cell["robust"]["changed"]["mean"] < 0.02
     page = (tmp_path / "results_graphs.md").read_text()
-    assert "| cell | row | graphs | seconds | precision | recall | changed |" in page
+    assert "| cell | row | graphs | seconds | precision | recall | cheapest | changed |" in page

@@ -34,14 +34,15 @@ class ChainUncertainty:
         moved[:, 0, 1] = -moved[:, 1, 0]
         moved[:, 0, 2], moved[:, 1, 2] = end[:, 1], -end[:, 0]
         sums = np.cumsum(moved @ covariances(steps) @ moved.mT, axis=0)
-        self._sums = np.concatenate((np.zeros((1, 3, 3)), sums))
+        self.sums = np.concatenate((np.zeros((1, 3, 3)), sums))
+        """Covariances ``(nodes, 3, 3)`` of what all steps before a node move the map by, about its origin."""
 
     def off_chain(self, loops: RelativePoses) -> tuple[np.ndarray, np.ndarray]:
         """Squared residual of each loop against the chain ``(n,)``, and the log of its covariance's determinant.
 
         Directions of which a loop knows nothing count in neither.
         """
-        return _off_chain(self.poses, self._sums, loops.nodes, loops.relative, covariances(loops))
+        return _off_chain(self.poses, self.sums, loops.nodes, loops.relative, covariances(loops))
 
     def off_pairs(self, loops: RelativePoses, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same of cycles of two loops ``pairs`` ``(n, 2)`` and the chain between their ends.
@@ -51,7 +52,7 @@ class ChainUncertainty:
         """
         if (loops.degrees < 3).any():
             raise ValueError("a loop does not know its whole relative pose; expected loops that do")
-        return _off_pairs(self.poses, self._sums, loops.nodes, loops.relative, covariances(loops), pairs)
+        return _off_pairs(self.poses, self.sums, loops.nodes, loops.relative, covariances(loops), pairs)
 
 
 def chain_poses(relative: np.ndarray, first: np.ndarray | None = None) -> np.ndarray:
@@ -70,7 +71,7 @@ def covariances(edges: RelativePoses) -> np.ndarray:
 
 
 @njit(cache=True)
-def _add_turned(total: np.ndarray, later: np.ndarray, earlier: np.ndarray, x: float, y: float, angle: float) -> None:
+def add_turned(total: np.ndarray, later: np.ndarray, earlier: np.ndarray, x: float, y: float, angle: float) -> None:
     """Add to the lower half of ``total`` the covariance of a motion about the map's origin, as seen at a point.
 
     The covariance is ``later`` less ``earlier``, and axes are turned. Written out: products of small matrices take ten
@@ -124,7 +125,7 @@ def _off_chain(
         c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
         x, y = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
         total = covariance[n].copy()
-        _add_turned(total, sums[max(i, j)], sums[min(i, j)], poses[j, 0], poses[j, 1], -poses[i, 2])
+        add_turned(total, sums[max(i, j)], sums[min(i, j)], poses[j, 0], poses[j, 1], -poses[i, 2])
         squared[n], logs[n] = _squared(
             total,
             c * x + s * y - relative[n, 0],
@@ -163,9 +164,9 @@ def _off_pairs(
         total = covariance[a].copy()
         # An error between i and k turns all that follows about the map's origin: j as this way puts it.
         mx, my = poses[i, 0] + ci * jx - si * jy, poses[i, 1] + si * jx + ci * jy
-        _add_turned(total, sums[max(i, k)], sums[min(i, k)], mx, my, -poses[i, 2])
-        _add_turned(total, sums[max(l, j)], sums[min(l, j)], poses[j, 0], poses[j, 1], turned)
+        add_turned(total, sums[max(i, k)], sums[min(i, k)], mx, my, -poses[i, 2])
+        add_turned(total, sums[max(l, j)], sums[min(l, j)], poses[j, 0], poses[j, 1], turned)
         # The second loop's own error is at l, along the axes of k.
-        _add_turned(total, covariance[b], nothing, ck * (jx - lx) + sk * (jy - ly), ck * (jy - ly) - sk * (jx - lx), kt)
+        add_turned(total, covariance[b], nothing, ck * (jx - lx) + sk * (jy - ly), ck * (jy - ly) - sk * (jx - lx), kt)
         squared[n], logs[n] = _squared(total, jx - relative[a, 0], jy - relative[a, 1], jt - relative[a, 2])
     return squared, logs

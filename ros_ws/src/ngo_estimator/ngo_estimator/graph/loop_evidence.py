@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty
 from ngo_estimator.graph.normal_equations import NormalEquations
+from ngo_estimator.graph.place_agreement import place_ratio
 from ngo_estimator.graph.relative_poses import RelativePoses
 
 _PARTNERS = 16
@@ -73,19 +74,26 @@ def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, inlie
     """Log odds ``(n,)`` of loops by their cycles with the chain and with each other, from their inlier ratio on."""
     odds = likelihood_ratio(*chain.off_chain(loops), loops.degrees, area)
     odds += math.log(inlier_ratio / (1.0 - inlier_ratio))
-    whole = np.flatnonzero(loops.degrees == 3)
-    if len(whole) > 1:
-        odds[whole] += np.minimum(_support(chain, loops[whole], area, inlier_ratio), _MOST_SUPPORT)
+    whole = loops.degrees == 3
+    for rows in (np.flatnonzero(whole), np.flatnonzero(~whole)):
+        if len(rows) > 1:
+            odds[rows] += np.minimum(_support(chain, loops[rows], area, inlier_ratio), _MOST_SUPPORT)
     return odds
 
 
 def _support(chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float) -> np.ndarray:
-    """What their partners say of loops ``(n,)``, log odds: each of these is right as often as the inlier ratio says."""
+    """What their partners say of loops ``(n,)``, log odds: each of these is right as often as the inlier ratio says.
+
+    All loops know the heading, or none of them is asked for it.
+    """
     ends, count = loops.nodes.astype(np.float64), min(_PARTNERS + 1, len(loops))
     partner = KDTree(ends).query(ends, k=count, p=1)[1]
     pairs = np.stack((np.repeat(np.arange(len(loops)), count), partner.ravel()), axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    ratio = likelihood_ratio(*chain.off_pairs(loops, pairs), np.full(len(pairs), 3), area)
+    if (loops.degrees == 3).all():
+        ratio = likelihood_ratio(*chain.off_pairs(loops, pairs), np.full(len(pairs), 3), area)
+    else:
+        ratio = place_ratio(chain, loops, pairs)
     each = np.log(inlier_ratio * np.exp(np.minimum(ratio, _LARGEST)) + 1.0 - inlier_ratio)
     return np.bincount(pairs[:, 0], each, len(loops))
 

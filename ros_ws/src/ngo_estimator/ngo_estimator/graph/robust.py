@@ -81,7 +81,7 @@ class Robust:
 
 
 def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> CorrectedGraph:
-    """The better of two solutions that begin at the chain."""
+    """The best of the solutions that begin at the chain."""
     area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
     chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
     whole = bool((problem.loops.degrees == 3).all())
@@ -90,16 +90,15 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         scale = _noticed(scale, least_scale)
         scaled = _scaled(problem, scale, scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
-    rows = np.argsort(-odds, kind="stable")
-    if whole:  # places say too little of each other to rule one out
-        rows = rows[: np.count_nonzero(odds > 0.0)]
-    likely = _affordable(replace(scaled, poses=chain), rows)
+    begun, rows = replace(scaled, poses=chain), np.argsort(-odds, kind="stable")
+    likely = _affordable(begun, rows[: np.count_nonzero(odds > 0.0)])
     solutions = [
         graduate(likely, chain, told=told)[0],
         believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio, told)[0],
     ]
-    if whole:
-        solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in solutions]
+    solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in solutions]
+    if not whole:  # cycles of places measure no scale: of a chain that is worse than stated they rule out right ones
+        solutions.append(graduate(_affordable(begun, rows), chain, told=told)[0])
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
