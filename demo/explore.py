@@ -8,22 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import Path as RosPath
 from ngo_msgs.action import Explore
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from visualization_msgs.msg import MarkerArray
 
+from demo.explore_picture import UNDER_WAY, Grid, Pictured, UnderWay, draw, in_frame_of, under_way
 from demo.graph import Graph, NodeSpec
 from ngo_sim.floor_plans import FloorPlanConfig
 from training.data.explored_worlds import Building
@@ -31,7 +29,6 @@ from training.scoring.exploring import Seen
 
 _START_TIMEOUT_S = 300.0
 _MOST_S = 3600.0
-_UNKNOWN_GREY = 0.75
 
 Show = Callable[[str, float], None]
 """Called with what is going on and the share seen so far."""
@@ -72,7 +69,9 @@ class ExploreDemo:
         self._config, self._out = config, out
         self._seen = Seen(Building(config.seed, FloorPlanConfig(scale=config.scale, people=0)))
         self._truth: list[np.ndarray] = []
-        self._grid: tuple[np.ndarray, float, np.ndarray] | None = None
+        self._grid: Grid | None = None
+        self._told: dict[type, Any] = {}  # the newest of what the explorer publishes
+        self._under_way: UnderWay | None = None
         self._rows: list[tuple[float, float, float]] = []  # time, path, coverage
         self._path_m, self._collisions, self._time_s = 0.0, 0, 0.0
 
@@ -90,7 +89,11 @@ class ExploreDemo:
             finally:
                 node.destroy_node()
                 rclpy.try_shutdown(context=context)
-        self._draw(result)
+        assert self._grid is not None
+        found = Pictured(
+            result, self._seen.map, np.array(self._truth), self._grid, self._under_way, np.array(self._rows)
+        )
+        draw(self._out / "picture.png", found)
         return result
 
     def _explore(self, graph: Graph, node: Any, step: Callable[[], None], show: Show) -> dict[str, Any]:
@@ -99,6 +102,8 @@ class ExploreDemo:
         node.create_subscription(OccupancyGrid, "map", self._on_map, latched)
         node.create_subscription(OccupancyGridUpdate, "map_updates", self._on_update, 10)
         node.create_subscription(PointStamped, "collision", self._on_collision, 10)
+        for kind, name in ((MarkerArray, "frontiers"), (PoseStamped, "goal"), (RosPath, "path")):
+            node.create_subscription(kind, f"explore/{name}", self._keep, latched)
         client = ActionClient(node, Explore, "explore")
         show("starting the nodes", 0.0)
         for spec in self._config.nodes():
@@ -138,6 +143,9 @@ class ExploreDemo:
         self._truth.append(now)
         self._time_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
+    def _keep(self, message: Any) -> None:
+        self._told[type(message)] = message
+
     def _on_collision(self, message: PointStamped) -> None:
         self._collisions += 1
 
@@ -163,48 +171,7 @@ class ExploreDemo:
         columns, rows = np.floor((points - corner) / resolution).astype(int).T
         inside = (rows >= 0) & (columns >= 0) & (rows < values.shape[0]) & (columns < values.shape[1])
         known = values[rows[inside], columns[inside]] != -1
-        self._rows.append((self._time_s, self._path_m, float(np.count_nonzero(known)) / len(points)))
-
-    def _draw(self, result: dict[str, Any]) -> None:
-        """The true map with the way, the map that was found, and the share seen by time."""
-        figure, (true, found, curve) = plt.subplots(1, 3, figsize=(19.0, 6.2))
-        truth = np.array(self._truth)
-        whole = self._seen.map
-        _show_map(true, whole.values, whole.resolution_m, whole.origin_xy)
-        true.plot(truth[:, 0], truth[:, 1], color="#1f6fd6", linewidth=1.0)
-        true.plot(*truth[0, :2], "o", color="black")
-        true.set_title("what can be seen, and the way of the robot")
-        assert self._grid is not None
-        _show_map(found, *self._grid)
-        found.set_title("the map that it made, from its first pose on")
-        times, _, seen = np.array(self._rows).T
-        curve.plot(times - times[0], 100.0 * seen)
-        curve.axhline(95.0, color="0.7", linewidth=0.8)
-        curve.set(xlabel="simulated time [s]", ylabel="seen of what can be seen [%]", ylim=(0.0, 101.0))
-        title = f"building, seed {result['seed']}: {100 * result['coverage']:.1f} % seen on {result['path_m']:.0f} m"
-        figure.suptitle(f"{title} in {result['time_s']:.0f} s; {result['ended']}")
-        figure.tight_layout()
-        figure.savefig(self._out / "picture.png", dpi=110)
-        plt.close(figure)
-
-
-def in_frame_of(points: np.ndarray, pose_xyyaw: np.ndarray) -> np.ndarray:
-    """Points ``(n, 2)`` as a robot at a pose sees them."""
-    cos, sin = np.cos(pose_xyyaw[2]), np.sin(pose_xyyaw[2])
-    away = points - pose_xyyaw[:2]
-    return np.stack((cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]), axis=1)
-
-
-def _show_map(axes: Any, values: np.ndarray, resolution: float, corner: np.ndarray) -> None:
-    rows, columns = np.flatnonzero((values != -1).any(axis=1)), np.flatnonzero((values != -1).any(axis=0))
-    shown = np.select([values == 0, values == 100], [1.0, 0.0], _UNKNOWN_GREY)
-    left, bottom = corner
-    extent = (left, left + values.shape[1] * resolution, bottom, bottom + values.shape[0] * resolution)
-    axes.imshow(shown, "gray", origin="lower", vmin=0.0, vmax=1.0, extent=extent, interpolation="nearest")
-    axes.set(
-        xlim=left + resolution * (columns[[0, -1]] + (-5, 5)),
-        ylim=bottom + resolution * (rows[[0, -1]] + (-5, 5)),
-        xlabel="x [m]",
-        ylabel="y [m]",
-        aspect="equal",
-    )
+        share = float(np.count_nonzero(known)) / len(points)
+        self._rows.append((self._time_s, self._path_m, share))
+        if self._under_way is None and share >= UNDER_WAY and len(self._told) == 3:
+            self._under_way = under_way((values.copy(), resolution, corner), self._told)
