@@ -34,8 +34,8 @@ the estimator. Robot, map, path follower and limits are the same in all rows; ex
 smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places; few places make them too narrow.
 
 Coverage counts the free cells that exact rays see from all places where the robot can go. The ratio is the geometric
-mean over the places where both rules came to 95 %. The tour on the known map is a heuristic, greedy cover and 2-opt: it
-is no bound, and rules may beat it.
+mean over the places where both rules came to 95 %. The tour on the known map is searched for (insertion, 2-opt, or-opt,
+large neighbourhoods); the shortest one may be a little shorter.
 IoU is the mean of free and occupied cells beside those exact rays. Decisions are timed as processor time."""
 
 
