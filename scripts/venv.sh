@@ -62,6 +62,7 @@ step "install the pinned requirements" install "${requirements[@]}"
 if [ "$purpose" = all ] && ! install -q -r requirements/locked_cpu.txt >/dev/null 2>&1; then
     step "install PyTorch's build for GPUs" install -r requirements/locked_gpu.txt
 fi
+"$VENV/bin/python" scripts/link_same_files.py "$VENV/lib"
 echo "$underlay" >"$VENV/ngo_underlay"
 echo "$purpose" >"$VENV/ngo_for"
 echo "$key" >"$VENV/ngo_key"

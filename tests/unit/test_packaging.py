@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import setuptools
 
+from scripts.link_same_files import LEAST_BYTES, link_same_files
 from tests.unit.test_layers import imported_names
 
 ROOT = Path(__file__).parents[2]
@@ -129,6 +130,17 @@ def test_every_pin_is_locked_with_hashes_and_nothing_else_is() -> None:
     for name in ("locked", "locked_lidar", "locked_ros", "locked_gpu", "locked_cpu"):
         entries = re.split(r"(?m)^(?=\w)", (ROOT / "requirements" / f"{name}.txt").read_text())[1:]
         assert entries and all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries), name
+
+
+def test_same_files_are_linked_and_no_others(tmp_path: Path) -> None:
+    contents = {"a/one": b"x" * LEAST_BYTES, "b/two": b"x" * LEAST_BYTES, "b/other": b"y" * LEAST_BYTES, "small": b"x"}
+    for name, content in contents.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "link").symlink_to("a/one")
+    assert link_same_files(tmp_path) == LEAST_BYTES and link_same_files(tmp_path) == 0
+    assert {name: (tmp_path / name).read_bytes() for name in contents} == contents
+    assert (tmp_path / "a/one").samefile(tmp_path / "b/two") and (tmp_path / "link").is_symlink()
 
 
 def test_the_container_is_made_as_the_documents_say() -> None:
