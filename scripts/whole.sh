@@ -3,4 +3,5 @@
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 
-[ "$(find_purpose)" = all ] || die "this needs PyTorch and the simulators, and .venv has what a lidar needs: run make venv FOR=all"
+purpose="$(find_purpose)"
+[ "$purpose" = all ] || die "this needs PyTorch and the simulators, and .venv has what a lidar needs: run make venv FOR=all"
