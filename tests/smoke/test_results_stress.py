@@ -105,7 +105,7 @@ def test_simulated_tables_of_one_tiny_drive_each(tmp_path: Path, monkeypatch: py
     ours = tables["buildings"]["half_covered"]["ours"]
     assert ours["drives"] == 1 and 0.0 < ours["ate_m"] < 0.5 and 0.0 <= ours["within_three_deviations"] <= 1.0
     assert tables["loops"]["poor_wheels"]["wheels"]["largest_m"] > tables["loops"]["poor_wheels"]["ours"]["largest_m"]
-    assert set(tables["joins"]) == {"aliased", "two_buildings"}
+    assert set(tables["joins"]) == {"aliased", "two_buildings", "same_building"}
     joins = tables["joins"]["two_buildings"]["ours"]
     assert joins["each"]["wrong_loops"] == [joins["wrong_loops"]]
     page = (tmp_path / "docs" / "results_stress.md").read_text()

@@ -81,7 +81,7 @@ def last_stretch(poses: np.ndarray, first: int) -> np.ndarray:
 
 def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans]) -> PlaceEvidence:
     """The evidence of the parts of a stretch, each of some scans, in the frame of the place's scans."""
-    place, shares, points, normals = _thinned(place), [], [np.zeros((0, 2))], [np.zeros((0, 2))]
+    place, shares, points, normals = _steady(_thinned(place)), [], [np.zeros((0, 2))], [np.zeros((0, 2))]
     for part in map(_thinned, stretch):
         ours = sightings(place.sensors, place.profiles, part.points)
         its = sightings(part.sensors, part.profiles, place.points)
@@ -114,6 +114,12 @@ def distinct_walls(points: np.ndarray, normals: np.ndarray) -> int:
 def _thinned(scans: PlacedScans) -> PlacedScans:
     one = _one_a_cell(scans.points)
     return replace(scans, points=scans.points[one], normals=scans.normals[one])
+
+
+def _steady(scans: PlacedScans) -> PlacedScans:
+    """Without points that the same scans mostly see through: people walked there."""
+    through, on = sightings(scans.sensors, scans.profiles, scans.points).T
+    return replace(scans, points=scans.points[on > through], normals=scans.normals[on > through])
 
 
 def _one_a_cell(points: np.ndarray) -> np.ndarray:
