@@ -56,7 +56,6 @@ class MixtureConfig:
     noise: float = 0.5  # log likelihood by which a mode of the search must be better than where a hypothesis leads
     same_m: float = 0.05  # poses closer than this are one
     same_rad: float = 0.03
-    open_share: float = 0.01  # mean squared slope of the lines, below which a direction is left to the hypothesis
 
     # Lost, and segments.
     lost_share: float = 0.6  # of the usual score, below which a scan fits nowhere

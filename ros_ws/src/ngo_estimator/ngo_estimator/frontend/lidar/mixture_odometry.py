@@ -39,8 +39,8 @@ _BROAD = 0.15
 _UNKNOWN = np.eye(3)
 """Information without which the walls may leave a direction open."""
 
-_KNOWN = np.array((0.02, 0.02, 0.01)) ** 2
-"""Variances (m, m, rad) up to which walls measure a pose that is compared with hypotheses."""
+_OPEN_SHARE = 1e-6
+"""Mean squared slope of the lines below which a direction is open; what normals agree on counts, however little."""
 
 _FEWEST = 12
 """Points without which a scan does not contradict what was seen."""
@@ -160,14 +160,11 @@ class MixtureOdometry:
         other = again(between(self._pose, found.pose))
         if other is None:
             return scan, found
-        points = _on_lines(other, self.config.search_points)
-        if not len(points):
+        few = _on_lines(other, self.config.search_points)
+        if not len(few.points):
             return scan, found
-        refound = self._sharpened(
-            other,
-            points,
-            self._fit(other, points, ANY, found.pose, self._prior(self.config.least_share), self._weight(points)),
-        )
+        prior, weight = self._prior(self.config.least_share), self._weight(few.points)
+        refound = self._sharpened(other, few, self._fit(few, ANY, found.pose, prior, weight))
         return (other, refound) if refound.score >= found.score else (scan, found)
 
     def _accepted(
@@ -221,13 +218,14 @@ class MixtureOdometry:
         Modes are those near the means of the hypotheses, and the two best of the search where these are others.
         """
         config = self.config
-        points = _on_lines(scan, config.search_points)
+        few = _on_lines(scan, config.search_points)
+        points = few.points
         if not len(points):
             return None
         # Few points contradict nothing: the prior decides.
         least = config.lost_share * self._usual if len(points) >= _FEWEST else 0.0
         prior, weight = self._prior(config.least_share), self._weight(points)
-        fits = [self._fit(scan, points, k, None, prior, weight) for k in self._starts()]
+        fits = [self._fit(few, k, None, prior, weight) for k in self._starts()]
         for wide in (False, True):
             if wide:
                 prior = prior.widened(0.5 * config.most_window_m, 0.5 * math.radians(config.most_window_deg))
@@ -236,11 +234,11 @@ class MixtureOdometry:
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
             ):  # fmt: skip
                 if not any(self._is_same(pose, other.pose) for other in fits):
-                    fit = self._fit(scan, points, ANY, pose, prior, weight)
+                    fit = self._fit(few, ANY, pose, prior, weight)
                     fits.append(replace(fit, total=fit.total - config.noise * weight))
             fitting = sorted((fit for fit in fits if fit.score >= least), key=lambda fit: -fit.total)
             if fitting:
-                best = self._sharpened(scan, points, fitting[0])
+                best = self._sharpened(scan, few, fitting[0])
                 return self._doubted([best, *fitting[1:]], weight)
         return None
 
@@ -295,9 +293,7 @@ class MixtureOdometry:
             math.radians(config.heading_step_deg),
         )
 
-    def _fit(
-        self, scan: KeyScan, points: Array, hypothesis: int, start: Array | None, prior: Mixture, weight: float
-    ) -> _Mode:
+    def _fit(self, few: KeyScan, hypothesis: int, start: Array | None, prior: Mixture, weight: float) -> _Mode:
         """A mode, registered under a hypothesis from where that has it, or from ``start`` ``(3,)``."""
         mean = compose(self._pose, self.mixture.steps[hypothesis])
         if start is None:
@@ -305,36 +301,29 @@ class MixtureOdometry:
         else:
             broad = np.diag(np.full(3, _BROAD**-2))
             information = broad * min(1.0, _FAR / max(squared_deviations(start, mean, broad), 1e-9))
-        found = self._icp(scan, start, mean, information, self.config.icp)
-        score = self._submap.field.score(points, found.pose)
+        found = self._icp(few, start, mean, information, self.config.icp)
+        score = self._submap.field.score(few.points, found.pose)
         return _Mode(found, hypothesis, score, score + weight * float(prior.logs(found.pose).max()))
 
-    def _sharpened(self, scan: KeyScan, points: Array, mode: _Mode) -> _Mode:
-        """A mode registered under the hypothesis that is likeliest there."""
-        mixture = self.mixture
-        walls = mode.walls
-        # Where the walls leave the pose open, the mode has it from its own hypothesis: it speaks for no other.
-        known = np.minimum(np.diag(walls), _KNOWN)
-        likeliest = mixture.likeliest(
-            mode.pose, mixture.prior(self._pose, self._covariance, np.diag(known), (0.0, 0.0))
-        )
-        if likeliest == mode.hypothesis != ANY:
-            return mode
+    def _sharpened(self, scan: KeyScan, few: KeyScan, mode: _Mode) -> _Mode:
+        """A mode of the ``few`` points, registered with all of the scan's under the hypothesis that is likeliest."""
+        mixture, walls = self.mixture, mode.walls
+        likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
         mean = compose(self._pose, mixture.steps[likeliest])
         covariance = mixture.pose_covariance(likeliest, self._covariance, mean)
         squared = squared_deviations(mode.pose, mean, inverted(covariance + walls))
         information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
         found = self._icp(scan, mode.pose, mean, information, self._last_steps)
-        return _Mode(found, likeliest, self._submap.field.score(points, found.pose), mode.total)
+        return _Mode(found, likeliest, self._submap.field.score(few.points, found.pose), mode.total)
 
     def _icp(self, scan: KeyScan, start: Array, mean: Array, information: Array, config: IcpConfig) -> Registration:
-        return icp(
-            self._submap.lines, scan.points, scan.normals, start, (mean, information), config, self.config.open_share
-        )
+        return icp(self._submap.lines, scan.points, scan.normals, start, (mean, information), config, _OPEN_SHARE)
 
 
-def _on_lines(scan: KeyScan, most: int) -> Array:
-    points = scan.points[(scan.normals != 0.0).any(axis=1)]
-    if len(points) < 2 * _FEWEST:
-        points = scan.points
-    return points[:: max(1, math.ceil(len(points) / most))]
+def _on_lines(scan: KeyScan, most: int) -> KeyScan:
+    """The scan with at most so many of its points, of those on lines where these are enough."""
+    kept = np.flatnonzero((scan.normals != 0.0).any(axis=1))
+    if len(kept) < 2 * _FEWEST:
+        kept = np.arange(len(scan.points))
+    kept = kept[:: max(1, math.ceil(len(kept) / most))]
+    return replace(scan, points=scan.points[kept], normals=scan.normals[kept])

@@ -8,6 +8,8 @@ deviations. Distance sets the pace, not time: a robot that stands learns nothing
 import math
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.velocity_filter import VelocityFilter
@@ -137,20 +139,15 @@ class MotionMixture:
     ) -> Mixture:
         """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``, as ``walls`` ``(3, 3)`` would
         measure them; no deviation is below ``least`` (m, rad), and no weight below ``share``."""
-        usable = self._usable
-        variances = self._deviations**2 + (0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2])
+        shared = np.array((0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]))
+        variances = self._deviations**2 + shared
         for k in (LAST, VELOCITY):
             joint, _ = self._foretold[k]
             variances[k] = 0.5 * (joint[0, 0] + joint[1, 1]), joint[2, 2]
         if walls is not None:
             variances += (0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])
-        deviations = np.sqrt(variances[usable] + np.square(least))
-        weights = np.maximum(self._prior_weights[usable], share)
-        weights /= weights.sum()
-        logs = np.log(weights) - 2.0 * np.log(deviations[:, 0]) - np.log(deviations[:, 1])
-        peak = -2.0 * math.log(least[0]) - math.log(least[1]) if min(least) > 0.0 else 0.0
-        means = np.array([compose(pose, step) for step in self._steps[usable]])
-        return Mixture(means, deviations, logs - peak)
+        both = variances, self._prior_weights
+        return Mixture(*_formed(pose, self._steps, self._usable, *both, np.array(least), share))
 
     def _unknown(self) -> Array:
         """Variances ``(6, 2)`` of what the last match left open of the motion."""
@@ -217,16 +214,7 @@ class MotionMixture:
         rate = c.learn_rate * min(1.0, way / c.learn_m + turn / c.learn_rad)
         if rate <= 0.0:
             return
-        off = np.array([between(mean, step) for mean in self._steps])
-        errors = np.stack(
-            (0.5 * (off[:, 0] ** 2 + off[:, 1] ** 2), np.array([wrap(float(e)) ** 2 for e in off[:, 2]])), axis=-1
-        )
-        spread = self._deviations**2 + variance
-        logs = np.log(self._prior_weights) - np.log(spread[:, 0]) - 0.5 * np.log(spread[:, 1])
-        logs -= errors[:, 0] / spread[:, 0] + 0.5 * errors[:, 1] / spread[:, 1]
-        logs[~usable] = -np.inf
-        shares = np.exp(logs - logs.max())
-        shares /= shares.sum()
+        errors, shares = _shared(self._steps, step, self._deviations, variance, self._prior_weights, usable)
         if self._raw is not None and abs(self._raw[2]) < c.learn_rad and way < 2.0 * c.learn_m:
             self.calibration.learn(self._raw, step, float(shares[TIGHT] + shares[LOOSE]))
         held = self._weights[usable].sum()
@@ -241,3 +229,41 @@ class MotionMixture:
         self._squares += part * (np.minimum(shrunk / self._base**2, c.most_factor**2) - self._squares)
         least = np.array(c.least_factors)[:, None]
         self._factors = np.clip(np.sqrt(self._squares), least, c.most_factor)
+
+
+@njit(cache=True)
+def _shared(
+    steps: Array, found: Array, deviations: Array, variance: Array, weights: Array, usable: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Squared errors ``(n, 2)`` of hypotheses against the motion that was ``found``, and shares ``(n,)`` in it."""
+    errors, logs = np.empty((len(steps), 2)), np.full(len(steps), -np.inf)
+    for k in range(len(steps)):
+        off = between(steps[k], found)
+        errors[k] = 0.5 * (off[0] ** 2 + off[1] ** 2), off[2] ** 2
+        if usable[k]:
+            spread = deviations[k] ** 2 + variance[k]
+            logs[k] = math.log(weights[k]) - math.log(spread[0]) - 0.5 * math.log(spread[1])
+            logs[k] -= errors[k, 0] / spread[0] + 0.5 * errors[k, 1] / spread[1]
+    shares = np.exp(logs - logs.max())
+    return errors, shares / shares.sum()
+
+
+@njit(cache=True)
+def _formed(
+    pose: Array, steps: Array, usable: NDArray[np.bool_], variances: Array, weights: Array, least: Array, share: float
+) -> tuple[Array, Array, Array]:
+    """Means, deviations and logarithms of weights of the mixture after ``pose`` ``(3,)``."""
+    n = int(usable.sum())
+    means, deviations, logs = np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
+    peak = -2.0 * math.log(least[0]) - math.log(least[1]) if min(least) > 0.0 else 0.0
+    i = 0
+    for k in range(len(steps)):
+        if usable[k]:
+            means[i] = compose(pose, steps[k])
+            deviations[i] = np.sqrt(variances[k] + least**2)
+            logs[i] = max(weights[k], share)
+            i += 1
+    total = logs.sum()
+    for i in range(n):
+        logs[i] = math.log(logs[i] / total) - 2.0 * math.log(deviations[i, 0]) - math.log(deviations[i, 1]) - peak
+    return means, deviations, logs
