@@ -123,13 +123,6 @@ def taken_integer(arrays: Mapping[str, np.ndarray], name: str, least: int = 0) -
     return value
 
 
-def taken_indices(arrays: Mapping[str, np.ndarray], name: str, below: int) -> np.ndarray:
-    """The indices ``name`` ``(n,)``; raises ``StateError`` unless they ascend from 0 or more to less than ``below``."""
-    indices = taken(arrays, name, np.int64, -1)
-    require_ascending(indices, name, below)
-    return indices
-
-
 def require_ascending(indices: np.ndarray, name: str, below: int) -> None:
     """Raise ``StateError`` unless indices ``(n,)`` ascend from 0 or more to less than ``below``."""
     within = len(indices) == 0 or (indices[0] >= 0 and indices[-1] < below and (np.diff(indices) > 0).all())
