@@ -7,14 +7,20 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.geometry.se2 import compose
 from ngo_estimator.loops.place_evidence import PlaceEvidence
+from ngo_estimator.loops.scan_settings import ScanGraphConfig, ScanLoopConfig
 from ngo_estimator.nodes.trajectory_report import TrajectoryReport
 from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
+from tests.unit.ngo_estimator.lidar_steps import HOUSE, drifted, lidar_steps, loop_way
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, between, outline, scan_at, way
+from tests.unit.ngo_estimator.ray_casting import fan
+from tests.unit.ngo_estimator.ray_casting import scan_at as cast_scan
 
 FIRST = way(*ROUND, ROUND[0], (4.0, 1.0))
 BACK = way((1.0, 6.0), ROUND[0], *ROUND[1:])  # another corner, from which it drives on
@@ -128,3 +134,33 @@ def test_a_state_that_was_saved_while_it_was_lost_goes_on_to_the_last_bit() -> N
         mine, its = core.update(step), other.update(step)
         np.testing.assert_array_equal(mine.pose_xyyaw, its.pose_xyyaw)
         assert mine.lost_since_ns == its.lost_since_ns
+
+
+@pytest.mark.parametrize("wrong", [None, (0.6, 0.3, 0.2), (0.0, 0.0, 0.35)], ids=["right", "moved", "turned"])
+def test_a_step_that_was_sure_and_wrong_is_noticed_by_its_scans_and_the_robot_found_again(
+    wrong: tuple[float, float, float] | None,
+) -> None:
+    """In the second round, where the map is known, a step says something else than was driven."""
+    true, random = loop_way(2.4), np.random.default_rng(0)
+    odometry, slip = drifted(true, (0.01, 0.005, 0.004)), int(len(true) * 1.6 / 2.4)
+    if wrong is not None:
+        odometry[slip:] = compose(
+            compose(odometry[slip], np.array(wrong)), se2.between(odometry[slip], odometry[slip:])
+        )
+
+    def scan(k: int, stamp_ns: int) -> KeyScan:
+        return cast_scan(HOUSE, true[k], stamp_ns, fan(181, 270.0), noise=(0.01, random))
+
+    core = ScanTrajectory(ScanGraphConfig(loops=ScanLoopConfig(every=4)))
+    updates = [core.update(step) for step in lidar_steps(odometry, scan)]
+    lost = [k for k, update in enumerate(updates, 1) if update.lost_since_ns is not None]
+    if wrong is None:
+        assert not lost
+    else:
+        assert slip < lost[0] < slip + 60 and lost[-1] < len(true) - 30
+        since = updates[lost[0] - 1].lost_since_ns
+        assert since is not None
+        assert slip - 20 < list(core.log.stamps_ns.values).index(since) <= lost[0]
+        assert updates[lost[0]].covariance[0, 0] > 1e3
+    last = core.newest().pose_xyyaw
+    assert np.hypot(*(last - true[-1])[:2]) < 0.3 and 3.0 * position_std(core.newest().covariance) < 1.0

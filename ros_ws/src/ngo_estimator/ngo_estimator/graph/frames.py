@@ -58,6 +58,10 @@ class Frames:
         if joins:
             self._joins.append(len(self) - 1)
 
+    def part_at(self, frame: int) -> None:
+        """Let another odometry go on from a frame."""
+        self._joins.set(np.union1d(self.joins, (frame,)))
+
     def add_node(self) -> None:
         """Make the newest frame a node."""
         self._nodes.append(len(self) - 1)

@@ -98,6 +98,15 @@ class KeyScanChain(NodeChain):
         """The nodes ``(n,)`` between which nobody measured a step, and the last one: they stay."""
         return np.concatenate((self.segments, self.segments[1:] - 1, [len(self) - 1]))
 
+    def part_at(self, node: int) -> None:
+        """Begin a segment with an earlier node: what the step to it said turned out to be wrong."""
+        for rows in (self._step_covariance, self._published_covariance):
+            rows.values[node - 1] = OPEN
+        self._step_variance.values[node - 1] = largest_variances(OPEN[None])[0]
+        self._segments.set(np.union1d(self.segments, (node,)))
+        self.frames.part_at(int(self.frames.nodes[node]))
+        self._end = self._end + OPEN
+
     def bridge(self, keep: np.ndarray, bridges: NeighbourTree) -> None:
         """Let go of nodes, as ``let_go``; ``bridges`` are the steps over the gaps, in their order."""
         kept = np.flatnonzero(keep)

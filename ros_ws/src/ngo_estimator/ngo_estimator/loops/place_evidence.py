@@ -40,12 +40,17 @@ _SAID = 40
 class PlaceEvidence:
     """``walls``: different straight walls that both see. ``through``: the largest share of sightings through walls.
 
-    ``said``: in how many parts of the stretch there were sightings enough for a share.
+    ``said``: in how many parts of the stretch there were sightings enough for a share. ``seen``: all sightings, and
+    ``mean``: the share of those of them that go through walls. ``overlap``: the share of points of one side that the
+    other one sees, or sees through.
     """
 
     walls: int
     through: float
     said: int
+    seen: int = 0
+    mean: float = 0.0
+    overlap: float = 0.0
 
 
 NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)
@@ -81,17 +86,24 @@ def last_stretch(poses: np.ndarray, first: int) -> np.ndarray:
 
 def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans]) -> PlaceEvidence:
     """The evidence of the parts of a stretch, each of some scans, in the frame of the place's scans."""
-    place, shares, points, normals = _steady(_thinned(place)), [], [np.zeros((0, 2))], [np.zeros((0, 2))]
+    counts, possible = [], 1
+    place, points, normals = _steady(_thinned(place)), [np.zeros((0, 2))], [np.zeros((0, 2))]
     for part in map(_thinned, stretch):
         ours = sightings(place.sensors, place.profiles, part.points)
         its = sightings(part.sensors, part.profiles, place.points)
         agree = ours[:, 1] > ours[:, 0]
         points.append(part.points[agree])
         normals.append(part.normals[agree])
-        # A wall that one side alone has is seen through by the other alone.
-        shares += [seen[0] / seen.sum() for seen in (ours.sum(0), its.sum(0)) if seen.sum() >= _SAID]
+        counts += [ours.sum(0), its.sum(0)]
+        possible += len(place.sensors) * len(part.points) + len(part.sensors) * len(place.points)
     walls = distinct_walls(np.concatenate(points), np.concatenate(normals))
-    return PlaceEvidence(walls, max(shares, default=0.0), len(shares))
+    # A wall that one side alone has is seen through by the other alone.
+    shares = [through / (through + on) for through, on in counts if through + on >= _SAID]
+    through, on = np.sum([(0, 0), *counts], axis=0).tolist()
+    seen = through + on
+    return PlaceEvidence(
+        walls, max(shares, default=0.0), len(shares), seen, mean=through / max(1, seen), overlap=seen / possible
+    )
 
 
 def distinct_walls(points: np.ndarray, normals: np.ndarray) -> int:

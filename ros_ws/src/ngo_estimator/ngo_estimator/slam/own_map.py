@@ -42,6 +42,17 @@ _TRIAL_LOOKS, _CONTRADICTIONS = 40, 3
 """Looks after a claim in which the newest scans may still contradict it, and how many in a row do."""
 
 
+_SURE_M = 1.5
+"""Half width of the search (m) around key scans against which the newest pose is taken to be sure."""
+
+_HERE, _ELSEWHERE, _LEAST_SEEN, _LOOKS_ELSEWHERE = 0.25, 0.35, 200, 4
+"""Mean share of sightings through walls up to which that is right, and from which on it is wrong, of so many at least;
+the looks for which it must be wrong."""
+
+_LEAST_OVERLAP = 0.2
+"""Share of points that the other side sees at least: through glass alone all sightings go through walls, but few."""
+
+
 class OwnMap:
     """Takes each newest key scan, and says where else in the map the robot was when it took the last ones."""
 
@@ -57,6 +68,8 @@ class OwnMap:
         self._matcher: ScanMatcher | None = None
         # Looks for which the newest segment may still turn out to lie elsewhere, and how many in a row say so.
         self._trial, self._against = 0, 0
+        # Key scans of looks: the last one that agreed with the map where the pose is sure, and those against it since.
+        self._agreed, self._astray = 0, np.zeros(0, np.int64)
 
     def follow(self, chain: KeyScanChain) -> None:
         """Take the step to the newest key scan; nobody knows it where that begins a segment."""
@@ -68,7 +81,7 @@ class OwnMap:
 
     def fits(self, keys: int) -> bool:
         """Whether all key scans that it names are among the first so many."""
-        return all(bool(((named >= 0) & (named < keys)).all()) for named in (self.looks, self._keys))
+        return all(bool(((named >= 0) & (named < keys)).all()) for named in (self.looks, self._keys, self._astray))
 
     def _forget_looks(self) -> None:
         self._window.clear()
@@ -145,11 +158,45 @@ class OwnMap:
         self._forget_looks()
         return True
 
+    def astray(
+        self,
+        scans: Sequence[KeyScan],
+        views: KeyScanViews,
+        chain: KeyScanChain,
+        windows: np.ndarray,
+        has_loops: bool,
+    ) -> int | None:
+        """The key scan from which on the robot is not where the graph has it; None where nothing says so.
+
+        Where the graph is sure of the pose, scans that look through the walls there say that a step was wrong.
+        ``has_loops``: whether the newest key scan has one.
+        """
+        newest, config = len(chain) - 1, self._config.loops
+        last = np.arange(newest + 1 - config.source_keys, newest + 1)
+        way = np.cumsum(np.hypot(*np.diff(chain.poses[::-1, :2], axis=0).T))[::-1]  # to the newest, of all others
+        old = np.flatnonzero((windows[:newest, 0] <= _SURE_M) & (way > config.least_gap_m))
+        if has_loops:
+            self._agreed, self._astray = newest, self._astray[:0]
+        if has_loops or last[0] < chain.borders[-1] or not len(old):
+            return None
+        found = evidence_of(scans, views, (last, chain.poses[last]), (old, chain.poses[old]))
+        if found.said and found.mean <= _HERE:
+            self._agreed, self._astray = newest, self._astray[:0]
+        elif found.seen >= _LEAST_SEEN and found.overlap >= _LEAST_OVERLAP and found.mean > _ELSEWHERE:
+            self._astray = np.append(self._astray, newest)
+        if len(self._astray) < _LOOKS_ELSEWHERE:
+            return None
+        first = max(self._agreed + 1, int(self._astray[0]) - config.source_keys)
+        self._agreed, self._astray = newest, self._astray[:0]
+        self._forget_looks()
+        return first if first > chain.borders[-1] else None
+
     def thin(self, keep: np.ndarray) -> None:
         """Take that the key scans that are not among ``keep`` ``(keys,)`` are gone."""
         left, number = keep[self._keys], np.cumsum(keep) - 1
         self._keys, self._poses = number[self._keys[left]], self._poses[left]
-        self.looks = number[self.looks]
+        self.looks, self._astray = number[self.looks], number[self._astray]
+        self._agreed = int(number[self._agreed])
         self.map_changed()
 
     def map_changed(self) -> None:
@@ -199,7 +246,10 @@ class OwnMap:
         pairs = np.stack((self._keys[near], later[agree]), axis=1)
         return ScanLoops(pairs, np.stack(relative), np.stack(turned), evidence, np.ones(len(poses), bool))
 
-    SAVED = ("_window", "looks", "_keys", "_poses", "_stale", "_parts", "_trial", "_against")
+    SAVED = (
+        "_window", "looks", "_keys", "_poses", "_stale", "_parts", "_trial", "_against", "_agreed",
+        "_astray",
+    )  # fmt: skip
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""

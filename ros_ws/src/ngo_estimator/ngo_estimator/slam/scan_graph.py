@@ -148,6 +148,11 @@ class ScanGraph(PoseGraph):
             if self._own_map.contradicted(self._scans, self._finder.views, chain, self._parts):
                 self._part_newest_segment()
                 return
+            astray = self._own_map.astray(self._scans, self._finder.views, chain, windows, len(fresh) > 0)
+            if astray is not None:
+                chain.part_at(astray)
+                self._part_newest_segment()
+                return
             self._claim(self._own_map.look(self._scans, self._finder.views, chain, windows, self._parts))
         self._waiting += self._waiting > 0
 
