@@ -14,7 +14,7 @@ from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_recordings.scan_stream import LidarScan, WheelPose
-from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, cast, fan
+from tests.unit.ngo_estimator.ray_casting import CORRIDOR, HALLWAY, ROOM, cast, fan, walls
 
 ANGLES = fan(181, 240.0)
 PERIOD_NS = 100_000_000
@@ -102,6 +102,17 @@ def test_a_corridor_leaves_the_way_along_it_to_the_wheels() -> None:
     assert off(steps, poses) < 0.05
     last = steps[-1].covariance
     assert last[0, 0] > 20.0 * last[1, 1]
+
+
+def test_without_wheels_a_robot_goes_on_where_nothing_changes() -> None:
+    """Two pillars tell its motion; behind them the walls are smooth, and ranges look as if the robot stood."""
+    left = ((2.0, 0.6), (2.3, 0.6), (2.3, 0.9), (2.0, 0.9))
+    right = ((1.2, -0.8), (1.5, -0.8), (1.5, -0.5), (1.2, -0.5))
+    hallway = walls(CORRIDOR, left, right)
+    poses = np.stack((0.1 * np.arange(70), np.zeros(70), np.zeros(70)), -1)
+    steps = fed(scan(hallway, pose, k, 6.0) for k, pose in enumerate(poses))
+    assert steps[-1].odom_xyyaw[0] == pytest.approx(6.9, rel=0.25)
+    assert steps[-1].odom_xyyaw[1] == pytest.approx(0.0, abs=0.05)
 
 
 def test_a_robot_that_was_carried_while_all_was_silent_begins_a_segment() -> None:

@@ -95,13 +95,3 @@ def test_dead_reckoning_has_the_covariance_of_all_hypotheses() -> None:
     others = mixture.weights[[LAST, VELOCITY, NONE]].sum()
     assert pose[2] == 1.5
     assert covariance[2, 2] > others * 1.5**2
-
-
-def test_ranges_that_do_not_change_make_no_motion_likelier() -> None:
-    mixture = MotionMixture(MixtureConfig())
-    mixture.foretell(0.0, None, None, 1.0)
-    mixture.take(ANY, ORIGIN, np.array((0.2, 0.0, 0.0)), EXACT, EXACT)
-    mixture.foretell(0.0, None, None, 1.0)
-    assert mixture.heaviest != NONE
-    mixture.foretell(0.0, None, None, 1.0, stands=True)
-    assert mixture.heaviest == NONE

@@ -27,7 +27,6 @@ class MixtureConfig:
     turn_share: float = 0.08  # rad for each rad
     way_rad: float = 0.03  # rad for each m
     anything: tuple[float, float] = (0.3, 0.3)  # deviation of anything, in usual periods of the scanner (m, rad)
-    standing: float = 50.0  # factor on the weight of no motion where the ranges show none
     most_gap: float = 10.0  # usual periods up to which deviations without wheels grow
     repeated: float = 8.0  # steps that share an error of the wheels
 

@@ -14,7 +14,6 @@ from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry, ScanEstimate
 from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
-from ngo_estimator.frontend.lidar.standstill import StandstillDetector
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, arc_velocity, compose
@@ -60,7 +59,6 @@ class MixtureLidar:
         self._core = MixtureOdometry(self.config)
         self._wheels: StampedWheels | None = None
         self._period = UsualPeriod()
-        self._standstill = StandstillDetector()
         self._waiting: deque[tuple[LidarScan, float]] = deque()  # with the evened stamp (s)
         self._held: list[LidarScan] = []  # that may be a bunch
         self._newest_ns: int | None = None
@@ -193,15 +191,8 @@ class MixtureLidar:
         key = self._key_scan(scan, sweep)
         again = None if sweep is None else partial(self._swept_again, scan, sweep, gap_s)
         silent = gap_s > self.config.silent_s and (by_wheels is None or self._wheels_paused(at_s - gap_s, at_s))
-        estimate = self._core.update(
-            key,
-            by_wheels,
-            counted,
-            gap_s / max(self._period.period_s, 1e-3),
-            silent,
-            again,
-            self._standstill.stands(scan),
-        )
+        gap = gap_s / max(self._period.period_s, 1e-3)
+        estimate = self._core.update(key, by_wheels, counted, gap, silent, again)
         if self._wheels is not None and not estimate.unsure:
             self._wheels.observe_turn(self._last_s, at_s, float(estimate.step[2]))
         self._last, self._last_s = key, at_s

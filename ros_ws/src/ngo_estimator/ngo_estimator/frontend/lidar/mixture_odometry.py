@@ -114,7 +114,6 @@ class MixtureOdometry:
         gap: float,
         silent: bool,
         again: Callable[[Array], KeyScan | None] | None = None,
-        stands: bool = False,
     ) -> ScanEstimate:
         """Estimate where a scan was taken.
 
@@ -126,9 +125,8 @@ class MixtureOdometry:
             silent: neither scans nor wheels told anything for so long that the robot may be anywhere.
             again: gives the scan without the sweep of another motion ``(3,)`` since then; None where that is much the
                 same.
-            stands: the ranges look as if the robot stands.
         """
-        self.mixture.foretell(float(self._pose[2]), by_wheels, counted, gap, stands)
+        self.mixture.foretell(float(self._pose[2]), by_wheels, counted, gap)
         found = None if silent else self._found(scan)
         if found is not None and again is not None:
             scan, found = self._swept_again(scan, found, again)

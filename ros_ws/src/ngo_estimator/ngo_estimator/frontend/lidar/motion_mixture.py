@@ -72,7 +72,6 @@ class MotionMixture:
         self.filter = VelocityFilter()
         self._foretold = {k: self.filter.predicted(0.0, np.zeros(3), 1.0, np.zeros(2)) for k in (LAST, VELOCITY)}
         self._last_gap = 1.0
-        self._prior_weights = self._weights
         self._raw: Array | None = None
         self.calibration = WheelCalibration(config)
 
@@ -96,14 +95,11 @@ class MotionMixture:
         """Deviations ``(6, 2)`` of their motions (m, rad)."""
         return self._deviations
 
-    def foretell(
-        self, yaw: float, by_wheels: Array | None, counted: Array | None, gap: float, stands: bool = False
-    ) -> None:
+    def foretell(self, yaw: float, by_wheels: Array | None, counted: Array | None, gap: float) -> None:
         """Form the hypotheses of the next motion from a pose of heading ``yaw``; ``by_wheels`` ``(3,)`` is what the
         wheels tell of it, and ``counted`` ``(3,)`` the same without calibration; None where they are silent.
 
         ``gap`` is the time since the last scan in usual periods: what the wheels did not count is as much longer.
-        ``stands``: the ranges look as if the robot stands.
         """
         self._usable[:] = by_wheels is not None, by_wheels is not None, True, True, True, True
         self._steps[:] = 0.0
@@ -111,10 +107,6 @@ class MotionMixture:
         self._steps[LAST] = self._steps[ANY] = arc_motion(self.filter.velocity, self._last_gap)
         self._steps[VELOCITY] = arc_motion(self.filter.velocity, self._gap)
         self._raw = counted
-        self._prior_weights = self._weights.copy()
-        if stands and by_wheels is None:  # a corridor looks so, too: wheels know better
-            self._prior_weights[NONE] *= self._config.standing
-        self._prior_weights /= self._prior_weights.sum()
         if by_wheels is not None:
             self._steps[TIGHT] = self._steps[LOOSE] = self._steps[ANY] = by_wheels
         longer = max(self._gap, 1.0)
@@ -146,7 +138,7 @@ class MotionMixture:
             variances[k] = 0.5 * (joint[0, 0] + joint[1, 1]), joint[2, 2]
         if walls is not None:
             variances += (0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])
-        both = variances, self._prior_weights
+        both = variances, self._weights
         return Mixture(*_formed(pose, self._steps, self._usable, *both, np.array(least), share))
 
     def _unknown(self) -> Array:
@@ -160,7 +152,7 @@ class MotionMixture:
     @property
     def heaviest(self) -> int:
         """The hypothesis of the largest weight, of those that can be formed."""
-        return int(np.where(self._usable, self._prior_weights, 0.0).argmax())
+        return int(np.where(self._usable, self._weights, 0.0).argmax())
 
     def likeliest(self, pose: Array, mixture: Mixture) -> int:
         """The hypothesis that is likeliest at a pose ``(3,)``."""
@@ -184,7 +176,7 @@ class MotionMixture:
         all."""
         means = [compose(pose, step) for step in self._steps]
         best, total = means[self.heaviest], np.zeros((3, 3))
-        weights = np.where(self._usable, self._prior_weights, 0.0)
+        weights = np.where(self._usable, self._weights, 0.0)
         for k in map(int, np.flatnonzero(self._usable)):
             off = means[k] - best
             off[2] = wrap(float(off[2]))
@@ -214,7 +206,7 @@ class MotionMixture:
         rate = c.learn_rate * min(1.0, way / c.learn_m + turn / c.learn_rad)
         if rate <= 0.0:
             return
-        errors, shares = _shared(self._steps, step, self._deviations, variance, self._prior_weights, usable)
+        errors, shares = _shared(self._steps, step, self._deviations, variance, self._weights, usable)
         if self._raw is not None and abs(self._raw[2]) < c.learn_rad and way < 2.0 * c.learn_m:
             self.calibration.learn(self._raw, step, float(shares[TIGHT] + shares[LOOSE]))
         held = self._weights[usable].sum()
