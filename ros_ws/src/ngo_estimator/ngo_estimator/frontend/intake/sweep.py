@@ -36,13 +36,10 @@ _FEWEST = 12
 _PAIRS = 120
 _DEVIATIONS = 5.0
 _OFF = 0.35
-"""What is measured is another sweep where it is off by so many deviations, and by this share of the scans' period."""
+"""What is measured is another sweep where it is off by this share of the scans' period, and surer than that."""
 
 _NEAR = 0.45
 """Share of the period within which a measured sweep is one of those that drivers make: noise makes it shorter."""
-
-_DILUTED = 0.3
-"""Share of its time at which a sweep may be measured: errors of the motion make it shorter, never longer."""
 
 _ONCE_KNOWN = 60
 _TRIED = 150
@@ -207,9 +204,10 @@ class MeasuredSweep:
         scan = self._taken[-1].scan
         believed_s = self._time_s(scan)
         self._known = _DEVIATIONS * spread < _OFF * self._period_s  # more of them would decide the same
-        if abs(measured - believed_s) < max(_DEVIATIONS * spread, _OFF * self._period_s):
+        if not self._known or abs(measured - believed_s) < _OFF * self._period_s:
             return
-        if believed_s != 0.0 and _DILUTED <= measured / believed_s <= 1.0:
+        # Errors of the motion make a sweep look shorter, never longer.
+        if believed_s != 0.0 and 0.0 <= measured / believed_s <= 1.0:
             return
         given_s = self._given_s(scan)
         full_s = self._period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
