@@ -33,7 +33,7 @@ from benchmarks.drives import CACHE, drive_of, stamp_ns
 from benchmarks.pinned import in_process, two_cores
 from benchmarks.process_use import memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.nodes.path_message import PathWriter
@@ -171,13 +171,13 @@ def _scan_run(arguments: Arguments) -> Run:
     drive = building_drive(arguments.seed, _FAR_M, most_scans=arguments.frames)
     assert isinstance(drive.reference, TruePoses)
     core = ScanTrajectory.load(WEIGHTS / "scan", iterations_per_step=arguments.iterations_per_step)
-    odometry = LidarOdometry.load(WEIGHTS / "scan")
+    odometry = MixtureLidar.load(WEIGHTS / "scan")
     odometry.mounting = drive.mounting
     truth = seen_from_first(drive.reference.poses_xyyaw)
     return Run(core, _scans(drive, odometry, core), drive.reference.stamps_ns, truth)
 
 
-def _scans(drive: LidarDrive, odometry: LidarOdometry, core: ScanTrajectory) -> Iterator[Callable[[], None]]:
+def _scans(drive: LidarDrive, odometry: MixtureLidar, core: ScanTrajectory) -> Iterator[Callable[[], None]]:
     """One call for each scan of a drive and the wheel poses before it, through both estimators."""
 
     def take(records: list[LidarScan | WheelPose]) -> None:

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from tqdm import tqdm
 
-from ngo_estimator.frontend.lidar import lidar_odometry
+from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.loops import pair_measurement
 from ngo_estimator.slam import localisation, online_trajectory, place_matcher, scan_matcher, scan_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
@@ -192,7 +192,7 @@ def _logs(arguments: Arguments, folder: Path) -> dict[str, Any]:
     return {name: summary_of(starts_of(rows["ours"].drawn)) for name, rows in found.items()}
 
 
-_LOG_CODE = (kidnapped_logs, scan_trajectory, lidar_odometry, localisation, scan_matcher)
+_LOG_CODE = (kidnapped_logs, scan_trajectory, mixture_lidar, localisation, scan_matcher)
 
 
 def _log(drive: LidarDrive, weights: Path, count: int) -> Measured:

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
-from ngo_estimator.frontend.lidar import lidar_odometry
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
+from ngo_estimator.frontend.lidar import mixture_lidar
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.mapping import scan_source as scan_sources
@@ -51,7 +51,7 @@ from training.scoring.online_estimate import steps_of, with_origin
 from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, measure, samples
 
 _CODE = (map_errors, whole_trajectory, scan_map, scan_sources)
-_LOG_CODE = (map_errors, scan_map, scan_sources, lidar_odometry, scan_trajectory)
+_LOG_CODE = (map_errors, scan_map, scan_sources, mixture_lidar, scan_trajectory)
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 _ROWS = ("odometry", "corrected", "true")
 _DEFAULT = OccupancyConfig()

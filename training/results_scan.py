@@ -200,8 +200,7 @@ def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Ma
     scored = scored_rows(rows, arguments.weights)
 
     def is_asked(index: int, row: Row) -> bool:
-        without_truth, without_wheels = name == "logs", name not in _WITH_WHEELS
-        left_out = (row.needs_truth and without_truth) or (row.needs_wheels and without_wheels)
+        left_out = row.needs_wheels and name not in _WITH_WHEELS
         return (index < ablation or not row.ablation) and not left_out
 
     plan = [
@@ -258,7 +257,7 @@ def _paired_with(row: str) -> str:
     """Our row that another one is compared with."""
     if row.endswith("percent_wrong"):
         return "_".join(("ours", *row.split("_")[-3:]))
-    return "ours_without_wheels" if row == "constant_deviations_without_wheels" else "ours"
+    return "ours"
 
 
 def _failures(tables: Mapping[str, Table]) -> list[str]:

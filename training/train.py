@@ -23,7 +23,6 @@ TASKS = {
     "end_to_end": "all networks of a world together",
     "ranges": "the ranges that Doom's place encoder sees in pictures",
     "loop_judge": "the judge of Doom's loops",
-    "step_deviation": "the deviations of a lidar's steps",
     "deepvo": "DeepVO, the baseline",
     "driver": "the learned driver of the 3D world, by DAgger and PPO",
 }

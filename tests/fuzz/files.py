@@ -15,7 +15,7 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.settings import BadParameter
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place, write_untrained
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
@@ -113,7 +113,7 @@ def _lidar_files(folder: Path) -> list[Path]:
 
 
 def _read_lidar(path: Path) -> None:
-    LidarOdometry.load(path.parent, "scan")
+    MixtureLidar.load(path.parent, "scan")
     ScanTrajectory.load(path.parent, "scan", 1)
 
 

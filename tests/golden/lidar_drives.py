@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.frontend.lidar.front_ends import load_front_end
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
 from ngo_estimator.offline.recorded import RecordedStep
@@ -93,7 +93,7 @@ class GoldenLidarDrive:
         wheels = tuple(map(WheelPose, self.wheel_stamps_ns.tolist(), self.wheel_poses.astype(np.float64)))
         mounting = Mounting(self.mounting[:3], bool(self.mounting[3]))
         drive = LidarDrive("golden", "golden", scans, wheels, mounting, self.true_poses)
-        both = LidarRun(load_front_end(weights, "scan"), ScanTrajectory.load(weights, "scan"), mounting)
+        both = LidarRun(MixtureLidar.load(weights, "scan"), ScanTrajectory.load(weights, "scan"), mounting)
         covariances, update = [np.zeros((3, 3))], None
         for found in both.run(drive.records()):
             if isinstance(found, RecordedStep):

@@ -23,7 +23,7 @@ def leaves_the_floor(name: str, weights: Path) -> bool:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"odometry": {"odometry": {"key_distance_m": 0.33}}},
+        {"odometry": {"key_m": 0.33}},
         {"odometry": {"points": {"spacing_m": 0.044}}},
         {"graph": {"loops": {"least_response": 0.495}}},
         {"graph": {"loops": {"submap_keys": 13}}},

@@ -16,7 +16,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes.messages import to_ns, to_time, transform_message
@@ -153,7 +153,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
         settings |= {"odom_frame": odom_frame}
         ngo_settings |= {"odom_frame": odom_frame, "map_frame": "world", "tf_ahead_s": AHEAD_S}
     noise, poses = np.random.default_rng(0), drive()
-    core, online = LidarOdometry(), ScanTrajectory(iterations_per_step=1)
+    core, online = MixtureLidar(), ScanTrajectory(iterations_per_step=1)
     core.mounting = mounting_of(mounting_message(upside_down))
     assert close(core.mounting.sensor_xyyaw, MOUNTING, 1e-6, 1e-4)
     expected: list[RelativeStep] = []

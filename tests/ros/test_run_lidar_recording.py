@@ -82,11 +82,11 @@ def test_nodes_of_a_lidar_need_no_networks(for_lidar: Path) -> None:
     modules = ("local_node", "lidar_input", "ngo_node", "ngo_map", "view_node", "run_recording", "recorded_output")
     lines = [f"import ngo_estimator.nodes.{module}" for module in (*modules, "join_sessions", "optimize_graph")]
     lines += [
-        "from ngo_estimator.frontend.lidar.front_ends import load_front_end",
+        "from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar",
         "from ngo_estimator.nodes.run_recording import get_package_share_directory as share, Path",
         "from ngo_estimator.slam.scan_trajectory import ScanTrajectory",
         "folder = Path(share('ngo_estimator'), 'weights', 'scan')",
-        "print(load_front_end(folder, 'scan'), ScanTrajectory.load(folder, 'scan'))",
+        "print(MixtureLidar.load(folder, 'scan'), ScanTrajectory.load(folder, 'scan'))",
     ]
     done = run(sys.executable, "-c", "\n".join(lines), python_path=for_lidar)
     assert done.returncode == 0 and "Trajectory" in done.stdout, done.stderr

@@ -17,8 +17,6 @@ _TITLES = {
     "kiss_icp": "KISS-ICP, z = 0",
     "icp_slam": "MRPT `icp-slam`",
     "rbpf_slam": "MRPT `rbpf-slam`",
-    "constant_deviations": "ours, deviations not learned",
-    "constant_deviations_without_wheels": "ours, without wheels, deviations not learned",
     "without_agreement": "ours, loops need no neighbours that agree",
     "without_kernel": "ours, without the robust kernel",
     "cartographer_published": "Cartographer, as published (Hess et al. 2016), not run here",
@@ -37,6 +35,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         "relations of a log, over the drives of a table. A number of one whole log has none. Odometry is what the "
         "correction was given: our front end's. Online is each pose as it was published. Speed is by computing time on "
         "one thread. Numbers in full are in [`training/results/scan.json`](../training/results/scan.json).",
+        *([f"**{result['note']}**"] if "note" in result else []),
         "## Bars",
         _bars(result["bars"]),
     ]
@@ -85,9 +84,8 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
 def _ablation(result: Mapping[str, Any]) -> list[str]:
     parts = [
         "## Ablation",
-        f"The first {result['settings']['ablation']} drives of each table. The only part that learned is the network "
-        "of a step's deviations. No pose depends on it, the published covariance does. The negative log-likelihood of "
-        "the truth (nats a pose) is lower for a covariance that fits better. Differences are to the "
+        f"The first {result['settings']['ablation']} drives of each table. The negative log-likelihood of the "
+        "truth (nats a pose) is lower for a covariance that fits better. Differences are to the "
         "row that is named, on the same drives, with 95 % bootstrap intervals over the drives.",
     ]
     for name, title in _BUILDING_TITLES.items():

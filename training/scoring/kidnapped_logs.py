@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_matcher import ScanMatcher

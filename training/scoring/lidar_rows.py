@@ -15,12 +15,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
-from ngo_estimator.frontend.lidar import front_ends
-from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd, lidar_front_end
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig, LidarStep
+from ngo_estimator.frontend.lidar import mixture_lidar
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.frontend.lidar.mixture_config import read_mixture_config
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import chained
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
-from ngo_estimator.networks.step_scaling import StepScaling
 from ngo_estimator.slam import scan_trajectory
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory
@@ -33,7 +33,7 @@ from training.scoring.wrong_loops import Solver, WrongLoopsConfig, solve_ours, w
 
 _MOST_WALL_POINTS = 60_000  # of a picture
 _NO_KERNEL = 1e6  # deviations: so wide that every residual counts in full
-_PIPELINE = (front_ends, scan_trajectory)
+_PIPELINE = (mixture_lidar, scan_trajectory)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +60,11 @@ class Estimate:
 class Pipeline:
     """Our estimators with the shipped settings, and what a row changes of them.
 
-    ``wheels`` are listened to where the robot has any. Without ``learned_deviations`` registration's own deviations of
-    a step are published.
-    ``odometry`` and ``graph`` are changes of the front end and of the back end, by the setting's name with dots:
-    ``{"loops.least_agreeing": 0}``.
+    ``wheels`` are listened to where the robot has any. ``odometry`` and ``graph`` are changes of the front end and of
+    the back end, by the setting's name with dots: ``{"loops.least_agreeing": 0}``.
     """
 
     wheels: bool = True
-    learned_deviations: bool = True
     odometry: Mapping[str, Any] = field(default_factory=dict)
     graph: Mapping[str, Any] = field(default_factory=dict)
 
@@ -119,11 +116,10 @@ class DriveRuns:
         return self._runs[key]
 
     def _front(self, pipeline: Pipeline) -> _Front:
-        key = identity_of(dataclasses.replace(pipeline, learned_deviations=True, graph={}))
+        key = identity_of(dataclasses.replace(pipeline, graph={}))
         if key not in self._fronts:
-            settings = changed(read_lidar_file(self._weights, "odometry", LidarOdometryConfig), pipeline.odometry)
-            scaling = StepScaling.load(self._weights) if settings.learned_deviation else None
-            odometry = lidar_front_end(settings, self.drive.mounting, scaling)
+            settings = changed(read_mixture_config(self._weights), pipeline.odometry)
+            odometry = MixtureLidar(settings, self.drive.mounting)
             steps: list[LidarStep] = []
             began = time.process_time()
             for record in self.drive.records(pipeline.wheels):
@@ -143,7 +139,7 @@ class DriveRuns:
         online = ScanTrajectory(settings)
         covariances = [np.zeros((3, 3))]
         began = time.process_time()
-        for step in front.steps if pipeline.learned_deviations else map(_unscaled, front.steps):
+        for step in front.steps:
             covariances.append(online.update(step).covariance)
         online.finish()
         back_s = time.process_time() - began
@@ -153,14 +149,7 @@ class DriveRuns:
         return _Run(online, trajectory, np.stack(covariances), front, back_s)
 
 
-def _unscaled(step: LidarStep) -> LidarStep:
-    """The step without the factors of the network, which no pose depends on."""
-    return (
-        step if step.key is None else dataclasses.replace(step, key=dataclasses.replace(step.key, factors=np.ones(3)))
-    )
-
-
-def _take(odometry: LidarFrontEnd, steps: list[LidarStep], at_end: bool) -> None:
+def _take(odometry: MixtureLidar, steps: list[LidarStep], at_end: bool) -> None:
     while True:
         try:
             steps.extend(odometry.ready(at_end))
@@ -239,7 +228,7 @@ class Row:
 
     ``code`` are the modules that its numbers follow from, beside those that they import. ``missing`` says in a few
     words what it lacks on this machine, or nothing. Of several estimates, one a seed, the mean error counts. Rows of
-    the ``ablation`` are measured on some drives of a table alone. One that ``needs_truth`` changes covariances alone.
+    the ``ablation`` are measured on some drives of a table alone.
     """
 
     estimate: Callable[[DriveRuns], Estimate | list[Estimate]]
@@ -248,14 +237,11 @@ class Row:
     code: tuple[ModuleType, ...] = _PIPELINE
     missing: Callable[[], str] = lambda: ""
     ablation: bool = False
-    needs_truth: bool = False
 
 
 def _ours(ablation: bool = False, **changes: Any) -> Row:
     pipeline = Pipeline(**changes)
-    return Row(
-        partial(ours, pipeline=pipeline), pipeline, ablation=ablation, needs_truth=not pipeline.learned_deviations
-    )
+    return Row(partial(ours, pipeline=pipeline), pipeline, ablation=ablation)
 
 
 def _gtsam(solve: Solver) -> Row:
@@ -284,8 +270,6 @@ ROWS: dict[str, Row] = {
     "gtsam_lm": _gtsam(lidar_peers.solve_lm),
     "gtsam_gnc": _gtsam(lidar_peers.solve_gnc),
     "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
-    "constant_deviations": _ours(True, learned_deviations=False),
-    "constant_deviations_without_wheels": _ours(True, learned_deviations=False, wheels=False),
     "without_agreement": _ours(True, graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
     "without_kernel": _ours(True, graph={"kernel": _NO_KERNEL}),
     **{

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial import KDTree
 
-from ngo_estimator.frontend.lidar import front_ends
+from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.geometry.planar_motion import all_between
 from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.slam import scan_trajectory
@@ -80,7 +80,7 @@ def visit_facts(drive: LidarDrive, poses: np.ndarray) -> dict[str, float]:
 def join_row() -> Row:
     """Our whole pipeline, how many of its loops are wrong, and whether the robot is lost in the end."""
     pipeline = Pipeline()
-    return Row(partial(_ours_with_joins, pipeline=pipeline), pipeline, code=(front_ends, scan_trajectory))
+    return Row(partial(_ours_with_joins, pipeline=pipeline), pipeline, code=(mixture_lidar, scan_trajectory))
 
 
 def _ours_with_joins(runs: DriveRuns, pipeline: Pipeline) -> Estimate:

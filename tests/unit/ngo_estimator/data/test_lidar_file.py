@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from ngo_estimator.data.lidar_file import LIDAR_FILE, LidarFileError, is_lidar, read_lidar_file
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig, read_mixture_config
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 
@@ -28,12 +28,12 @@ def test_what_is_not_there_has_its_default(tmp_path: Path) -> None:
     assert (config.keys_between, config.kernel, config.loops.every) == (3, 2.0, 4)
     assert isinstance(config.kernel, float)
     assert config.most_scans == ScanGraphConfig().most_scans and config.loops.search == ScanGraphConfig().loops.search
-    assert read_lidar_file(given, "odometry", LidarOdometryConfig, "scan") == LidarOdometryConfig()
+    assert read_mixture_config(given, "scan") == MixtureConfig()
 
 
 def test_the_shipped_file_is_read() -> None:
     assert is_lidar(SHIPPED)
-    LidarOdometry.load(SHIPPED, "scan")
+    read_mixture_config(SHIPPED, "scan")
     ScanTrajectory.load(SHIPPED, "scan")
 
 
@@ -68,12 +68,32 @@ def test_a_bad_file_is_one_line(tmp_path: Path, values: Any, told: str) -> None:
     assert "\n" not in str(error.value) and str(given / LIDAR_FILE) in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"learned_deviation": True}, "'learned_deviation' in 'odometry' is gone: no network"),
+        ({"front_end": "mixture"}, "'front_end' in 'odometry' is gone: there is one front end"),
+        ({"odometry": {"key_distance_m": 0.3}}, "'odometry' in 'odometry' is gone: \"key_m\""),
+        ({"wheels": {}}, "'wheels' in 'odometry' is gone"),
+        ({"key_m": 0.0}, "key_m is 0.0"),
+        ({"keys_m": 0.3}, "unknown keys"),
+    ],
+)
+def test_of_a_setting_that_is_gone_one_line_says_what_replaces_it(
+    tmp_path: Path, values: dict[str, Any], told: str
+) -> None:
+    given = folder(tmp_path, {**WHOLE, "odometry": values})
+    with pytest.raises(LidarFileError, match=told) as error:
+        read_mixture_config(given)
+    assert "\n" not in str(error.value) and str(given / LIDAR_FILE) in str(error.value)
+
+
 def test_another_world_is_told(tmp_path: Path) -> None:
     with pytest.raises(LidarFileError, match="for the world 'scan'; expected 'maze2d'"):
-        LidarOdometry.load(folder(tmp_path, WHOLE), "maze2d")
+        read_mixture_config(folder(tmp_path, WHOLE), "maze2d")
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
     assert not is_lidar(tmp_path)
     with pytest.raises(LidarFileError, match="cannot be read"):
-        LidarOdometry.load(tmp_path)
+        read_mixture_config(tmp_path)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.likelihood_field import SearchConfig, likelihood_field, search
 from ngo_estimator.geometry.line_map import line_map, line_map_of_points
-from ngo_estimator.geometry.planar_motion import Array, between, rotated, transformed
+from ngo_estimator.geometry.planar_motion import Array, between, rotated
 from ngo_estimator.geometry.scan_matching import IcpConfig, icp
 from tests.unit.ngo_estimator.ray_casting import HALLWAY, ROOM, fan, round_trip, scan_at
 
@@ -124,30 +123,6 @@ def test_outliers_hardly_pull() -> None:
     assert found.share < 0.9
 
 
-@pytest.mark.parametrize("off", [(0.8, -0.7, 0.4), (-0.9, 0.3, -0.5), (0.0, 0.0, 0.5)])
-def test_a_search_leads_to_the_pose_from_afar(off: tuple[float, float, float]) -> None:
-    scans = [scan_at(ROOM, pose) for pose in round_trip(40)[::5]]
-    poses = round_trip(40)[::5]
-    points = np.concatenate([transformed(p, s.points) for p, s in zip(poses, scans, strict=True)])
-    normals = np.concatenate([rotated(p[2], s.normals) for p, s in zip(poses, scans, strict=True)])
-    field = likelihood_field(points, normals, poses[4][:2], SearchConfig())
-    start = poses[4] + np.array(off)
-    weak = (start, np.eye(3))
-    pose, score = search(field, scans[4].points, start, weak, (1.0, math.radians(30.0)))
-    assert score > 0.8
-    assert np.hypot(*(pose - poses[4])[:2]) < 0.06 and abs(pose[2] - poses[4][2]) < 0.03
-
-
-def test_a_search_in_a_corridor_keeps_to_the_prior() -> None:
-    scan = scan_at(HALLWAY, IDENTITY, angles=fan(361, 360.0))
-    field = likelihood_field(scan.points, scan.normals, np.zeros(2), SearchConfig())
-    start = np.array((0.4, 0.3, 0.1))
-    prior = (start, np.diag((0.2**-2, 0.2**-2, 0.2**-2)))
-    on_lines = scan.points[(scan.normals != 0.0).any(axis=1)]
-    pose, _ = search(field, on_lines, start, prior, (0.5, 0.3))
-    assert abs(pose[0] - start[0]) < 0.11 and abs(pose[1]) < 0.05
-
-
 def test_nothing_to_register_leaves_the_prior() -> None:
     empty = np.empty((0, 2))
     lines = line_map([scan_at(ROOM, A)], [A])
@@ -177,8 +152,6 @@ def test_bad_arguments_are_refused(points: Array, start: Array, words: str) -> N
 def test_bad_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="first_gate_m"):
         IcpConfig(first_gate_m=2.0)
-    with pytest.raises(ValueError, match="step_m"):
-        SearchConfig(step_m=0.0)
     with pytest.raises(ValueError, match="0 scans"):
         line_map([], [])
 

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig
-from ngo_estimator.frontend.lidar.mounting_yaw import MountingYawConfig
-from ngo_estimator.frontend.lidar.wheel_odometry import WheelOdometryConfig
+from ngo_estimator.frontend.intake import mounting_yaw
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
@@ -39,10 +38,8 @@ def recorded(count: int, begin_ns: int = 10**12, further_left_rad: float = 0.0) 
     return records
 
 
-def run_over(
-    records: Sequence[Record], config: LidarOdometryConfig | None = None
-) -> tuple[LidarRun, list[RecordedStep], list[RecordedRun]]:
-    run = LidarRun(LidarOdometry(config), ScanTrajectory(iterations_per_step=1), MOUNTING)
+def run_over(records: Sequence[Record]) -> tuple[LidarRun, list[RecordedStep], list[RecordedRun]]:
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), MOUNTING)
     events = list(run.run(records))
     steps = [event for event in events if isinstance(event, RecordedStep)]
     return run, steps, [event for event in events if isinstance(event, RecordedRun)]
@@ -51,7 +48,7 @@ def run_over(
 def test_it_equals_the_cores_fed_by_hand() -> None:
     records = recorded(60)
     run, steps, runs = run_over(records)
-    odometry, online = LidarOdometry(mounting=MOUNTING), ScanTrajectory(iterations_per_step=1)
+    odometry, online = MixtureLidar(mounting=MOUNTING), ScanTrajectory(iterations_per_step=1)
     updates = []
     for record in records:
         if isinstance(record, WheelPose):
@@ -99,16 +96,19 @@ def test_stamps_that_jump_back_begin_another_trajectory() -> None:
 
 
 @pytest.mark.parametrize(("yaw", "side"), [(0.05, "left"), (-0.05, "right")])
-def test_a_scanner_that_looks_elsewhere_than_its_mounting_says_is_told(yaw: float, side: str) -> None:
-    config = WheelOdometryConfig(mounting_yaw=MountingYawConfig(stretch_m=0.2, fewest=10))
-    run, _, _ = run_over(recorded(60, further_left_rad=yaw), LidarOdometryConfig(wheels=config))
+def test_a_scanner_that_looks_elsewhere_than_its_mounting_says_is_told(
+    yaw: float, side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mounting_yaw, "STRETCH_M", 0.2)
+    monkeypatch.setattr(mounting_yaw, "FEWEST", 10)
+    run, _, _ = run_over(recorded(60, further_left_rad=yaw))
     assert run.facts["mounting_yaw_deg"] == pytest.approx(math.degrees(yaw), abs=0.6)
     (remark,) = run.remarks()
     assert f"{abs(run.facts['mounting_yaw_deg']):.1f} deg further to the {side}" in remark
 
 
 def test_faults_inside_are_told() -> None:
-    run = LidarRun(LidarOdometry(), ScanTrajectory(), MOUNTING)
+    run = LidarRun(MixtureLidar(), ScanTrajectory(), MOUNTING)
     run.faults += ["an optimisation failed, RuntimeError: x", "another"]
     assert run.facts["faults"] == 2 and "2 faults" in run.remarks()[0] and "RuntimeError" in run.remarks()[0]
 

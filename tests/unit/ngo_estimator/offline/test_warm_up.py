@@ -27,8 +27,8 @@ def test_registration_and_the_search_for_loops_are_compiled() -> None:
 
 
 ODOMETRY = """
-from ngo_estimator.nodes.lidar_input import load_front_end, warm_up_odometry
-load_front_end(WEIGHTS, "scan")
+from ngo_estimator.nodes.lidar_input import MixtureLidar, warm_up_odometry
+MixtureLidar.load(WEIGHTS, "scan")
 warm_up_odometry()
 """
 TRAJECTORY = """

@@ -1,11 +1,9 @@
 import numpy as np
 
 from ngo_estimator.data.images import scan_image
-from ngo_estimator.geometry.planar_motion import all_between
 from ngo_sim.episodes import record_episode
 from training.data.building_drives import building_drive
 from training.data.lidar_drives import TruePoses
-from training.data.lidar_steps import building_steps
 from training.data.scans import ROWS, SCAN_IMAGE, ScannedMaze
 from training.data.simulated_drives import maze_drive, scanned_maze_drive
 from training.data.worlds import WORLDS
@@ -20,14 +18,6 @@ def test_a_building_is_the_same_each_time_and_another_where_rooms_repeat() -> No
     assert not np.array_equal(first.scans[0].ranges, aliased.scans[0].ranges)
     assert first.reference.stamps_ns.tolist() == [scan.stamp_ns for scan in first.scans]
     assert first.identity != aliased.identity
-
-
-def test_steps_between_key_scans_of_a_building_are_those_of_its_truth() -> None:
-    steps = building_steps(1_003, 3.0, aliased=False, wheels=True)
-    true = all_between(steps.truth[:-1], steps.truth[1:])
-    assert len(true) == len(steps.evidence) > 3 and np.hypot(*true[:, :2].T).max() > 0.3
-    np.testing.assert_allclose(steps.relative, true, atol=0.03)
-    assert (np.linalg.eigvalsh(steps.covariance) > 0.0).all()
 
 
 def test_a_scanned_maze_has_the_scans_that_the_networks_saw() -> None:

@@ -13,8 +13,6 @@ import numpy as np
 from numba import njit
 from scipy.spatial import KDTree
 
-from ngo_estimator.geometry.planar_motion import transformed
-
 _REACH = 3.0
 """Deviations around a point that have a likelihood."""
 _NEAR_DEPTH = 4  # of the blocks where a search near places begins: 1.3 m a side where a cell is 8 cm
@@ -165,14 +163,6 @@ def search(
         return np.array((centre[0] + shift[0], centre[1] + shift[1], headings[angle]))
 
     return SearchMatch(pose(best), response, second, None if other[0] < 0 else pose(other))
-
-
-def response_at(grid: PooledGrid, points: np.ndarray, pose: np.ndarray) -> float:
-    """Mean likelihood of points ``(n, 2)`` (m) at a pose ``(3,)``, 0 to 1; raises ``ValueError`` without a point."""
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
-        raise ValueError(f"points have the shape {points.shape}; expected (n, 2) with at least one point")
-    cells = np.floor((transformed(pose, points) - grid.origin_m) / grid.resolution_m).astype(np.int32)
-    return float(_sum(grid.levels[0], cells, 0, 0) / (255.0 * len(points)))
 
 
 def _heading_offsets(config: SearchConfig, window: float) -> np.ndarray:

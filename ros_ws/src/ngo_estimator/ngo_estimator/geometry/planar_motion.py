@@ -129,12 +129,6 @@ def inverted(matrix: Array) -> Array:
 
 
 @njit(cache=True)
-def fused_covariance(a: Array, b: Array) -> Array:
-    """Covariance ``(3, 3)`` of what two independent measurements with covariances ``(3, 3)`` tell together."""
-    return inverted(inverted(a) + inverted(b))
-
-
-@njit(cache=True)
 def squared_deviations(pose: Array, mean: Array, information: Array) -> float:
     """Squared distance of a pose from a mean with an information matrix ``(3, 3)``, in deviations."""
     away = pose - mean

@@ -22,6 +22,9 @@ _DEPTH = 3
 _MARGIN = 2 << _DEPTH
 """Cells of the field round all that was seen: blocks that begin there may reach into it."""
 
+_LONGEST_GAP_M = 1.5
+"""Neighbouring points farther apart are not joined."""
+
 
 @dataclass(frozen=True)
 class ScoreFieldConfig:
@@ -195,3 +198,25 @@ def _score(field: Field, points: Array, pose: Array, corner: Array, cell: float,
         row, column = math.floor(y / cell), math.floor(x / cell)
         total += field[row, column] if 0 <= row < rows and 0 <= column < columns else unknown
     return total / (255.0 * len(points))
+
+
+@njit(cache=True)
+def joined(points: Array, normals: Array, spacing: float) -> Array:
+    """The points ``(n, 2)``, and more between neighbours whose surfaces face alike and whose gap runs along these."""
+    between = np.zeros(len(points), dtype=np.int64)
+    for i in range(len(points) - 1):
+        x, y = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+        length = math.hypot(x, y)
+        alike = normals[i, 0] * normals[i + 1, 0] + normals[i, 1] * normals[i + 1, 1] > 0.95
+        if alike and length < _LONGEST_GAP_M and abs(x * normals[i, 0] + y * normals[i, 1]) < 0.2 * length:
+            between[i] = int(length / spacing)
+    result = np.empty((len(points) + between.sum(), 2))
+    place = 0
+    for i in range(len(points)):
+        for j in range(between[i] + 1):
+            share = j / (between[i] + 1)
+            for axis in range(2):
+                step = points[i + 1, axis] - points[i, axis] if between[i] else 0.0
+                result[place, axis] = points[i, axis] + share * step
+            place += 1
+    return result

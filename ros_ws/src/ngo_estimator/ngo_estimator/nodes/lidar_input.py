@@ -15,7 +15,7 @@ from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
-from ngo_estimator.frontend.lidar.front_ends import load_front_end
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
@@ -51,7 +51,7 @@ class LidarInput:
 
     def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
         self._node, self._settings, self._publish = node, settings, publish
-        self._core = LidarIntake(load_core(load_front_end, settings), self._mounting_of, settings.min_range)
+        self._core = LidarIntake(load_core(MixtureLidar.load, settings), self._mounting_of, settings.min_range)
         with compiling(node.get_logger().info):
             warm_up_odometry()
         self._base_frame = settings.framed(settings.base_frame)

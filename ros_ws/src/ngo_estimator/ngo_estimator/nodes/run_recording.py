@@ -265,7 +265,7 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
 
 def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Console) -> "Started":
     """Registration of a lidar's scans, with the robot's odometry."""
-    from ngo_estimator.frontend.lidar.front_ends import load_front_end
+    from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
     from ngo_estimator.geometry.scan_points import Mounting
     from ngo_estimator.offline.lidar_run import LidarRun
     from ngo_estimator.offline.recorded import Truth
@@ -276,7 +276,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     from ngo_recordings.mounting import find_mounting
     from ngo_recordings.scan_stream import scan_stream
 
-    odometry = load_front_end(folder, arguments.world)
+    odometry = MixtureLidar.load(folder, arguments.world)
     online = ScanTrajectory.load(folder, arguments.world, arguments.iterations_per_step)
     given = replace(arguments.topics, action="none", twist="none")
     if not given.scan_topics and (scans := given.image or choose_scan(recording)) is not None:

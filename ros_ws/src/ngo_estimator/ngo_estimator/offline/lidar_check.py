@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
@@ -33,7 +33,7 @@ def lidar_lines(recording: Recording, topics: RecordingTopics) -> list[str]:
             return Mounting(np.zeros(3)) if frame == described.scan_frame else None
         return Mounting(found.base_from_scan_xyyaw, found.upside_down)
 
-    run = LidarRun(LidarOdometry(), ScanTrajectory(), mounting_of)
+    run = LidarRun(MixtureLidar(), ScanTrajectory(), mounting_of)
     skipped: Counter[str] = Counter()
     run.learn(scan_stream(recording, topics, skipped=skipped))
     lines += [f"{count} left out at its beginning: {reason}" for reason, count in skipped.items()]

@@ -8,7 +8,7 @@ from typing import Any
 
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake, MountingOf
 from ngo_estimator.frontend.intake.wheel_clock import WheelTruth
-from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
@@ -22,6 +22,9 @@ _REASONS: dict[type[ValueError], str] = {
     LateFrame: "older than the scan before",
 }
 _MOST_WALL_POINTS = 400_000
+_LEAST_LAG_S = 0.005
+"""An age of scans that is said."""
+
 _LEARNED_SCANS = 600
 _LEARNED_M, _LEARNED_RAD = 6.0, 6.0
 """Way and turn after which faults of scanners and wheels are known."""
@@ -38,7 +41,7 @@ class LidarRun:
 
     def __init__(
         self,
-        odometry: LidarFrontEnd,
+        odometry: MixtureLidar,
         online: ScanTrajectory,
         mounting: Mounting | MountingOf,
         min_range_m: float = 0.0,
@@ -75,7 +78,7 @@ class LidarRun:
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
         lines = self._odometry.remarks()
-        if lag_s := self._odometry.lag_s:
+        if abs(lag_s := self._odometry.lag_s) >= _LEAST_LAG_S:
             lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
         if yaw := math.degrees(self._odometry.mounting_yaw_rad):
             side = "left" if yaw > 0.0 else "right"

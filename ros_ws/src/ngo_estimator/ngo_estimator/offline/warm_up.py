@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarStep
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_recordings.scan_stream import LidarScan
@@ -18,13 +17,8 @@ _STEPS = 60
 
 
 def warm_up_odometry() -> list[LidarStep]:
-    """Drive each front end to and fro in a room of four walls, long enough that loops can be looked for; returns the
-    steps of the first."""
-    steps, _ = _driven(LidarOdometry()), _driven(MixtureLidar())
-    return steps
-
-
-def _driven(odometry: LidarFrontEnd) -> list[LidarStep]:
+    """Drive to and fro in a room of four walls, long enough that loops can be looked for; returns the steps."""
+    odometry = MixtureLidar()
     steps: list[LidarStep] = []
     angles = np.linspace(-math.pi, math.pi, _RAYS, endpoint=False)
     pose, first = np.array([-4.0, 0.5, 0.1]), None

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
@@ -53,7 +53,7 @@ def errors(
     records: list[LidarScan], true: list[Array], mounting_of: Callable[[str], Mounting | None] = lambda _: FRONT
 ) -> tuple[Array, LidarRun]:
     """How far each pose of the path is off (m), and the run."""
-    run = LidarRun(LidarOdometry(), ScanTrajectory(iterations_per_step=1), mounting_of)
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), mounting_of)
     (whole,) = [event for event in run.run(records) if isinstance(event, RecordedRun)]
     path = whole.trajectory
     expected = [between(true[0], true[round((stamp - 10**12) / STEP_NS)]) for stamp in path.stamps_ns.tolist()]
@@ -122,7 +122,7 @@ def test_rays_that_see_the_robot_are_left_out() -> None:
         ranges = each.ranges.copy()
         ranges[own] = 0.1 + noise.normal(0.0, 0.003, 6)
         seen.append(replace(each, ranges=ranges))
-    run = LidarRun(LidarOdometry(), ScanTrajectory(iterations_per_step=1), FRONT)
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), FRONT)
     (whole,) = [event for event in run.run(seen) if isinstance(event, RecordedRun)]
     assert "6 rays of front see the robot itself: left out" in run.remarks()
     assert whole.walls is not None

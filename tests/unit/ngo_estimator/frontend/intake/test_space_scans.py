@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ngo_estimator.frontend.lidar.front_ends import lidar_front_end
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometryConfig
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
@@ -61,7 +60,7 @@ def test_a_robot_that_sees_in_space_knows_its_way(
         made.append(sensor(compose(pose, SENSOR), stamp_ns, noise))
         poses.append(pose)
         pose = compose(pose, np.array((0.06, 0.0, 0.03)))
-    run = LidarRun(lidar_front_end(LidarOdometryConfig()), ScanTrajectory(iterations_per_step=1), Mounting(SENSOR))
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), Mounting(SENSOR))
     whole = next(event for event in run.run(made) if isinstance(event, RecordedRun)).trajectory
     expected = np.array([between(poses[0], each) for each in poses])
     off_m = np.linalg.norm((whole.poses_xyyaw - expected)[:, :2], axis=1).max()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.frontend.intake import sweep
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
@@ -59,7 +59,7 @@ def records(poses: Array, wheel_scale: float = 1.0, ahead_s: float = 0.0, sweeps
 
 def run_over(made: list[Any], poses: Array) -> tuple[float, LidarRun]:
     """The largest error of a path (m) that was learned about first, and its run."""
-    run = LidarRun(LidarOdometry(), ScanTrajectory(iterations_per_step=1), Mounting(SENSOR))
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), Mounting(SENSOR))
     run.learn(made)
     whole = next(event for event in run.run(made) if isinstance(event, RecordedRun)).trajectory
     expected = np.array([between(poses[0], pose) for pose in poses[: len(whole.poses_xyyaw)]])

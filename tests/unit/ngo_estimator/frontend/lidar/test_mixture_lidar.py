@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import check_step
-from ngo_estimator.frontend.lidar.front_ends import lidar_front_end
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarOdometryConfig, LidarStep
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.planar_motion import between, compose
@@ -176,10 +175,3 @@ def test_scans_that_cannot_be_used_are_refused() -> None:
         lidar.add_wheels(first.stamp_ns, np.full(3, np.nan))
     lidar.add_scan(replace(first, stamp_ns=first.stamp_ns - 2 * 10**9))
     assert lidar.restarts == 1
-
-
-def test_a_setting_chooses_the_front_end() -> None:
-    assert isinstance(lidar_front_end(LidarOdometryConfig(front_end="mixture")), MixtureLidar)
-    assert isinstance(lidar_front_end(LidarOdometryConfig()), LidarOdometry)
-    with pytest.raises(ValueError, match="front_end"):
-        LidarOdometryConfig(front_end="other")

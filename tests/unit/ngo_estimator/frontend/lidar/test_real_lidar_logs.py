@@ -11,15 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ngo_estimator.frontend.lidar.scan_odometry import ScanOdometry
-from ngo_estimator.frontend.lidar.swept_scan import SweptScan
-from ngo_estimator.frontend.lidar.wheel_odometry import WheelOdometry
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, wrap
-from ngo_estimator.geometry.scan_points import Mounting, key_scan
+from ngo_recordings.scan_stream import LidarScan
 
 FOLDER = os.environ.get("NGO_LIDAR_LOGS")
-AHEAD = Mounting(np.zeros(3))
-MAX_RANGE = 81.9
 
 pytestmark = pytest.mark.skipif(not FOLDER, reason="NGO_LIDAR_LOGS does not name a folder with real logs")
 
@@ -61,15 +57,14 @@ def relation_errors(stamps: list[int], poses: Array) -> tuple[float, float]:
 @pytest.mark.parametrize("with_wheels", [True, False])
 def test_mit_csail_is_followed_open_loop(with_wheels: bool) -> None:
     stamps, ranges, wheel_poses = csail()
-    angles = np.radians(-90.0 + 0.5 * np.arange(361))
-    odometry, wheels = ScanOdometry(), WheelOdometry() if with_wheels else None
-    poses = []
+    lidar, poses = MixtureLidar(), [np.zeros(3)]
     for stamp, measured, wheel_pose in zip(stamps, ranges, wheel_poses, strict=True):
-        if wheels is not None:
-            wheels.add(stamp, wheel_pose)
-        scan = key_scan(stamp, angles, measured, (0.05, MAX_RANGE), AHEAD)
-        poses.append(odometry.update(SweptScan(scan), wheels).pose)
+        if with_wheels:
+            lidar.add_wheels(stamp, wheel_pose)
+        lidar.add_scan(LidarScan(stamp, -0.5 * math.pi, math.radians(0.5), measured, 0.05, 81.9, 0.0, "laser"))
+        poses += [step.odom_xyyaw for step in lidar.ready()]
+    poses += [step.odom_xyyaw for step in lidar.ready(at_end=True)]
     metres, degrees = relation_errors(stamps, np.array(poses))
     assert metres < 0.09 and degrees < 0.5
-    if wheels is not None:
-        assert wheels.lag_s == pytest.approx(0.12, abs=0.04)
+    if with_wheels:
+        assert lidar.lag_s == pytest.approx(0.12, abs=0.04)

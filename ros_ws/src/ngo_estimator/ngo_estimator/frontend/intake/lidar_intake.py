@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
+from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
 from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.own_returns import OwnReturns
 from ngo_estimator.frontend.intake.sweep import MeasuredSweep
 from ngo_estimator.frontend.intake.turns import Part, Turns
 from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
-from ngo_estimator.frontend.lidar.front_ends import LidarFrontEnd
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan
@@ -36,7 +37,7 @@ class LidarIntake:
         min_range_m: nearer ranges are not used.
     """
 
-    def __init__(self, front_end: LidarFrontEnd, mounting_of: MountingOf, min_range_m: float = 0.0) -> None:
+    def __init__(self, front_end: MixtureLidar, mounting_of: MountingOf, min_range_m: float = 0.0) -> None:
         self.front_end, self._mounting_of, self._min_range_m = front_end, mounting_of, min_range_m
         self._no_return: dict[str, NoReturnValues] = {}
         self._own: dict[str, OwnReturns] = {}
@@ -52,6 +53,7 @@ class LidarIntake:
         for sweep in self._sweeps.values():
             sweep.interrupt()
         self._wheels = CorrectedWheels()
+        self._yaw = MountingYaw()
         clock = WheelClock()
         clock.truth = self._clock.truth
         self._clock = clock
@@ -76,7 +78,7 @@ class LidarIntake:
     @property
     def mounting_yaw_rad(self) -> float:
         """How much further to the left the scanner looks than its mounting says, by the wheels; 0 until it is known."""
-        return self.front_end.mounting_yaw_rad
+        return self._yaw.yaw_rad
 
     @property
     def restarts(self) -> int:
@@ -152,6 +154,10 @@ class LidarIntake:
         late_ns = round(self.front_end.lag_s * 1e9)
         motion = self._wheels.motion(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
         elapsed_s = (step.stamp_ns - step.from_stamp_ns) * 1e-9
+        if motion is None or step.unsure:
+            self._yaw.interrupt()
+        else:
+            self._yaw.observe(step.relative_xyyaw, motion, elapsed_s)
         for scanner, sweep in self._sweeps.items():
             if self._turns.alone and (mounting := self._mountings.get(scanner)) is not None:
                 sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)

@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.geometry.scan_matching import IcpConfig
 from ngo_estimator.geometry.scan_points import ScanPointsConfig
 from ngo_estimator.geometry.score_field import ScoreFieldConfig
@@ -88,6 +90,25 @@ class MixtureConfig:
             )
         if len(self.anything) != 2:
             raise ValueError(f"anything is {self.anything}; expected two deviations")
+
+
+_NOT_NEEDED = "nothing replaces it"
+_GONE = {
+    "front_end": "there is one front end; leave it out",
+    "mixture": 'its settings stand in "odometry" itself',
+    "learned_deviation": "no network scales deviations now; leave it out",
+    "odometry": '"key_m", "key_deg", "submap_scans", "icp" and the search\'s settings stand in its place',
+    "wheels": "lag, slips and freezes of wheels are learned without settings",
+    "wheel_silence_s": _NOT_NEEDED,
+    "least_variance_m2": _NOT_NEEDED,
+    "least_variance_rad2": _NOT_NEEDED,
+}
+"""Settings of the front end before this one, and what replaces each."""
+
+
+def read_mixture_config(weights: Path, world: str | None = None) -> MixtureConfig:
+    """The front end's settings in ``lidar.json`` of the folder ``weights``; raises ``LidarFileError`` of one line."""
+    return read_lidar_file(weights, "odometry", MixtureConfig, world, _GONE)
 
 
 def _positive(value: Any) -> bool:

@@ -1,24 +1,23 @@
 """The local estimator of a 2D lidar: scans and wheel odometry in, relative poses and key scans out (no ROS here)."""
 
-import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep
 from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarStep
-from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig, read_mixture_config
 from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry, ScanEstimate
 from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, arc_velocity, compose
 from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan
-from ngo_estimator.networks.step_scaling import STEP_EVIDENCE
 from ngo_recordings.scan_stream import LidarScan
 
 _FARTHEST_M = 1000.0
@@ -54,6 +53,11 @@ class MixtureLidar:
         """How often the stamps jumped back by ``RESTART_AFTER_NS`` or more."""
         self.reset()
 
+    @classmethod
+    def load(cls, weights: Path, world: str | None = None) -> "MixtureLidar":
+        """Begin with the settings in the folder ``weights``; raises ``LidarFileError`` of one clear line."""
+        return cls(read_mixture_config(weights, world))
+
     def reset(self) -> None:
         """Forget everything: the next scan is the new origin of ``odom``."""
         self._core = MixtureOdometry(self.config)
@@ -84,12 +88,6 @@ class MixtureLidar:
     def lag_s(self) -> float:
         """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
         return 0.0 if self._wheels is None else self._wheels.lag_s
-
-    @property
-    def mounting_yaw_rad(self) -> float:
-        """How much further to the left the scanner looks than its mounting says, by the wheels."""
-        forward = self._core.mixture.calibration.matrix[0]
-        return -math.atan2(forward[1], forward[0])
 
     def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
         """Take the wheels' pose ``(3,)`` in their own frame.
@@ -226,7 +224,6 @@ class MixtureLidar:
             place_code=nothing,
             share=estimate.score,
             unsure=estimate.unsure,
-            evidence=np.zeros(len(STEP_EVIDENCE)),
             key=key_step,
             origin_scan=origin,
             robot_odom_xyyaw=pose,

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.likelihood_field import joined
 from ngo_estimator.geometry.line_map import LineMap, averaged_lines, line_map_of_points, line_squares
 from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
-from ngo_estimator.geometry.score_field import RayCounts, ScoreField, ScoreFieldConfig
+from ngo_estimator.geometry.score_field import RayCounts, ScoreField, ScoreFieldConfig, joined
 
 _REDRAWN_M = 4.0
 """The counts are made anew where the robot is so far from their middle."""

@@ -5,11 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from ngo_estimator.frontend.lidar.mounting_yaw import MountingYaw, MountingYawConfig
-from ngo_estimator.frontend.lidar.wheel_odometry import WheelOdometry
-from ngo_estimator.geometry.planar_motion import Array, compose
-
-SECOND = 10**9
+from ngo_estimator.frontend.intake import mounting_yaw
+from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
+from ngo_estimator.geometry.planar_motion import Array, between, compose
 
 
 def driven(steps: int, step: tuple[float, float, float] = (0.1, 0.0, 0.0), wander: float = 0.02) -> Array:
@@ -29,10 +27,14 @@ def seen_by_scans(poses: Array, yaw: float, noise_m: float = 0.005) -> Array:
     return np.stack((cosine * x + sine * y + noise[0], cosine * y - sine * x + noise[1], heading), axis=-1)
 
 
-def estimate(by_scans: Array, by_wheels: Array, step_s: float = 0.2, config: MountingYawConfig | None = None) -> float:
-    estimator = MountingYaw(config)
-    for k, (scans, wheels) in enumerate(zip(by_scans, by_wheels, strict=True)):
-        estimator.observe(step_s * k, scans, wheels)
+def observe(estimator: MountingYaw, by_scans: Array, by_wheels: Array) -> None:
+    for k in range(1, len(by_scans)):
+        estimator.observe(between(by_scans[k - 1], by_scans[k]), between(by_wheels[k - 1], by_wheels[k]), 0.2)
+
+
+def estimate(by_scans: Array, by_wheels: Array) -> float:
+    estimator = MountingYaw()
+    observe(estimator, by_scans, by_wheels)
     return estimator.yaw_rad
 
 
@@ -64,10 +66,11 @@ def test_no_yaw_is_claimed_of_a_right_mounting_nor_of_a_short_way() -> None:
     ],
 )
 def test_what_is_no_drive_ahead_does_not_count(
-    step: tuple[float, float, float], wheels_step: tuple[float, float, float]
+    step: tuple[float, float, float], wheels_step: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scans = seen_by_scans(driven(1500, step, 0.0), 0.05, noise_m=0.0)
-    assert estimate(scans, driven(1500, wheels_step, 0.0), config=MountingYawConfig(fewest=1)) == 0.0
+    monkeypatch.setattr(mounting_yaw, "FEWEST", 1)
+    scans = seen_by_scans(driven(500, step, 0.0), 0.05, noise_m=0.0)
+    assert estimate(scans, driven(500, wheels_step, 0.0)) == 0.0
 
 
 def test_slips_in_between_do_not_bend_it() -> None:
@@ -80,34 +83,21 @@ def test_slips_in_between_do_not_bend_it() -> None:
     assert estimate(seen_by_scans(poses, 0.03), np.array(wheels)) == pytest.approx(0.03, abs=0.005)
 
 
-def test_stretches_end_where_scans_or_wheels_are_not_sure() -> None:
-    """Scans jump each tenth time, and are not sure of it; wheels freeze for a while."""
-    wheels = WheelOdometry()
-    poses = driven(1600)
-    jump = np.zeros(3)
-    for k, (pose, scans) in enumerate(zip(poses, seen_by_scans(poses, 0.03), strict=True)):
-        frozen = 200 <= k < 240
-        wheels.add(k * SECOND // 5, poses[200] if frozen else pose)
-        if k % 10 == 0:
-            jump = jump + (0.0, 0.2, 0.0)
-            wheels.observe_pose(k * SECOND // 5, None)
+def test_a_stretch_ends_where_scans_or_wheels_are_not_sure() -> None:
+    estimator, ahead = MountingYaw(), np.array((0.1, 0.0, 0.0))
+    for k in range(1000):
+        if k % 8 == 0:
+            estimator.observe(ahead, np.array((0.1, 0.2, 0.0)), 0.2)
+            estimator.interrupt()
         else:
-            wheels.observe_pose(k * SECOND // 5, scans + jump)
-    assert wheels.mounting_yaw.yaw_rad == pytest.approx(0.03, abs=0.003)
+            estimator.observe(ahead, np.array((0.1, 0.003, 0.0)), 0.2)
+    assert estimator.yaw_rad == pytest.approx(0.03, abs=0.001)
 
 
-def test_memory_is_bounded_and_a_new_mounting_is_learned() -> None:
-    config = MountingYawConfig(kept=120)
-    estimator = MountingYaw(config)
-    poses = driven(3000)
-    scans = np.concatenate((seen_by_scans(poses, 0.05)[:1500], seen_by_scans(poses, -0.05)[1500:]))
-    for k in range(3000):
-        estimator.observe(0.2 * k, scans[k], poses[k])
+def test_memory_is_bounded_and_a_new_mounting_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mounting_yaw, "_KEPT", 120)
+    estimator, poses = MountingYaw(), driven(1500)
+    for yaw in (0.05, -0.05):
+        observe(estimator, seen_by_scans(poses, yaw), poses)
         assert len(estimator._found) <= 120
     assert estimator.yaw_rad == pytest.approx(-0.05, abs=0.003)
-
-
-@pytest.mark.parametrize("wrong", [{"stretch_m": 0.0}, {"agree_rad": math.inf}, {"fewest": 0}, {"kept": 99}])
-def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="fewest"):
-        MountingYawConfig(**wrong)  # type: ignore[arg-type]

