@@ -25,10 +25,9 @@ def leaves_the_floor(name: str, weights: Path) -> bool:
     [
         {"odometry": {"key_m": 0.33}},
         {"odometry": {"points": {"spacing_m": 0.044}}},
-        {"graph": {"loops": {"least_response": 0.495}}},
         {"graph": {"loops": {"submap_keys": 13}}},
     ],
-    ids=["key scans", "points", "loops", "submaps"],
+    ids=["key scans", "points", "submaps"],
 )
 def test_stored_drives_tell_other_settings(changes: dict[str, Any], tmp_path: Path) -> None:
     """Settings that are a tenth larger or smaller than the shipped ones."""

@@ -17,7 +17,7 @@ KEYS = (*online.BARS, "ratio_to_isam2_best", "cpu_s_a_minute_at_10_hz")
 
 @pytest.mark.timeout(300)
 def test_online(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = online.Arguments(worlds=("maze2d",), window=64, live=20, repeats=3, out=tmp_path)
+    arguments = online.Arguments(worlds=("maze2d",), window=64, live=20, repeats=2, out=tmp_path)
     monkeypatch.setattr(online, "BARS", dict.fromkeys(online.BARS, 1e9))
     # tests/ros/test_demo.py runs the whole graph, and measures this latency.
     monkeypatch.setattr(online, "end_to_end", lambda *_: 123.0)

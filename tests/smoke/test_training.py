@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -277,36 +276,6 @@ def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(two_proce
     training = load_local(weights.parent)[1]["training"]
     assert training["processes"] == 2
     assert training["command"].startswith("python -m training.train_local --accelerator cpu --devices 2 --strategy ddp")
-
-
-@pytest.mark.timeout(600)  # two processes are started twice
-def test_two_machines_train_as_two_processes_and_go_on_after_one_is_lost(two_processes: Path, tmp_path: Path) -> None:
-    """Groups of processes stand for the machines."""
-
-    def train(how: str) -> list[tuple[int, str]]:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        torchrun = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1"]
-        torchrun += ["--master-addr=127.0.0.1", f"--master-port={port}"]
-        machines, logs = [], [tmp_path / "machine0.log", tmp_path / "machine1.log"]
-        for rank, log in enumerate(logs):
-            program = [f"--node-rank={rank}", "-m", "tests.smoke.two_processes", str(tmp_path), how]
-            with log.open("w") as stderr:
-                machines.append(
-                    subprocess.Popen([*torchrun, *program], cwd=records.ROOT, env=ONE_THREAD, stderr=stderr)
-                )
-        return [(machine.wait(150), log.read_text()) for machine, log in zip(machines, logs, strict=True)]
-
-    assert all(code != 0 for code, _ in train("lost"))
-    assert [row["epoch"] for row in curve(tmp_path)] == ["0"]
-    ended = train("astray")
-    assert [code for code, _ in ended] == [0, 0], ended
-    assert all("not the same for all processes" in (tmp_path / f"astray{rank}.txt").read_text() for rank in range(2))
-    assert [row["epoch"] for row in curve(tmp_path)] == ["0", "1"]
-    lost, whole = ranks(tmp_path), ranks(two_processes)
-    assert lost[0]["weights"] == lost[1]["weights"] == whole[0]["weights"]
-    assert [set(rank["mazes"]) < set(other["mazes"]) for rank, other in zip(lost, whole, strict=True)] == [True, True]
 
 
 def test_the_speed_of_making_data_is_measured(
