@@ -69,7 +69,7 @@ bench: build ## speed of nodes and online core beside GTSAM, last a line of JSON
 # come last, so that workers end together.
 test: build ## every test below tests/, WORKERS=2 at a time: ARGS="tests/unit -k name" goes to pytest
 	$(WHOLE)
-	@$(OPEN) && exec python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	@$(OPEN) && exec python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not long" $(ARGS)
 
 fuzz: build ## minutes of mutated files, messages and service calls: ARGS="--files 10000 --messages 100000"
 	$(WHOLE)

@@ -32,7 +32,13 @@ def record(world: str, path: Path, **parameters: Any) -> None:
     ("world", "drives", "settings", "shape"),
     [
         # One drive as a lidar sees it, whose end is held out, without actions.
-        ("maze2d", [SMALL_MAZE], {"rate": 6e-3, "epochs": 3, "topics": LIDAR}, (1, 241, 1)),
+        pytest.param(
+            "maze2d",
+            [SMALL_MAZE],
+            {"rate": 6e-3, "epochs": 3, "topics": LIDAR},
+            (1, 241, 1),
+            marks=pytest.mark.long,
+        ),
         # Several with actions, of which the last is held out.
         (
             "maze3d",

@@ -32,6 +32,8 @@ from training.scoring.network_odometry import open_odometry
 from training.scoring.oracle_rows import LIMITS
 from training.scoring.table_rows import Sources, rows_of
 
+pytestmark = pytest.mark.long
+
 STEPS = 160
 PREFIXES = (80, STEPS)
 TABLES = ["seen", "unseen", "seen_policy", "unseen_policy"]

@@ -263,6 +263,7 @@ def two_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(two_processes: Path) -> None:
     first, second = ranks(two_processes)
     assert len(first["mazes"]) == len(second["mazes"]) == len({*first["mazes"], *second["mazes"]}) / 2 > 0
