@@ -171,13 +171,15 @@ class OwnMap:
         Where the graph is sure of the pose, scans that look through the walls there say that a step was wrong.
         ``has_loops``: whether the newest key scan has one.
         """
-        newest, config = len(chain) - 1, self._config.loops
-        last = np.arange(newest + 1 - config.source_keys, newest + 1)
-        way = np.cumsum(np.hypot(*np.diff(chain.poses[::-1, :2], axis=0).T))[::-1]  # to the newest, of all others
-        old = np.flatnonzero((windows[:newest, 0] <= _SURE_M) & (way > config.least_gap_m))
+        newest, config, border = len(chain) - 1, self._config.loops, chain.borders[-1]
         if has_loops:
             self._agreed, self._astray = newest, self._astray[:0]
-        if has_loops or last[0] < chain.borders[-1] or not len(old):
+        last = np.arange(newest + 1 - config.source_keys, newest + 1)
+        if has_loops or last[0] < border:
+            return None
+        way = np.cumsum(np.hypot(*np.diff(chain.poses[::-1, :2], axis=0).T))[::-1]  # to the newest, of all others
+        old = np.flatnonzero((windows[:newest, 0] <= _SURE_M) & (way > config.least_gap_m))
+        if not len(old):
             return None
         found = evidence_of(scans, views, (last, chain.poses[last]), (old, chain.poses[old]))
         if found.said and found.mean <= _HERE:
@@ -189,7 +191,7 @@ class OwnMap:
         first = max(self._agreed + 1, int(self._astray[0]) - config.source_keys)
         self._agreed, self._astray = newest, self._astray[:0]
         self._forget_looks()
-        return first if first > chain.borders[-1] else None
+        return first if first > border else None
 
     def thin(self, keep: np.ndarray) -> None:
         """Take that the key scans that are not among ``keep`` ``(keys,)`` are gone."""
