@@ -32,10 +32,9 @@ from training.prerequisites import Scripts, Wanted, prepare
 from training.report import attention, figures, results_page, tables
 from training.report.folders import Folders
 from training.report.training_records import trainings_json
-from training.scoring import oracle_rows
 from training.scoring import prefix_errors as prefix_errors_module
+from training.scoring import row_estimators
 from training.scoring.network_odometry import open_odometry
-from training.scoring.oracle_rows import LIMITED_WORLDS, LIMITS, limit_estimator
 from training.scoring.prefix_errors import prefix_errors
 from training.scoring.row_estimators import Arrays, Estimator, Prepared, estimators
 from training.scoring.table import Drive, Measured, Row, measure
@@ -64,7 +63,7 @@ class Arguments(Folders):
 
 
 _ATTENTION_TRAJECTORIES = 24
-_CODE = (oracle_rows, prefix_errors_module, neural_graph_optimizer, overlaps, pair_measurement, errors)
+_CODE = (row_estimators, prefix_errors_module, neural_graph_optimizer, overlaps, pair_measurement, errors)
 
 
 def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]:
@@ -78,11 +77,6 @@ def main(arguments: Arguments, scripts: Scripts | None = None) -> dict[str, Any]
     evaluations = {table: evaluate_rows(arguments, sources, table) for table in world.tables}
     result = {**record, **summary(arguments, sources, stores, evaluations)}
     result.pop("arguments")
-    if world.name in LIMITED_WORLDS:
-        result["limits"] = {
-            table: tables.rows_json(limiting_rows(arguments, sources, table, found), result["steps"], world)
-            for table, found in evaluations.items()
-        }
     images = figures.draw_all(arguments.images, sources, arguments.split, stores, evaluations, result)
     print(f"{world.name}: {arguments.out / f'{world.name}.json'}, {arguments.docs / f'results_{world.name}.md'}")
     return arguments.publish(world.name, result, results_page.page(result, images, world))
@@ -129,16 +123,6 @@ def evaluate_rows(arguments: Arguments, sources: Sources, table: str) -> dict[st
         row: [measured for name, measured in found.items() if name.rpartition("-seed")[0] == row]
         for row in rows_of(sources.world)
     }
-
-
-def limiting_rows(
-    arguments: Arguments, sources: Sources, table: str, evaluations: dict[str, list[Measured]]
-) -> dict[str, list[Measured]]:
-    """The rows that show the limits of a table; of optimizers those of the first training seed."""
-    data = table_data(arguments, sources, table)
-    rows = {name: _row(sources, limit_estimator(name, sources), data, ()) for name in LIMITS}
-    known = {row: evaluations[row][:1] for row in ("ngo_5", "gtsam", "true_pairs", "oracle")}
-    return known | {name: [found] for name, found in _measured(arguments, sources, table, rows).items()}
 
 
 def _row(sources: Sources, estimator: Estimator, data: TableData, prefixes: tuple[int, ...]) -> Row:

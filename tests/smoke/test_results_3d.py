@@ -1,4 +1,4 @@
-"""The tables of the 3D world at toy size: seen and unseen mazes, networks of their own, and what limits the result."""
+"""The tables of the 3D world at toy size: seen and unseen mazes, and networks of their own."""
 
 import itertools
 import json
@@ -29,7 +29,6 @@ from training.data.worlds import World, world_named
 from training.report import attention_map, figures
 from training.report.maze_views import maze_and_start
 from training.scoring.network_odometry import open_odometry
-from training.scoring.oracle_rows import LIMITS
 from training.scoring.table_rows import Sources, rows_of
 
 pytestmark = pytest.mark.long
@@ -86,11 +85,11 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
     assert json.loads((folder / "results" / "maze3d.json").read_text()) == result
     assert result["command"].startswith("python -m training.results --world maze3d ")
     assert (result["trajectories"], result["steps"], result["seeds"]) == (2, STEPS, [0])
-    assert list(result["tables"]) == TABLES == list(result["limits"])
+    assert list(result["tables"]) == TABLES
     assert {"local", "local_no_action", "deepvo", "paper_1", "paper_5", "ngo_1", "ngo_5", "gauss_newton", "gtsam",
             "smoothed", "gtsam_smoothed", "true_pairs", "oracle",
             "end_to_end"} < set(rows_of(world_named("maze3d")))  # fmt: skip
-    for name, table in result["tables"].items():
+    for table in result["tables"].values():
         assert list(table) == rows_of(world_named("maze3d"))
         for row in table.values():
             assert list(row["prefixes"]) == [str(length) for length in PREFIXES]
@@ -98,8 +97,6 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
                 for metric in METRICS:
                     low, high = entry[metric]["ci95"]
                     assert 0.0 <= low <= entry[metric]["mean"] <= high
-        assert list(result["limits"][name]) == ["ngo_5", "gtsam", "true_pairs", "oracle", *LIMITS]
-        assert result["limits"][name]["gtsam"] == {metric: table["gtsam"][metric] for metric in METRICS}
     assert {"odometry_smoother", "deepvo-seed0", "local_no_action-seed0", "ngo_5-seed0"} < set(result["trainings"])
     assert "--without-action" in result["trainings"]["local_no_action-seed0"]["command"]
     assert str(folder) not in json.dumps(result)
@@ -133,14 +130,11 @@ def test_the_optimizer_learns_from_the_other_driver_and_the_smoother_does_not(
     assert of_optimizers and all(stores == ["train", "train_policy"] for stores in of_optimizers)
 
 
-def test_the_page_shows_tables_limits_and_figures(made: tuple[Path, dict[str, Any]]) -> None:
+def test_the_page_shows_tables_and_figures(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
     page = (folder / "docs" / "results_maze3d.md").read_text()
     for name in TABLES:
         assert f"## Table `{name}`" in page
-    assert page.count("### What limits it") == len(TABLES)
-    for name in LIMITS:
-        assert page.count(f"| `{name}` |") == len(TABLES)
     images = sorted((folder / "docs" / "images").iterdir())
     assert len(images) >= 4
     for image in images:

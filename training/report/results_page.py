@@ -6,7 +6,6 @@ from typing import Any
 from training.data.worlds import World
 from training.report.page import figures, interval, joined, markdown, number, signed, with_interval
 from training.report.page import page as whole
-from training.scoring.oracle_rows import LIMITS
 from training.scoring.scores import METRICS, Metric
 from training.scoring.table_rows import ROWS
 
@@ -40,12 +39,6 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
             "The estimator has seen these steps alone, as in use.",
             _prefixes(table, metrics[0]),
         ]
-        if "limits" in result:
-            parts += [
-                "### What limits it",
-                "One part after the other replaced by the truth; of optimizers the first training seed.",
-                _table(result["limits"][name], metrics),
-            ]
         if result["attention"].get(name):
             parts += ["### Attention", _attention(result["attention"][name])]
     parts += [
@@ -67,7 +60,7 @@ def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
             seeds = value.get("seeds")
             spread = f" ({number(min(seeds))} to {number(max(seeds))})" if seeds else ""
             texts.append(interval(value) + spread)
-        return [f"`{row}`", (ROWS[row] if row in ROWS else LIMITS[row]).title, *texts]
+        return [f"`{row}`", ROWS[row].title, *texts]
 
     header = ["Row", "", *(f"{metric.title}, {metric.unit}" for metric in metrics)]
     return markdown(header, (cells(row, entry) for row, entry in table.items()))

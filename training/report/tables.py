@@ -53,11 +53,6 @@ def table_json(table: Table, prefixes: Sequence[int], steps: int, world: World) 
     }
 
 
-def rows_json(table: Table, steps: int, world: World) -> dict[str, Any]:
-    """``ROW.METRIC.{mean, ci95}`` of whole trajectories alone."""
-    return {row: _metrics(found, steps, world) for row, found in table.items()}
-
-
 def _metrics(row: Sequence[Measured], steps: int, world: World) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for metric in METRICS[world.name]:

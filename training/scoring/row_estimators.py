@@ -21,7 +21,7 @@ from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.baselines import loop_factors
 from training.baselines.graph_settings import REGISTRATIONS, fit_calibration, load_settings
-from training.baselines.loop_factors import LoopFactors, MoreLoops, Seen
+from training.baselines.loop_factors import MoreLoops, Seen
 from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
 from training.data.feature_store import open_store
 from training.scoring.table_rows import ROWS, Sources
@@ -149,13 +149,8 @@ def optimized_by(
     optimizer: NeuralGraphOptimizer,
     pair_head: PairHead,
     prepared: Prepared | None = None,
-    informed: Callable[[NeuralGraphOptimizer, Tensor], NeuralGraphOptimizer] | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """``optimize_offline`` for many trajectories at once.
-
-    ``prepared`` is of the same trajectories and the same pair head.
-    ``informed`` makes an optimizer that knows the true poses ``(batch, steps, 3)`` of the trajectories it is given.
-    """
+    """``optimize_offline`` for many trajectories at once; ``prepared`` is of the same ones and the same pair head."""
 
     def odometry_and_loops(first: int, whole: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], Loops | None]:
         odometry = whole["relative"], whole["log_std"]
@@ -177,8 +172,7 @@ def optimized_by(
             some = {name: _float32(array[first : first + _TOGETHER]) for name, array in arrays.items()}
             whole = prefix(some, _whole(some["relative"].shape[1], optimizer.block))
             odometry, loops = odometry_and_loops(first, whole)
-            used = optimizer if informed is None else informed(optimizer, whole["truth"])
-            result = used(*odometry, whole["motion"], loops)
+            result = optimizer(*odometry, whole["motion"], loops)
             parts.append(_with_tail(result.poses.double(), some["relative"].double()))
         return torch.cat(parts).numpy()
 
@@ -186,17 +180,9 @@ def optimized_by(
 
 
 def pose_graph(
-    row: str,
-    settings: PoseGraphSettings,
-    pair_head: PairHead,
-    known: Callable[[LoopFactors, np.ndarray], LoopFactors] | None = None,
-    smoother: OdometrySmoother | None = None,
+    row: str, settings: PoseGraphSettings, pair_head: PairHead, smoother: OdometrySmoother | None = None
 ) -> Callable[[Arrays], np.ndarray]:
-    """The classical rows: GTSAM with the loops that are found, or with those that are known.
-
-    ``known`` makes other loops of those of a trajectory and its true poses, ``smoother`` the odometry of a row that
-    takes it smoothed.
-    """
+    """The classical rows: GTSAM with the loops that are found, or with true ones; ``smoother`` is of smoothed rows."""
 
     def poses(arrays: Arrays) -> np.ndarray:
         whole = prefix(arrays, _whole(arrays["relative"].shape[1], settings.block))
@@ -218,24 +204,16 @@ def pose_graph(
                 ]
             else:
                 loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
-            if known is not None:
-                loops = [known(found, true) for found, true in zip(loops, truth, strict=True)]
             more: Sequence[MoreLoops | None] = [None] * len(truth)
             if settings.search.overlaps and row != "true_pairs":
                 moved = settings.calibrated(steps[0])
                 more = loop_factors.overlaps_of(pair_head, whole["codes"], moved, settings.search, settings.block)
-            if known is not None:
-                more = [of and _known(of, known, true) for of, true in zip(more, truth, strict=True)]
             added = zip(odometry, loops, more, strict=True)
             solved = [optimize(*one, found, settings, of) for one, found, of in added]
         left = torch.from_numpy(settings.calibrated(arrays["relative"]))
         return _with_tail(torch.from_numpy(np.stack(solved)), left).numpy()
 
     return poses
-
-
-def _known(more: MoreLoops, known: Callable[[LoopFactors, np.ndarray], LoopFactors], truth: np.ndarray) -> MoreLoops:
-    return lambda nodes: known(more(nodes), truth)
 
 
 def _whole(steps: int, block: int) -> int:

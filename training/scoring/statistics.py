@@ -48,25 +48,6 @@ def mean_interval(values: np.ndarray) -> Interval:
     return _interval(float(values.mean()), _resampled_means(values))
 
 
-def ratio_interval(totals: np.ndarray, counts: np.ndarray) -> Interval:
-    """Sum of ``totals`` by sum of ``counts``, both ``(trajectories,)``; the interval by resampling trajectories.
-
-    Resamples that count nothing are left out.
-    """
-    totals, counts = _by_trajectory(totals), _by_trajectory(counts)
-    if len(totals) != len(counts) or counts.min() < 0.0 or counts.sum() <= 0.0:
-        raise ValueError(f"{len(totals)} totals have counts {counts}; expected as many, from 0 on and one of them more")
-    means, mean_counts = _resampled_means(totals), _resampled_means(counts)
-    counted = mean_counts > 0.0
-    return _interval(float(totals.sum() / counts.sum()), means[counted] / mean_counts[counted])
-
-
-def rms_interval(squares: np.ndarray, counts: np.ndarray) -> Interval:
-    """Root mean square of what has these sums of squares, with arguments as of ``ratio_interval``."""
-    mean = ratio_interval(squares, counts)
-    return Interval(*(float(np.sqrt(value)) for value in (mean.mean, mean.low, mean.high)))
-
-
 def compare(values: np.ndarray, others: np.ndarray) -> Comparison:
     """Compare two estimators' errors on the same trajectories, shaped as in ``mean_interval``."""
     values, others = _by_trajectory(values), _by_trajectory(others)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.scoring.statistics import Interval, compare, mean_interval, ratio_interval, rms_interval
+from training.scoring.statistics import Interval, compare, mean_interval
 
 
 def test_the_interval_of_a_normal_sample_is_that_of_its_standard_error() -> None:
@@ -87,12 +87,3 @@ def test_what_cannot_be_compared_is_refused() -> None:
         compare(np.ones(2), np.ones(3))
     with pytest.raises(ValueError, match="positive"):
         compare(np.ones(3), np.zeros(3))
-
-
-def test_ratios_weigh_trajectories_by_what_they_count() -> None:
-    found = ratio_interval(np.array([1.0, 9.0, 0.0]), np.array([1.0, 3.0, 0.0]))
-    assert found.mean == pytest.approx(10.0 / 4.0)
-    assert (found.low, found.high) == pytest.approx((1.0, 3.0))
-    assert rms_interval(np.array([4.0, 12.0]), np.array([1.0, 3.0])) == Interval(2.0, 2.0, 2.0)
-    with pytest.raises(ValueError, match="one of them more"):
-        ratio_interval(np.ones(3), np.zeros(3))
