@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 
+from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
 from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan
 
 _STEP_NS = 100_000_000
@@ -20,7 +22,7 @@ _SILENT = range(3, 13)
 
 def warm_up_odometry() -> list[LidarStep]:
     """Drive to and fro in a room of four walls, long enough that loops can be looked for; returns the steps."""
-    odometry = MixtureLidar()
+    odometry = LidarIntake(MixtureLidar(), lambda frame: Mounting(np.zeros(3)))
     steps: list[LidarStep] = []
     angles = np.linspace(-math.pi, math.pi, _RAYS, endpoint=False)
     pose, first = np.array([-4.0, 0.5, 0.1]), None

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_recordings.scan_stream import LidarScan
@@ -39,7 +40,7 @@ class NoReturnValues:
         """The values that are known, m."""
         self._piled: deque[tuple[float, ...]] = deque(maxlen=_KEPT)
         self._tops: Counter[float] = Counter()
-        self._place = np.zeros(0)
+        self._place = np.zeros(0, np.float32)
 
     def clean(self, scan: LidarScan) -> LidarScan:
         """The scan with no return in the place of these values.
@@ -61,33 +62,56 @@ class NoReturnValues:
         return replace(scan, ranges=ranges, range_max=range_max)
 
     def _learn(self, scan: LidarScan) -> None:
-        usual = np.isfinite(scan.ranges) & (scan.ranges > max(scan.range_min, 0.0))
-        if 0.0 < scan.range_max < math.inf:
-            usual &= scan.ranges < scan.range_max
-        values, counts = np.unique(scan.ranges[usual], return_counts=True)
-        total = int(counts.sum())
-        if total < 4 * _FEWEST:
-            return
-        found = []
-        for k in np.flatnonzero(counts >= max(_FEWEST, _SHARE * total)):
-            behind = counts[k + 1 : np.searchsorted(values, values[k] + _BEHIND_M, side="right")].sum()
-            if behind < _LEAST_GAP * counts[k]:
-                found.append(float(values[k]))
-                if k == len(values) - 1 and counts[k] >= _TOP_SHARE * total:
-                    self._tops[found[-1]] += 1
-        if self._is_elsewhere(scan.ranges):
+        ranges = np.array(scan.ranges, np.float32)
+        largest = scan.range_max if scan.range_max > 0.0 else math.inf
+        values, at_top = _piled(ranges, max(scan.range_min, 0.0), largest)
+        found = values.tolist()
+        if at_top:
+            self._tops[found[-1]] += 1
+        if self._is_elsewhere(ranges):
             self._piled.append(tuple(found))
+        if not found:
+            return
         seen = Counter(value for values in self._piled for value in values)
         for value in found:
             if value not in self.values and (seen[value] >= _SCANS or self._tops[value] >= _TOP_SCANS):
                 self.values = sorted([*self.values, value])
 
     def _is_elsewhere(self, ranges: Array) -> bool:
-        before = self._place
-        if len(before) == len(ranges):
-            both = np.isfinite(before) & np.isfinite(ranges)
-            changed = np.abs(before[both] - ranges[both]) > _CHANGED_M
-            if len(changed) and changed.mean() < _CHANGED_SHARE:
-                return False
+        if len(self._place) == len(ranges) and not _changed(self._place, ranges):
+            return False
         self._place = ranges
         return True
+
+
+@njit(cache=True)
+def _piled(ranges: Array, least: float, largest: float) -> tuple[Array, bool]:
+    """Values that pile up in a scan, with nothing just behind them; and whether many have the largest of all."""
+    usual = np.sort(ranges[np.isfinite(ranges) & (ranges > least) & (ranges < largest)])
+    found, total = np.empty(0, ranges.dtype), len(usual)
+    at_top = False
+    begin = 0
+    while total >= 4 * _FEWEST and begin < total:
+        end = begin + 1
+        while end < total and usual[end] == usual[begin]:
+            end += 1
+        count = end - begin
+        if count >= max(_FEWEST, _SHARE * total):
+            behind = end
+            while behind < total and usual[behind] <= usual[begin] + np.float32(_BEHIND_M):
+                behind += 1
+            if behind - end < _LEAST_GAP * count:
+                found = np.append(found, usual[begin])
+                at_top = end == total and count >= _TOP_SHARE * total
+        begin = end
+    return found, at_top
+
+
+@njit(cache=True)
+def _changed(before: Array, after: Array) -> bool:
+    both, changed = 0, 0
+    for k in range(len(before)):
+        if math.isfinite(before[k]) and math.isfinite(after[k]):
+            both += 1
+            changed += abs(before[k] - after[k]) > np.float32(_CHANGED_M)
+    return both == 0 or changed >= _CHANGED_SHARE * both

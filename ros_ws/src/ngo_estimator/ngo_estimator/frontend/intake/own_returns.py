@@ -1,15 +1,13 @@
 """Rays that see the robot itself: a near range that stays while the robot drives and turns."""
 
 import math
-from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from ngo_estimator.geometry.planar_motion import Array, compose
 from ngo_recordings.scan_stream import LidarScan
-
-Indices = NDArray[np.integer[Any]]
 
 _CELL_M = 0.02
 _FARTHEST_M = 1.0
@@ -41,9 +39,8 @@ class OwnReturns:
         self._cells = round(_FARTHEST_M / _CELL_M)
         self._hits = np.zeros((_HEADINGS, 0, self._cells), np.int32)
         self._scans = np.zeros(_HEADINGS, np.int32)
-        self._own = np.zeros((0, self._cells), np.bool_)
+        self._own, self._any = np.zeros((0, self._cells), np.bool_), False
         self._pose, self._counted = np.zeros(3), np.array((math.inf, 0.0, 0.0))
-        self._waiting = False
 
     def moved(self, step: Array) -> None:
         """Take the robot's motion ``(3,)`` since the scan before."""
@@ -54,21 +51,16 @@ class OwnReturns:
         count = len(scan.ranges)
         if count != self._hits.shape[1]:  # rays have other directions now
             self._hits = np.zeros((_HEADINGS, count, self._cells), np.int32)
-            self._own = np.zeros((count, self._cells), np.bool_)
+            self._own, self._any = np.zeros((count, self._cells), np.bool_), False
             self._scans[:] = 0
-        near = (scan.ranges > max(scan.range_min, 0.0)) & (scan.ranges < _FARTHEST_M - _CELL_M)
-        rays = np.flatnonzero(near)
-        cells = (scan.ranges[rays] / _CELL_M).astype(np.int64)
-        self._count(rays, cells)
-        if not self._own.any():
+        ranges, least = np.array(scan.ranges, np.float32), max(scan.range_min, 0.0)
+        self._count(ranges, least)
+        if not self._any:
             return scan.ranges
-        own = rays[self._own[rays, cells]]
-        self.rays = len(own)
-        ranges = scan.ranges.copy()
-        ranges[own] = np.nan
+        self.rays = _left_out(ranges, least, self._own)
         return ranges
 
-    def _count(self, rays: Indices, cells: Indices) -> None:
+    def _count(self, ranges: Array, least: float) -> None:
         off = self._pose - self._counted
         turn = abs(math.remainder(off[2], math.tau))
         if math.hypot(off[0], off[1]) < _STEP_M and turn < _STEP_RAD:
@@ -76,20 +68,50 @@ class OwnReturns:
         self._counted = self._pose
         heading = int((self._pose[2] % math.tau) / math.tau * _HEADINGS) % _HEADINGS
         self._scans[heading] += 1
-        if not len(rays):
-            return
-        self._hits[heading, rays, cells] += 1
-        total = int(self._scans.sum())
+        self._any |= _learned(ranges, least, self._hits, self._scans, heading, self._own)
+
+
+@njit(cache=True)
+def _cell(value: float, least: float) -> int:
+    """The cell of a range (m) that may be the robot's; -1 where it is too far, or none."""
+    return int(value / np.float32(_CELL_M)) if least < value < _FARTHEST_M - _CELL_M else -1
+
+
+@njit(cache=True)
+def _left_out(ranges: Array, least: float, own: NDArray[np.bool_]) -> int:
+    """Make the ranges that end on the robot no numbers; how many these are."""
+    count = 0
+    for ray in range(len(ranges)):
+        cell = _cell(ranges[ray], least)
+        if cell >= 0 and own[ray, cell]:
+            ranges[ray] = np.nan
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _learned(
+    ranges: Array, least: float, hits: NDArray[np.int32], scans: NDArray[np.int32], heading: int, own: NDArray[np.bool_]
+) -> bool:
+    """Count a scan, and judge anew the rays that saw something near; whether one of these sees the robot."""
+    total, cells = scans.sum(), own.shape[1]
+    found = False
+    for ray in range(len(ranges)):
+        cell = _cell(ranges[ray], least)
+        if cell < 0:
+            continue
+        hits[heading, ray, cell] += 1
         if total < _FEWEST:
-            return
-        # A range beside a cell's border falls to either side: two neighbours count as one.
-        hits = self._hits[:, rays].astype(np.float64)
-        hits[:, :, :-1] += self._hits[:, rays, 1:]
-        counted = self._scans >= _PER_HEADING
-        shares = hits[counted] / self._scans[counted, None, None]
-        everywhere = hits.sum(axis=0) >= _SEEN * total
-        turning = (shares >= _SEEN).sum(axis=0) >= _FEWEST_HEADINGS
-        inside = (np.arange(self._cells) + 2) * _CELL_M <= _INSIDE_M
-        own = everywhere & (turning | inside[None])
-        own[:, 1:] |= own[:, :-1]
-        self._own[rays] = own
+            continue
+        own[ray] = False
+        for c in range(cells):
+            seen, turning = 0, 0
+            for h in range(_HEADINGS):
+                # A range beside a cell's border falls to either side: two neighbours count as one.
+                both = hits[h, ray, c] + (hits[h, ray, c + 1] if c + 1 < cells else 0)
+                seen += both
+                turning += scans[h] >= _PER_HEADING and both >= _SEEN * scans[h]
+            if seen >= _SEEN * total and (turning >= _FEWEST_HEADINGS or (c + 2) * _CELL_M <= _INSIDE_M):
+                own[ray, c : c + 2] = True
+                found = True
+    return found

@@ -186,21 +186,23 @@ def _rates(stamps: Array, values: Array, over_s: float) -> Array:
 def _correlation(scans: Array, wheels: Array) -> tuple[Array, Array, Array]:
     """Lags ``(n,)`` (cells by which the wheels' signal begins later), the correlation at each, and the scans' turn
     (rad) in what both have in common there."""
-    size = 1 << (len(scans) + len(wheels)).bit_length()
+    lags = np.arange(-len(scans) + 1, len(wheels))
+    # What both have in common of the scans' signal, and of the wheels'.
+    ours = np.maximum(-lags, 0), np.minimum(len(scans), len(wheels) - lags)
+    its = np.maximum(lags, 0), np.minimum(len(wheels), len(scans) + lags)
 
-    def products(one: Array, other: Array) -> Array:
-        both = np.fft.irfft(np.conj(np.fft.rfft(one, size)) * np.fft.rfft(other, size), size)
-        return np.concatenate((both[size - len(scans) + 1 :], both[: len(wheels)]))
+    def sums(values: Array, common: tuple[Array, Array]) -> Array:
+        upto = np.concatenate(([0.0], np.cumsum(values)))
+        difference: Array = upto[common[1]] - upto[common[0]]
+        return difference
 
-    lags = np.arange(-len(scans) + 1, len(wheels)).astype(np.float64)
-    ones = np.ones_like(scans), np.ones_like(wheels)
-    common = products(*ones)
-    energies = products(scans**2, ones[1]) * products(ones[0], wheels**2)
-    turned = products(np.abs(scans), ones[1]) * _CELL_S, products(ones[0], np.abs(wheels)) * _CELL_S
-    enough = (common > _LEAST_S / _CELL_S) & (np.minimum(*turned) > 0.5 * _LEAST_TURN_RAD)
+    turned = sums(np.abs(scans), ours) * _CELL_S, sums(np.abs(wheels), its) * _CELL_S
+    enough = (ours[1] - ours[0] > _LEAST_S / _CELL_S) & (np.minimum(*turned) > 0.5 * _LEAST_TURN_RAD)
     enough &= np.maximum(*turned) > _LEAST_TURN_RAD
-    correlation = products(scans, wheels)[enough] / np.sqrt(np.maximum(energies[enough], 1e-12))
-    return lags[enough], correlation, turned[0][enough]
+    energies = sums(scans**2, ours)[enough] * sums(wheels**2, its)[enough]
+    size = 1 << (len(scans) + len(wheels)).bit_length()
+    products = np.fft.irfft(np.conj(np.fft.rfft(scans, size)) * np.fft.rfft(wheels, size), size)[lags[enough]]
+    return lags[enough].astype(np.float64), products / np.sqrt(np.maximum(energies, 1e-12)), turned[0][enough]
 
 
 def _aligned(scans: Array, wheels: Array, lag: int) -> tuple[Array, Array]:

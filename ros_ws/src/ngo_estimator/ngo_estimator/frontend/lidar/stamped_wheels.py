@@ -1,9 +1,10 @@
 """Stamped poses of the wheels, the pose at any time among them, and how late scans are by their clock."""
 
 import numpy as np
+from numba import njit
 
 from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
-from ngo_estimator.geometry.planar_motion import Array, all_between, between, chained, wrap
+from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
 
 _KEPT = 1024
 _EXTRAPOLATED_S = 0.5
@@ -72,29 +73,13 @@ class StampedWheels:
     def pose_at(self, stamp_s: float) -> Array | None:
         """The wheels' pose ``(3,)`` when a scan of this stamp (s since the epoch) was taken; None where they were
         silent."""
-        rows, at = self._rows[: self._count], stamp_s - self._origin_ns * 1e-9 - self.lag_s
-        if self._count == 0 or at < rows[0, 0] - _EXTRAPOLATED_S or at > rows[-1, 0] + _EXTRAPOLATED_S:
-            return None
-        if self._count == 1:
-            return rows[0, 1:].copy()
-        i = min(max(int(np.searchsorted(rows[:, 0], at)), 1), self._count - 1)
-        before, after = rows[i - 1], rows[i]
-        share = (at - before[0]) / (after[0] - before[0])
-        result: Array = before[1:] + min(max(share, -1.0), 2.0) * (after[1:] - before[1:])
-        return result
+        return _known(_pose_at(self._rows[: self._count], stamp_s - self._origin_ns * 1e-9 - self.lag_s))
 
     def motion(self, from_s: float, to_s: float, calibration: Array) -> Array | None:
         """The robot's motion ``(3,)`` between two scans (s since the epoch), each reading's times ``calibration``
         ``(3, 3)``; None where the wheels were silent."""
-        begin, end = self.pose_at(from_s), self.pose_at(to_s)
-        if begin is None or end is None:
-            return None
-        rows, origin_s = self._rows[: self._count], self._origin_ns * 1e-9 + self.lag_s
-        first, last = np.searchsorted(rows[:, 0], (from_s - origin_s, to_s - origin_s), side="right")
-        poses = np.concatenate((begin[None], rows[first:last, 1:], end[None]))
-        steps: Array = all_between(poses[:-1], poses[1:]) @ calibration
-        result: Array = chained(steps)[-1]
-        return result
+        begin_s, end_s = (stamp_s - self._origin_ns * 1e-9 - self.lag_s for stamp_s in (from_s, to_s))
+        return _known(_motion(self._rows[: self._count], begin_s, end_s, calibration))
 
     def counted(self, from_s: float, to_s: float) -> Array | None:
         """The same without calibration."""
@@ -116,9 +101,9 @@ class StampedWheels:
             start, end, turn = self._pending.pop(0)
             if start + _LAGS_S[0] < rows[0, 0]:
                 continue
-            by_wheels = np.interp(end - _LAGS_S, rows[:, 0], rows[:, 3]) - np.interp(
-                start - _LAGS_S, rows[:, 0], rows[:, 3]
-            )
+            first, last = np.searchsorted(rows[:, 0], (start - _LAGS_S[-1], end - _LAGS_S[0]))
+            times, yaws = rows[max(first - 1, 0) : last + 1, 0], rows[max(first - 1, 0) : last + 1, 3]
+            by_wheels = np.interp(end - _LAGS_S, times, yaws) - np.interp(start - _LAGS_S, times, yaws)
             if max(abs(turn), float(np.abs(by_wheels).max())) < _TURNS_RAD:
                 continue
             self._off = _REMEMBERED * self._off + np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
@@ -137,3 +122,33 @@ class StampedWheels:
         bend = left - 2.0 * here + right
         shift = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
         return float(_LAGS_S[best] + shift * (_LAGS_S[1] - _LAGS_S[0]))
+
+
+def _known(found: Array) -> Array | None:
+    return None if np.isnan(found[0]) else found
+
+
+@njit(cache=True)
+def _pose_at(rows: Array, at: float) -> Array:
+    """The pose ``(3,)`` at a time; no number where the wheels were silent."""
+    if len(rows) == 0 or at < rows[0, 0] - _EXTRAPOLATED_S or at > rows[-1, 0] + _EXTRAPOLATED_S:
+        return np.full(3, np.nan)
+    if len(rows) == 1:
+        return rows[0, 1:].copy()
+    i = min(max(int(np.searchsorted(rows[:, 0], at)), 1), len(rows) - 1)
+    share = (at - rows[i - 1, 0]) / (rows[i, 0] - rows[i - 1, 0])
+    result: Array = rows[i - 1, 1:] + min(max(share, -1.0), 2.0) * (rows[i, 1:] - rows[i - 1, 1:])
+    return result
+
+
+@njit(cache=True)
+def _motion(rows: Array, begin_s: float, end_s: float, calibration: Array) -> Array:
+    """The motion ``(3,)`` between two times, each reading's times ``calibration``; no number where they were silent."""
+    last, end = _pose_at(rows, begin_s), _pose_at(rows, end_s)
+    motion = np.zeros(3)
+    for k in range(np.searchsorted(rows[:, 0], begin_s, side="right"), len(rows)):
+        if rows[k, 0] > end_s:
+            break
+        motion = compose(motion, between(last, rows[k, 1:]) @ calibration)
+        last = rows[k, 1:].copy()
+    return compose(motion, between(last, end) @ calibration)
