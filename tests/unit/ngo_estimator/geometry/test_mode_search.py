@@ -70,7 +70,7 @@ def test_what_other_scans_saw_through_is_no_wall() -> None:
         counts.add(np.zeros(2), wall)
     counts.add(np.zeros(2), person)
     assert counts.walls(np.concatenate((wall, person))).tolist() == [True, False]
-    counts.add(np.zeros(2), wall, -1)  # seen through by one, and hit by one
+    counts.forget_oldest()  # seen through by one, and hit by one
     assert counts.walls(person).tolist() == [True]
 
 

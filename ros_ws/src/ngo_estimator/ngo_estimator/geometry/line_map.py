@@ -99,8 +99,8 @@ def line_squares(points: Array, normals: Array, side: float = 0.06) -> NDArray[n
 def averaged_lines(points: Array, normals: Array, squares: NDArray[np.int64]) -> tuple[Array, Array]:
     """Points and normals ``(m, 2)``, averaged over the points that lie in the same square.
 
-    ``squares`` ``(n,)`` are their numbers by ``line_squares``. Points without normals are left out. Averages are less
-    noisy than single points, and fewer.
+    ``squares`` ``(n,)`` are their numbers by ``line_squares``; points with -1 are left out. Averages are less noisy
+    than single points, and fewer.
     """
     order = np.argsort(squares)
     mean_points, mean_normals = np.empty_like(points), np.empty_like(normals)

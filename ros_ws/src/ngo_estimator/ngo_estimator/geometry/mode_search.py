@@ -36,6 +36,10 @@ class Mixture:
         logs[-1] -= 2.0 * ratio[0] + ratio[1]
         return Mixture(self.means, deviations, logs)
 
+    def log(self, pose: Array) -> float:
+        """Logarithm of the density of the hypothesis that is likeliest at a pose ``(3,)``."""
+        return float(_log(self.means, self.deviations, self.log_weights, pose))
+
     def logs(self, pose: Array) -> Array:
         """Logarithm ``(k,)`` of the density of each at a pose ``(3,)``."""
         result: Array = _logs(self.means, self.deviations, self.log_weights, pose)
@@ -94,6 +98,11 @@ def two_modes(
         (np.array((window.centre[0] + x * cell, window.centre[1] + y * cell, wrap(float(headings[int(a)])))), total)
         for total, a, x, y in found
     ]
+
+
+@njit(cache=True)
+def _log(means: Array, deviations: Array, log_weights: Array, pose: Array) -> float:
+    return float(_logs(means, deviations, log_weights, pose).max())
 
 
 @njit(cache=True)

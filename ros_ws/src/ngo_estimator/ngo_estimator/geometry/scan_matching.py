@@ -276,13 +276,21 @@ def nearest(
     best, least = -1, CELL_M * CELL_M
     if row < -1 or row > rows or column < -1 or column > columns:
         return best
-    for r in range(max(row - 1, 0), min(row + 2, rows)):
-        low, high = max(column - 1, 0), min(column + 2, columns)
-        if low >= high:
+    # How far the neighbouring cells are: the point's own cell comes first, and mostly none of the others can be nearer.
+    from_left, from_low = x - corner[0] - column * CELL_M, y - corner[1] - row * CELL_M
+    for i in range(3):
+        r = row + (0, -1, 1)[i]
+        up = (0.0, from_low, CELL_M - from_low)[i]
+        if r < 0 or r >= rows or up * up >= least:
             continue
-        for j in range(first[r * columns + low], first[r * columns + high]):
-            away_x, away_y = points[j, 0] - x, points[j, 1] - y
-            square = away_x * away_x + away_y * away_y
-            if square < least and normals[j, 0] * nx + normals[j, 1] * ny > facing:
-                best, least = j, square
+        for j in range(3):
+            c = column + (0, -1, 1)[j]
+            across = (0.0, from_left, CELL_M - from_left)[j]
+            if c < 0 or c >= columns or up * up + across * across >= least:
+                continue
+            for k in range(first[r * columns + c], first[r * columns + c + 1]):
+                away_x, away_y = points[k, 0] - x, points[k, 1] - y
+                square = away_x * away_x + away_y * away_y
+                if square < least and normals[k, 0] * nx + normals[k, 1] * ny > facing:
+                    best, least = k, square
     return best

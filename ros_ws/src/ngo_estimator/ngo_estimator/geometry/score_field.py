@@ -5,6 +5,7 @@ score of many poses at once (Hess et al. 2016, section V).
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from ngo_estimator.geometry.planar_motion import Array
 
 Counts = NDArray[np.int16]
 Field = NDArray[np.uint8]
+Cells = NDArray[np.int32]
 
 _DEPTH = 3
 """Blocks have up to ``2 ** _DEPTH`` cells a side."""
@@ -45,29 +47,33 @@ class ScoreFieldConfig:
 
 
 class RayCounts:
-    """In how many scans rays ended in and passed each cell round ``middle`` ``(2,)``; scans can be taken back."""
+    """In how many scans rays ended in and passed each cell round ``middle`` ``(2,)``; the oldest can be forgotten."""
 
     def __init__(self, config: ScoreFieldConfig, middle: Array) -> None:
         self.config = config
         self.corner = middle - 0.5 * config.side * config.cell_m
         self.hits = np.zeros((config.side, config.side), np.int16)
         self.passes = np.zeros((config.side, config.side), np.int16)
+        self._scans: deque[tuple[Cells, Cells]] = deque()  # cells in which rays of each ended, and passed
         self._marks, self._mark = np.zeros((config.side, config.side), np.int32), 0
         self._kernel = _kernel(config)
         self._low, self._high = np.full(2, config.side), np.zeros(2, np.int64)  # row and column of what was seen
 
-    def add(self, origin: Array, ends: Array, times: int = 1) -> None:
-        """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``; ``times`` -1 takes them back."""
+    def add(self, origin: Array, ends: Array) -> None:
+        """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``."""
         self._mark += 2
         low, high = (ends.min(axis=0), ends.max(axis=0)) if len(ends) else (origin, origin)
         both = np.stack((np.minimum(low, origin), np.maximum(high, origin))) - self.corner
         low, high = np.floor(both[:, ::-1] / self.config.cell_m).astype(np.int64)
         self._low = np.clip(np.minimum(self._low, low - _MARGIN), 0, self.config.side)
         self._high = np.clip(np.maximum(self._high, high + _MARGIN + 1), 0, self.config.side)
-        _count(
-            self.hits, self.passes, self._marks, origin - self.corner, ends - self.corner, self.config.cell_m, times,
-            self._mark,
-        )  # fmt: skip
+        cells = _seen(self._marks, origin - self.corner, ends - self.corner, self.config.cell_m, self._mark)
+        self._scans.append(cells)
+        _count(self.hits, self.passes, *cells, 1)
+
+    def forget_oldest(self) -> None:
+        """Take back the oldest scan."""
+        _count(self.hits, self.passes, *self._scans.popleft(), -1)
 
     def walls(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points ``(n, 2)`` are on walls: not more rays passed there than the settings say."""
@@ -115,34 +121,49 @@ def _kernel(config: ScoreFieldConfig) -> Field:
 
 
 @njit(cache=True)
-def _count(
-    hits: Counts,
-    passes: Counts,
-    marks: NDArray[np.int32],
-    origin: Array,
-    ends: Array,
-    cell: float,
-    times: int,
-    mark: int,
-) -> None:
-    """Count a scan once in each cell; where one of its rays ended, none passed. Cells get ``mark`` or one more."""
-    rows, columns = hits.shape
+def _seen(marks: NDArray[np.int32], origin: Array, ends: Array, cell: float, mark: int) -> tuple[Cells, Cells]:
+    """Cells in which rays of a scan ended, and those that they passed and none ended in, each once.
+
+    Cells get ``mark`` or one more.
+    """
+    rows, columns = marks.shape
+    marked = marks.ravel()
+    ended, passed = np.empty(len(ends), np.int32), np.empty(4096, np.int32)
+    count = 0
     for k in range(len(ends)):
         row, column = math.floor(ends[k, 1] / cell), math.floor(ends[k, 0] / cell)
-        if 0 <= row < rows and 0 <= column < columns and marks[row, column] != mark:
-            hits[row, column] += times
-            marks[row, column] = mark
+        if 0 <= row < rows and 0 <= column < columns and marked[row * columns + column] != mark:
+            ended[count] = row * columns + column
+            marked[ended[count]] = mark
+            count += 1
+    free = 0
+    begin_x, begin_y = origin[0] / cell, origin[1] / cell
     for k in range(len(ends)):
         x, y = ends[k, 0] - origin[0], ends[k, 1] - origin[1]
         length = math.hypot(x, y)
-        for s in range(int(length / cell - 1.5)):
-            share = s * cell / length
-            row, column = int((origin[1] + share * y) / cell), int((origin[0] + share * x) / cell)
+        steps = int(length / cell - 1.5)
+        while free + steps > len(passed):
+            passed = np.concatenate((passed, np.empty_like(passed)))
+        step_x, step_y = x / length if steps > 0 else 0.0, y / length if steps > 0 else 0.0
+        for s in range(steps):
+            row, column = int(begin_y + s * step_y), int(begin_x + s * step_x)
             if not (0 <= row < rows and 0 <= column < columns):
                 break
-            if marks[row, column] < mark:
-                passes[row, column] += times
-                marks[row, column] = mark + 1
+            at = row * columns + column
+            if marked[at] < mark:
+                marked[at] = mark + 1
+                passed[free] = at
+                free += 1
+    return ended[:count].copy(), passed[:free].copy()
+
+
+@njit(cache=True)
+def _count(hits: Counts, passes: Counts, ended: Cells, passed: Cells, times: int) -> None:
+    hit, through = hits.ravel(), passes.ravel()
+    for k in range(len(ended)):
+        hit[ended[k]] += times
+    for k in range(len(passed)):
+        through[passed[k]] += times
 
 
 @njit(cache=True)
@@ -170,9 +191,9 @@ def _draw(field: Field, points: Array, cell: float, kernel: Field) -> None:
         if not (reach <= row < rows - reach and reach <= column < columns - reach) or field[row, column] == 255:
             continue
         for i in range(len(kernel)):
-            for j in range(len(kernel)):
-                r, c = row + i - reach, column + j - reach
-                field[r, c] = max(field[r, c], kernel[i, j])
+            drawn, values = field[row + i - reach, column - reach : column + reach + 1], kernel[i]
+            for j in range(len(values)):
+                drawn[j] = max(drawn[j], values[j])
 
 
 @njit(cache=True)

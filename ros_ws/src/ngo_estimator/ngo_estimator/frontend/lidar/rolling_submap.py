@@ -19,6 +19,7 @@ _REDRAWN_M = 4.0
 class _Placed:
     points: Array
     normals: Array
+    squares: NDArray[np.int64]
     drawn: Array
     origin: Array
     ends: Array
@@ -51,7 +52,7 @@ class RollingSubmap:
         angles, ranges = scan.angles[seen], scan.ranges[seen]
         ends = transformed(sensor, np.stack((ranges * np.cos(angles), ranges * np.sin(angles)), axis=-1))
         drawn = joined(points, normals, self._config.cell_m)
-        self._scans.append(_Placed(points, normals, drawn, sensor[:2], ends))
+        self._scans.append(_Placed(points, normals, line_squares(points, normals), drawn, sensor[:2], ends))
         if self._counts is not None and np.hypot(*(pose[:2] - self._middle)) < _REDRAWN_M:
             self._counts.add(sensor[:2], ends)
         else:
@@ -59,8 +60,8 @@ class RollingSubmap:
             for placed in self._scans:
                 self._counts.add(placed.origin, placed.ends)
         if len(self._scans) > self._most:
-            oldest = self._scans.popleft()
-            self._counts.add(oldest.origin, oldest.ends, -1)
+            self._scans.popleft()
+            self._counts.forget_oldest()
         self._lines = self._field = None
 
     def walls(self, points: Array) -> NDArray[np.bool_]:
@@ -74,9 +75,9 @@ class RollingSubmap:
         if self._lines is None:
             points = np.concatenate([placed.points for placed in self._scans])
             normals = np.concatenate([placed.normals for placed in self._scans])
-            kept = self.walls(points)
-            points, normals = points[kept], normals[kept]
-            self._lines = line_map_of_points(*averaged_lines(points, normals, line_squares(points, normals)))
+            squares = np.concatenate([placed.squares for placed in self._scans])
+            squares[~self.walls(points)] = -1
+            self._lines = line_map_of_points(*averaged_lines(points, normals, squares))
         return self._lines
 
     @property
