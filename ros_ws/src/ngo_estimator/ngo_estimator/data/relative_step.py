@@ -1,5 +1,6 @@
 """One step of the local odometry, as the online trajectory takes it, and what makes one unusable."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -89,7 +90,7 @@ class RelativeStep:
     @property
     def tf_odom_known(self) -> bool:
         """Whether ``map`` -> ``odom`` follows from this step."""
-        return self.robot_odom_xyyaw is None or not bool(np.isnan(self.robot_odom_xyyaw).all())
+        return self.robot_odom_xyyaw is None or not all(map(math.isnan, self.robot_odom_xyyaw))
 
 
 def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | None) -> None:
@@ -128,17 +129,18 @@ def check_step(step: RelativeStep, motion_feature_size: int, code_length: int | 
 def _check_values(name: str, value: np.ndarray, shape: tuple[int, ...], limit: float) -> None:
     if value.shape != shape:
         raise RejectedStep(f"{name} is of shape {value.shape}; expected {shape}")
-    largest = np.abs(value).max(initial=0.0)
-    if not largest < np.inf:  # what is no number is the largest
+    values = value.ravel().tolist()  # few, for which this is faster than an array
+    if not all(map(math.isfinite, values)):
         raise RejectedStep(f"{name} has values that are not finite")
-    if largest > limit:
+    if (largest := max(map(abs, values), default=0.0)) > limit:
         raise RejectedStep(f"{name} has values as large as {largest:g}; expected at most {limit:g}")
 
 
 def _check_covariance(name: str, covariance: np.ndarray) -> None:
     _check_values(name, covariance, (3, 3), np.inf)
-    if not (np.diagonal(covariance) > 0.0).all():
-        raise RejectedStep(f"{name} has the variances {np.diagonal(covariance).tolist()}; expected positive ones")
+    variances = np.diagonal(covariance).tolist()
+    if min(variances) <= 0.0:
+        raise RejectedStep(f"{name} has the variances {variances}; expected positive ones")
 
 
 def _check_scan(name: str, scan: KeyScan, stamp_ns: int) -> None:

@@ -20,6 +20,8 @@ def joined_parts(segments: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         pairs: nodes ``(n, 2)`` that believed loops join.
     """
     part = np.arange(len(segments))
+    if len(segments) == 1:
+        return part
     for a, b in np.unique(segment_of(segments, pairs), axis=0).tolist():
         if part[a] != part[b]:
             low, high = sorted((int(part[a]), int(part[b])))

@@ -62,8 +62,12 @@ def evidence_of(
     views: KeyScanViews,
     stretch: tuple[np.ndarray, np.ndarray],
     others: tuple[np.ndarray, np.ndarray],
+    most_scans: int = _MOST_SCANS,
 ) -> PlaceEvidence:
-    """How the key scans of a stretch agree with those of others near it; both are keys and their poses ``(n, 3)``."""
+    """How the key scans of a stretch agree with those of others near it; both are keys and their poses ``(n, 3)``.
+
+    Of the others ``most_scans`` are compared.
+    """
 
     def together(keys: np.ndarray, poses: np.ndarray) -> PlacedScans:
         chosen = keys.tolist()
@@ -71,7 +75,7 @@ def evidence_of(
 
     keys, at = stretch
     near = np.flatnonzero(np.isfinite(KDTree(at[:, :2]).query(others[1][:, :2], distance_upper_bound=_NEAR_M)[0]))
-    near = near[:: max(1, -(-len(near) // _MOST_SCANS))]
+    near = near[:: max(1, -(-len(near) // most_scans))]
     if not len(near):
         return NO_EVIDENCE
     parts = [slice(first, first + _PART) for first in range(0, len(keys), _PART)]

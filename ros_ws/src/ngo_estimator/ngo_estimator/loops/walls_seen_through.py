@@ -91,9 +91,12 @@ def sightings(sensors: Array, profiles: Array, points: Array) -> NDArray[np.int6
     seen = np.zeros((len(points), 2), np.int64)
     bins = profiles.shape[1]
     for s in range(len(sensors)):
+        farthest = (profiles[s].max() + _MARGIN_M) / (1.0 - _MARGIN_SHARE)
         for k in range(len(points)):
             x, y = points[k, 0] - sensors[s, 0], points[k, 1] - sensors[s, 1]
             away = math.sqrt(x * x + y * y)
+            if away > farthest:
+                continue
             direction = math.floor((math.atan2(y, x) - sensors[s, 2]) * bins / (2.0 * math.pi)) % bins
             ray = profiles[s, direction]
             if ray > 0.0:

@@ -88,6 +88,8 @@ class HypothesisWindow:
 
     def move(self, relative: np.ndarray, covariance: np.ndarray) -> None:
         """Carry the sightings over a step ``(3,)`` with its covariance ``(3, 3)``."""
+        if not self._sightings:
+            return
         self._since = compose(self._since, relative)
         self._covariance = propagate(self._covariance, self._since, relative, covariance)
         self._way_m = self._way_m + np.hypot(relative[0], relative[1])

@@ -49,6 +49,9 @@ _HERE, _ELSEWHERE, _LEAST_SEEN, _LOOKS_ELSEWHERE = 0.25, 0.35, 200, 4
 """Mean share of sightings through walls up to which that is right, and from which on it is wrong, of so many at least;
 the looks for which it must be wrong."""
 
+_HELD_AGAINST = 20
+"""Key scans at most that the newest are held against."""
+
 _LEAST_OVERLAP = 0.2
 """Share of points that the other side sees at least: through glass alone all sightings go through walls, but few."""
 
@@ -181,7 +184,7 @@ class OwnMap:
         old = np.flatnonzero((windows[:newest, 0] <= _SURE_M) & (way > config.least_gap_m))
         if not len(old):
             return None
-        found = evidence_of(scans, views, (last, chain.poses[last]), (old, chain.poses[old]))
+        found = evidence_of(scans, views, (last, chain.poses[last]), (old, chain.poses[old]), _HELD_AGAINST)
         if found.said and found.mean <= _HERE:
             self._agreed, self._astray = newest, self._astray[:0]
         elif found.seen >= _LEAST_SEEN and found.overlap >= _LEAST_OVERLAP and found.mean > _ELSEWHERE:

@@ -173,7 +173,7 @@ class ScanGraph(PoseGraph):
     @property
     def _joining_pairs(self) -> np.ndarray:
         """Keys ``(n, 2)`` that loops join: of two segments only where the last optimisation believed the loop."""
-        pairs, weight = self.used_loops.pairs, np.zeros(len(self._selection))
+        pairs, weight = self._finder.loops.pairs[self._selection.rows], np.zeros(len(self._selection))
         weight[: len(self.closed)] = self.closed.weight
         first, last = segment_of(self._nodes.segments, pairs).T
         return pairs[(first == last) | (weight > BELIEVED)]

@@ -9,8 +9,10 @@ reckoned, and after a while begins a new segment with an empty submap: what is n
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
@@ -84,6 +86,11 @@ class _Mode:
     def walls(self) -> Array:
         """Covariance by the walls alone."""
         return inverted(self.found.information + _UNKNOWN)
+
+
+class _Points(NamedTuple):
+    points: Array
+    normals: Array
 
 
 class MixtureOdometry:
@@ -246,8 +253,10 @@ class MixtureOdometry:
         for fit in fits:
             if not any(self._is_same(fit.pose, mode.pose) for mode in modes):
                 modes.append(fit)
+        if len(modes) == 1:
+            return modes[0]
         prior = self._prior(0.0)
-        logs = np.array([mode.score / weight + float(prior.logs(mode.pose).max()) for mode in modes])
+        logs = np.array([mode.score / weight + prior.log(mode.pose) for mode in modes])
         likelihoods = np.exp(np.minimum(logs - logs[0], 0.0))
         covariance = modes[0].found.covariance
         for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
@@ -257,21 +266,14 @@ class MixtureOdometry:
         return replace(modes[0], found=replace(modes[0].found, covariance=covariance))
 
     def _is_same(self, a: Array, b: Array) -> bool:
-        off = between(a, b)
-        return math.hypot(off[0], off[1]) < self.config.same_m and abs(off[2]) < self.config.same_rad
+        return bool(_near(a, b, self.config.same_m, self.config.same_rad))
 
     def _starts(self) -> list[int]:
         """The hypotheses but anything, without those that say no more than one before."""
-        mixture = self.mixture
-        starts: list[int] = []
-        for k in mixture.usable[:-1]:
-            if not any(
-                self._is_same(mixture.steps[k], mixture.steps[other])
-                and (mixture.deviations[k] < 2.0 * mixture.deviations[other]).all()
-                for other in starts
-            ):
-                starts.append(k)
-        return starts
+        mixture, same = self.mixture, (self.config.same_m, self.config.same_rad)
+        usable, deviations = np.array(mixture.usable[:-1]), mixture.deviations
+        distinct: list[int] = usable[_distinct(mixture.steps[usable], deviations[usable], *same)].tolist()
+        return distinct
 
     def _window(self, prior: Mixture, wide: bool) -> SearchWindow:
         config = self.config
@@ -279,11 +281,7 @@ class MixtureOdometry:
         most_m, most_rad = config.most_window_m, math.radians(config.most_window_deg)
         if wide:
             return SearchWindow(centre, most_m, most_rad, math.radians(config.heading_step_deg))
-        off = prior.means - centre
-        turn = np.abs((off[:, 2] + math.pi) % (2.0 * math.pi) - math.pi)
-        reach = 2.0 * prior.deviations[:-1] if len(prior.means) > 1 else prior.deviations
-        metres = float((np.abs(off[:-1, :2]).max(axis=1) + reach[:, 0]).max())
-        radians = float((turn[:-1] + reach[:, 1]).max())
+        metres, radians = _reach(prior.means[:-1], prior.deviations[:-1], centre)
         return SearchWindow(
             centre,
             min(max(metres, config.least_window_m), most_m),
@@ -291,7 +289,7 @@ class MixtureOdometry:
             math.radians(config.heading_step_deg),
         )
 
-    def _fit(self, few: KeyScan, hypothesis: int, start: Array | None, prior: Mixture, weight: float) -> _Mode:
+    def _fit(self, few: _Points, hypothesis: int, start: Array | None, prior: Mixture, weight: float) -> _Mode:
         """A mode, registered under a hypothesis from where that has it, or from ``start`` ``(3,)``."""
         mean = compose(self._pose, self.mixture.steps[hypothesis])
         if start is None:
@@ -301,9 +299,9 @@ class MixtureOdometry:
             information = broad * min(1.0, _FAR / max(squared_deviations(start, mean, broad), 1e-9))
         found = self._icp(few, start, mean, information, self.config.icp)
         score = self._submap.field.score(few.points, found.pose)
-        return _Mode(found, hypothesis, score, score + weight * float(prior.logs(found.pose).max()))
+        return _Mode(found, hypothesis, score, score + weight * prior.log(found.pose))
 
-    def _sharpened(self, scan: KeyScan, few: KeyScan, mode: _Mode) -> _Mode:
+    def _sharpened(self, scan: KeyScan, few: _Points, mode: _Mode) -> _Mode:
         """A mode of the ``few`` points, registered with all of the scan's under the hypothesis that is likeliest."""
         mixture, walls = self.mixture, mode.walls
         likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
@@ -314,14 +312,44 @@ class MixtureOdometry:
         found = self._icp(scan, mode.pose, mean, information, self._last_steps)
         return _Mode(found, likeliest, self._submap.field.score(few.points, found.pose), mode.total)
 
-    def _icp(self, scan: KeyScan, start: Array, mean: Array, information: Array, config: IcpConfig) -> Registration:
+    def _icp(
+        self, scan: KeyScan | _Points, start: Array, mean: Array, information: Array, config: IcpConfig
+    ) -> Registration:
         return icp(self._submap.lines, scan.points, scan.normals, start, (mean, information), config, _OPEN_SHARE)
 
 
-def _on_lines(scan: KeyScan, most: int) -> KeyScan:
-    """The scan with at most so many of its points, of those on lines where these are enough."""
-    kept = np.flatnonzero((scan.normals != 0.0).any(axis=1))
+@njit(cache=True)
+def _near(a: Array, b: Array, metres: float, radians: float) -> bool:
+    off = between(a, b)
+    return math.hypot(off[0], off[1]) < metres and abs(off[2]) < radians
+
+
+@njit(cache=True)
+def _distinct(steps: Array, deviations: Array, metres: float, radians: float) -> NDArray[np.bool_]:
+    """Which steps ``(n, 3)`` with their deviations ``(n, 2)`` say more than one before."""
+    result = np.ones(len(steps), np.bool_)
+    for k in range(len(steps)):
+        for i in range(k):
+            if result[i] and _near(steps[k], steps[i], metres, radians):
+                result[k] = result[k] and not (deviations[k] < 2.0 * deviations[i]).all()
+    return result
+
+
+@njit(cache=True)
+def _reach(means: Array, deviations: Array, centre: Array) -> tuple[float, float]:
+    """Half a window (m, rad) that covers hypotheses to two deviations."""
+    metres, radians = 0.0, 0.0
+    for k in range(len(means)):
+        off = max(abs(means[k, 0] - centre[0]), abs(means[k, 1] - centre[1]))
+        metres = max(metres, off + 2.0 * deviations[k, 0])
+        radians = max(radians, abs(wrap(means[k, 2] - centre[2])) + 2.0 * deviations[k, 1])
+    return metres, radians
+
+
+def _on_lines(scan: KeyScan, most: int) -> _Points:
+    """At most so many of a scan's points, of those on lines where these are enough."""
+    kept = np.flatnonzero((scan.normals[:, 0] != 0.0) | (scan.normals[:, 1] != 0.0))
     if len(kept) < 2 * _FEWEST:
         kept = np.arange(len(scan.points))
     kept = kept[:: max(1, math.ceil(len(kept) / most))]
-    return replace(scan, points=scan.points[kept], normals=scan.normals[kept])
+    return _Points(scan.points[kept], scan.normals[kept])
