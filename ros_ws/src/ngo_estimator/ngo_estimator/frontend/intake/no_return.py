@@ -10,9 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from ngo_estimator.geometry.planar_motion import Array
 from ngo_recordings.scan_stream import LidarScan
+
+Ranges = NDArray[np.float32]
 
 _BEHIND_M = 0.1
 _LEAST_GAP = 0.25
@@ -77,7 +79,7 @@ class NoReturnValues:
             if value not in self.values and (seen[value] >= _SCANS or self._tops[value] >= _TOP_SCANS):
                 self.values = sorted([*self.values, value])
 
-    def _is_elsewhere(self, ranges: Array) -> bool:
+    def _is_elsewhere(self, ranges: Ranges) -> bool:
         if len(self._place) == len(ranges) and not _changed(self._place, ranges):
             return False
         self._place = ranges
@@ -85,7 +87,7 @@ class NoReturnValues:
 
 
 @njit(cache=True)
-def _piled(ranges: Array, least: float, largest: float) -> tuple[Array, bool]:
+def _piled(ranges: Ranges, least: float, largest: float) -> tuple[Ranges, bool]:
     """Values that pile up in a scan, with nothing just behind them; and whether many have the largest of all."""
     usual = np.sort(ranges[np.isfinite(ranges) & (ranges > least) & (ranges < largest)])
     found, total = np.empty(0, ranges.dtype), len(usual)
@@ -108,7 +110,7 @@ def _piled(ranges: Array, least: float, largest: float) -> tuple[Array, bool]:
 
 
 @njit(cache=True)
-def _changed(before: Array, after: Array) -> bool:
+def _changed(before: Ranges, after: Ranges) -> bool:
     both, changed = 0, 0
     for k in range(len(before)):
         if math.isfinite(before[k]) and math.isfinite(after[k]):

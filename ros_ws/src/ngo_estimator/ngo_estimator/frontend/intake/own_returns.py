@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from ngo_estimator.geometry.planar_motion import Array, compose
 from ngo_recordings.scan_stream import LidarScan
 
+Ranges = NDArray[np.float32]
+Counts = NDArray[np.int32]
+
 _CELL_M = 0.02
 _FARTHEST_M = 1.0
 """No robot of a usual size sees itself farther away."""
@@ -46,7 +49,7 @@ class OwnReturns:
         """Take the robot's motion ``(3,)`` since the scan before."""
         self._pose = compose(self._pose, step)
 
-    def clean(self, scan: LidarScan) -> Array:
+    def clean(self, scan: LidarScan) -> Ranges:
         """The scan's ranges ``(rays,)``, those that end on the robot not numbers."""
         count = len(scan.ranges)
         if count != self._hits.shape[1]:  # rays have other directions now
@@ -60,7 +63,7 @@ class OwnReturns:
         self.rays = _left_out(ranges, least, self._own)
         return ranges
 
-    def _count(self, ranges: Array, least: float) -> None:
+    def _count(self, ranges: Ranges, least: float) -> None:
         off = self._pose - self._counted
         turn = abs(math.remainder(off[2], math.tau))
         if math.hypot(off[0], off[1]) < _STEP_M and turn < _STEP_RAD:
@@ -78,7 +81,7 @@ def _cell(value: float, least: float) -> int:
 
 
 @njit(cache=True)
-def _left_out(ranges: Array, least: float, own: NDArray[np.bool_]) -> int:
+def _left_out(ranges: Ranges, least: float, own: NDArray[np.bool_]) -> int:
     """Make the ranges that end on the robot no numbers; how many these are."""
     count = 0
     for ray in range(len(ranges)):
@@ -91,7 +94,7 @@ def _left_out(ranges: Array, least: float, own: NDArray[np.bool_]) -> int:
 
 @njit(cache=True)
 def _learned(
-    ranges: Array, least: float, hits: NDArray[np.int32], scans: NDArray[np.int32], heading: int, own: NDArray[np.bool_]
+    ranges: Ranges, least: float, hits: Counts, scans: Counts, heading: int, own: NDArray[np.bool_]
 ) -> bool:
     """Count a scan, and judge anew the rays that saw something near; whether one of these sees the robot."""
     total, cells = scans.sum(), own.shape[1]
