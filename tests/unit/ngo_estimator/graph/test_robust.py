@@ -129,6 +129,22 @@ def test_misstated_covariances_are_noticed(factor: float) -> None:
     assert 0.5 < ratio[0, 0] < 2.0
 
 
+def mixed(seed: int, wrong: int, group: int = 1) -> tuple[GraphProblem, np.ndarray]:
+    """Of the loops of a square, each second one says only that two nodes are at one place."""
+    (problem, true), (places, _) = (square(4, seed, wrong, metric, group) for metric in (True, False))
+    loops = problem.loops[::2].extended(places.loops[1::2])
+    return replace(problem, loops=loops), true
+
+
+@pytest.mark.parametrize("factor", [25.0, 0.04])
+def test_misstated_covariances_are_noticed_where_some_loops_know_only_places(factor: float) -> None:
+    problem, true = mixed(4, 2 * ROUND)
+    stated = replace(problem, steps=problem.steps.scaled(factor), loops=problem.loops.scaled(factor))
+    solution = Robust().correct(stated)
+    assert 0.3 < solution.step_scale * factor < 3.0
+    assert worst(solution.poses, true) < 2.0 * worst(Robust().correct(problem).poses, true)
+
+
 @pytest.mark.parametrize(("least_scale", "believed"), [(1.0, True), (1e-3, False)])
 def test_errors_in_common_do_not_shut_out_the_loops_of_another_place(least_scale: float, believed: bool) -> None:
     """All residuals are small, until the last loops, which are two deviations off, and agree with each other."""

@@ -5,7 +5,7 @@ cost, ``truncated_cost``, so that the better of two solutions can be kept whoeve
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -51,6 +51,10 @@ class GraphProblem:
                 f"there are {len(self.poses)} poses, {len(self.steps)} steps, {len(self.loops)} loops and trust in "
                 f"{len(self.trust)}; expected a step less than poses, and trust in every loop"
             )
+
+    def scaled(self, variance: float) -> "GraphProblem":
+        """The same with all covariances so many times as large."""
+        return replace(self, steps=self.steps.scaled(variance), loops=self.loops.scaled(variance))
 
 
 @dataclass(frozen=True)

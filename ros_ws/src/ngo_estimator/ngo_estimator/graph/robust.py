@@ -2,8 +2,8 @@
 
 Two methods give a solution: graduated non-convexity over all loops that the cycles do not rule out, and belief in the
 surest loops first. What each solution predicts lets more loops in. One cost judges between all. Covariances that
-are not as stated are scaled. The cycles measure the scale before anything is solved, and the residuals of what is
-believed measure it afterwards.
+are not as stated are scaled. Cycles of loops that know the whole relative pose measure the scale before anything is
+solved, and the residuals of what is believed measure it afterwards.
 """
 
 from dataclasses import replace
@@ -84,11 +84,11 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
     """The best of the solutions that begin at the chain."""
     area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
     chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
-    whole = bool((problem.loops.degrees == 3).all())
-    if whole:
-        scale, inlier_ratio = scale_and_inlier_ratio(ChainUncertainty(problem.steps), problem.loops, area)
+    metric = problem.loops.degrees == 3
+    if metric.any():
+        scale, inlier_ratio = scale_and_inlier_ratio(ChainUncertainty(problem.steps), problem.loops[metric], area)
         scale = _noticed(scale, least_scale)
-        scaled = _scaled(problem, scale, scale)
+        scaled = problem.scaled(scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
     begun, rows = replace(scaled, poses=chain), np.argsort(-odds, kind="stable")
     likely = _affordable(begun, rows[: np.count_nonzero(odds > 0.0)])
@@ -97,12 +97,12 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio, told)[0],
     ]
     solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in solutions]
-    if not whole:  # cycles of places measure no scale: of a chain that is worse than stated they rule out right ones
+    if not metric.all():  # of a chain that is worse than stated, cycles of places rule out right ones
         solutions.append(graduate(_affordable(begun, rows), chain, told=told)[0])
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
-    if whole and scale not in (1.0, solution.loop_scale):
+    if scale not in (1.0, solution.loop_scale):
         solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops), least_scale)
     return solution
 
@@ -120,7 +120,7 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
     nodes, old = len(start.poses), len(start.loop_weights)
     since = chain_poses(problem.steps.relative[nodes - 1 :], start.poses[-1])
     poses = np.concatenate((start.poses, since[1:]))
-    scaled, believed = _scaled(problem, start.scale, start.scale), np.zeros(len(problem.loops), bool)
+    scaled, believed = problem.scaled(start.scale), np.zeros(len(problem.loops), bool)
     believed[:old] = start.loop_weights > 0.0
     # A loop that was refused is asked again where it fits, or when all are.
     fits = (scaled.loops.residuals(poses) ** 2).sum(1) <= thresholds(scaled.loops)
@@ -142,7 +142,7 @@ def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
 
 def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int, least_scale: float) -> CorrectedGraph:
     """The nearest solution of the truncated cost, with variances so many times as large as stated."""
-    scaled = _scaled(problem, scale, scale)
+    scaled = problem.scaled(scale)
     poses, loop_weights, step_weights = graduate(scaled, poses, _NEAR, steps_break=True)
     cost = truncated_cost(scaled, poses)
     solution = CorrectedGraph(problem, poses, loop_weights, step_weights, cost, scale, loops_from_nothing=loops)
@@ -154,10 +154,6 @@ def _polished(problem: GraphProblem, poses: np.ndarray, scale: float, loops: int
 def _noticed(scale: float, least: float) -> float:
     scale = max(scale, least)
     return 1.0 if 1.0 / _MISSTATED < scale < _MISSTATED else scale
-
-
-def _scaled(problem: GraphProblem, step_scale: float, loop_scale: float) -> GraphProblem:
-    return replace(problem, steps=problem.steps.scaled(step_scale), loops=problem.loops.scaled(loop_scale))
 
 
 def _found_scales(problem: GraphProblem, solution: CorrectedGraph) -> tuple[float, float]:
