@@ -95,14 +95,20 @@ def line_squares(points: Array, normals: Array, side: float = 0.06) -> NDArray[n
     return squares
 
 
-@njit(cache=True)
 def averaged_lines(points: Array, normals: Array, squares: NDArray[np.int64]) -> tuple[Array, Array]:
     """Points and normals ``(m, 2)``, averaged over the points that lie in the same square.
 
     ``squares`` ``(n,)`` are their numbers by ``line_squares``; points with -1 are left out. Averages are less noisy
     than single points, and fewer.
     """
-    order = np.argsort(squares)
+    averages: tuple[Array, Array] = _averaged(points, normals, squares, np.argsort(squares))
+    return averages
+
+
+@njit(cache=True)
+def _averaged(
+    points: Array, normals: Array, squares: NDArray[np.int64], order: NDArray[np.int64]
+) -> tuple[Array, Array]:
     mean_points, mean_normals = np.empty_like(points), np.empty_like(normals)
     count, begin = 0, 0
     while begin < len(order) and squares[order[begin]] < 0:

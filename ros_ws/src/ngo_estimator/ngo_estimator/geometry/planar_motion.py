@@ -34,6 +34,7 @@ def between(a: Array, b: Array) -> Array:
     return np.array((cos * x + sin * y, -sin * x + cos * y, wrap(b[2] - a[2])))
 
 
+@njit(cache=True)
 def arc_velocity(motion: Array, elapsed_s: float) -> Array:
     """The constant velocity ``(3,)`` (m/s, m/s, rad/s) along the robot's axes of a motion ``(3,)`` along an arc.
 
@@ -43,6 +44,7 @@ def arc_velocity(motion: Array, elapsed_s: float) -> Array:
     return np.array((along[0], along[1], motion[2])) / elapsed_s
 
 
+@njit(cache=True)
 def arc_motion(velocity: Array, elapsed_s: float) -> Array:
     """The motion ``(3,)`` of a constant velocity ``(3,)``: the inverse of ``arc_velocity``."""
     motion = velocity * elapsed_s

@@ -51,13 +51,19 @@ class RayCounts:
 
     def __init__(self, config: ScoreFieldConfig, middle: Array) -> None:
         self.config = config
-        self.corner = middle - 0.5 * config.side * config.cell_m
         self.hits = np.zeros((config.side, config.side), np.int16)
         self.passes = np.zeros((config.side, config.side), np.int16)
         self._scans: deque[tuple[Cells, Cells]] = deque()  # cells in which rays of each ended, and passed
         self._marks, self._mark = np.zeros((config.side, config.side), np.int32), 0
         self._kernel = _kernel(config)
-        self._low, self._high = np.full(2, config.side), np.zeros(2, np.int64)  # row and column of what was seen
+        self.begin_at(middle)
+
+    def begin_at(self, middle: Array) -> None:
+        """Forget all scans; the cells lie round another ``middle``."""
+        while self._scans:
+            self.forget_oldest()
+        self.middle, self.corner = middle, middle - 0.5 * self.config.side * self.config.cell_m
+        self._low, self._high = np.full(2, self.config.side), np.zeros(2, np.int64)  # row and column of what was seen
 
     def add(self, origin: Array, ends: Array) -> None:
         """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``."""
@@ -173,6 +179,8 @@ def _walls(hits: Counts, passes: Counts, points: Array, cell: float, ratio: floa
     for k in range(len(points)):
         row, column = math.floor(points[k, 1] / cell), math.floor(points[k, 0] / cell)
         if not (1 <= row < rows - 1 and 1 <= column < columns - 1):
+            continue
+        if passes[row, column] == 0:
             continue
         ended = 0
         for r in range(row - 1, row + 2):

@@ -93,9 +93,7 @@ def _left_out(ranges: Ranges, least: float, own: NDArray[np.bool_]) -> int:
 
 
 @njit(cache=True)
-def _learned(
-    ranges: Ranges, least: float, hits: Counts, scans: Counts, heading: int, own: NDArray[np.bool_]
-) -> bool:
+def _learned(ranges: Ranges, least: float, hits: Counts, scans: Counts, heading: int, own: NDArray[np.bool_]) -> bool:
     """Count a scan, and judge anew the rays that saw something near; whether one of these sees the robot."""
     total, cells = scans.sum(), own.shape[1]
     found = False

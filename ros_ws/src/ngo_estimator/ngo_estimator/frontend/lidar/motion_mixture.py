@@ -45,15 +45,13 @@ class WheelCalibration:
 
     def learn(self, motion: Array, found: Array, share: float) -> None:
         """Take a motion ``(3,)`` of the wheels and what a match found; the ``share`` of it that is theirs counts."""
-        way = math.hypot(motion[0], motion[1])
-        keep = 1.0 - share * min(0.1, way / self._config.remembered_m)
-        share /= way + abs(float(motion[2])) + 1e-3  # errors grow with the root of the way
-        self._squares = keep * self._squares + share * np.outer(motion, motion)
-        self._products = keep * self._products + share * np.outer(motion, found)
-        self._matrix = np.linalg.solve(self._squares, self._products)
+        self._matrix = _calibrated(self._squares, self._products, motion, found, share, self._config.remembered_m)
 
 
 TIGHT, LOOSE, LAST, VELOCITY, NONE, ANY = range(6)
+
+_KNOWN = np.zeros((3, 3))
+"""Covariance of what is measured exactly."""
 
 
 class MotionMixture:
@@ -64,7 +62,7 @@ class MotionMixture:
         self._config = config
         self._weights = np.array(config.first_weights)
         self._factors = np.array(config.first_factors)[:, None].repeat(2, axis=1)  # of positions, of headings
-        self._squares = self._factors**2
+        self._squares, self._least = self._factors**2, np.array(config.least_factors)
         self._steps = np.zeros((6, 3))
         self._usable = np.zeros(6, np.bool_)
         self._base = self._deviations = np.ones((6, 2))
@@ -109,45 +107,23 @@ class MotionMixture:
         self._raw = counted
         if by_wheels is not None:
             self._steps[TIGHT] = self._steps[LOOSE] = self._steps[ANY] = by_wheels
-        longer = max(self._gap, 1.0)
-        self._base = self._unscaled()
-        self._deviations = self._factors * self._base
-        self._deviations[[LAST, VELOCITY, NONE]] *= longer
-        self._deviations[ANY] = np.array(self._config.anything) * longer
+        c = self._config
+        grow = c.still_m, c.way_share, c.turn_m, math.radians(c.still_deg), c.turn_share, c.way_rad
+        self._base, self._deviations = _grown(self._steps, self._factors, max(self._gap, 1.0), grow, c.anything)
         for k, periods in ((LAST, self._last_gap), (VELOCITY, self._gap)):
             self._foretold[k] = self.filter.predicted(yaw, self._steps[k], periods, self._deviations[k])
-
-    def _unscaled(self) -> Array:
-        """Deviations ``(6, 2)`` (m, rad) before factors."""
-        c = self._config
-        way, turn = np.hypot(self._steps[:, 0], self._steps[:, 1]), np.abs(self._steps[:, 2])
-        way[[NONE, ANY]], turn[[NONE, ANY]] = 0.0, 0.0
-        position = c.still_m + c.way_share * way + c.turn_m * turn
-        heading = math.radians(c.still_deg) + c.turn_share * turn + c.way_rad * way
-        return np.stack((position, heading), axis=-1)
 
     def prior(
         self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float], share: float = 0.0
     ) -> Mixture:
         """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``, as ``walls`` ``(3, 3)`` would
         measure them; no deviation is below ``least`` (m, rad), and no weight below ``share``."""
-        shared = np.array((0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]))
-        variances = self._deviations**2 + shared
-        for k in (LAST, VELOCITY):
-            joint, _ = self._foretold[k]
-            variances[k] = 0.5 * (joint[0, 0] + joint[1, 1]), joint[2, 2]
-        if walls is not None:
-            variances += (0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])
-        both = variances, self._weights
-        return Mixture(*_formed(pose, self._steps, self._usable, *both, np.array(least), share))
-
-    def _unknown(self) -> Array:
-        """Variances ``(6, 2)`` of what the last match left open of the motion."""
-        result = np.zeros((6, 2))
-        known = self.filter.joint[3:, 3:]
-        for k, periods in ((LAST, self._last_gap), (VELOCITY, self._gap)):
-            result[k] = 0.5 * (known[0, 0] + known[1, 1]) * periods**2, known[2, 2] * periods**2
-        return result
+        joint = self._foretold[LAST][0], self._foretold[VELOCITY][0]
+        walls = _KNOWN if walls is None else walls
+        means = _formed(
+            pose, self._steps, self._usable, self._deviations, covariance, *joint, walls, self._weights, least, share
+        )
+        return Mixture(*means)
 
     @property
     def heaviest(self) -> int:
@@ -167,9 +143,9 @@ class MotionMixture:
 
     def step_covariance(self, hypothesis: int) -> Array:
         """Covariance ``(3, 3)`` of a hypothesis' motion; errors of wheels repeat from step to step."""
-        position, heading = self._deviations[hypothesis] ** 2
         repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
-        return repeated * np.diag((position, position, heading))
+        result: Array = _diagonal(self._deviations[hypothesis], repeated)
+        return result
 
     def foretold(self, pose: Array, covariance: Array) -> tuple[Array, Array]:
         """The pose ``(3,)`` after one of ``covariance`` ``(3, 3)`` by the likeliest hypothesis, with the covariance of
@@ -198,29 +174,95 @@ class MotionMixture:
 
     def learn(self, step: Array, walls: Array) -> None:
         """Take the motion ``(3,)`` that a match found, with the covariance ``(3, 3)`` that walls alone leave it."""
-        c, usable = self._config, self._usable
-        variance = np.array((0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2])) + self._unknown()
-        way, turn = math.hypot(step[0], step[1]), abs(float(step[2]))
-        by_wheels = self._steps[TIGHT] if usable[TIGHT] else step
-        way, turn = max(way, math.hypot(by_wheels[0], by_wheels[1])), max(turn, abs(float(by_wheels[2])))
-        rate = c.learn_rate * min(1.0, way / c.learn_m + turn / c.learn_rad)
-        if rate <= 0.0:
-            return
-        errors, shares = _shared(self._steps, step, self._deviations, variance, self._weights, usable)
-        if self._raw is not None and abs(self._raw[2]) < c.learn_rad and way < 2.0 * c.learn_m:
-            self.calibration.learn(self._raw, step, float(shares[TIGHT] + shares[LOOSE]))
-        held = self._weights[usable].sum()
-        self._weights[usable] += rate * (held * shares[usable] - self._weights[usable])
-        self._weights[:] = np.maximum(self._weights, c.least_weight)
-        self._weights /= self._weights.sum()
-        # Of a posterior: what the match leaves open is as likely as it was foretold.
-        known = self._deviations**2
-        left = known * variance / (known + variance)
-        shrunk = errors * (known / (known + variance)) ** 2 + left
-        part = rate * shares[:, None]
-        self._squares += part * (np.minimum(shrunk / self._base**2, c.most_factor**2) - self._squares)
-        least = np.array(c.least_factors)[:, None]
-        self._factors = np.clip(np.sqrt(self._squares), least, c.most_factor)
+        c = self._config
+        numbers = c.learn_rate, c.learn_m, c.learn_rad, c.least_weight, c.most_factor
+        foretold = self._steps, self._usable, self._base, self._deviations
+        known = self.filter.joint, (self._last_gap, self._gap)
+        share, way = _learned(
+            *foretold, self._weights, self._squares, self._factors, self._least, step, walls, *known, numbers
+        )
+        if share > 0.0 and self._raw is not None and abs(self._raw[2]) < c.learn_rad and way < 2.0 * c.learn_m:
+            self.calibration.learn(self._raw, step, share)
+
+
+@njit(cache=True)
+def _calibrated(
+    squares: Array, products: Array, motion: Array, found: Array, share: float, remembered_m: float
+) -> Array:
+    """Take a motion ``(3,)`` into sums of squares and products ``(3, 3)``; the matrix ``(3, 3)`` that they make."""
+    way = math.hypot(motion[0], motion[1])
+    keep = 1.0 - share * min(0.1, way / remembered_m)
+    share /= way + abs(motion[2]) + 1e-3  # errors grow with the root of the way
+    squares[:] = keep * squares + share * np.outer(motion, motion)
+    products[:] = keep * products + share * np.outer(motion, found)
+    return np.ascontiguousarray(np.linalg.solve(squares, products))
+
+
+@njit(cache=True)
+def _grown(
+    steps: Array, factors: Array, longer: float, grow: tuple[float, float, float, float, float, float],
+    anything: tuple[float, float],
+) -> tuple[Array, Array]:  # fmt: skip
+    """Deviations ``(6, 2)`` (m, rad) of steps ``(6, 3)``, before factors and with them."""
+    still_m, way_share, turn_m, still_rad, turn_share, way_rad = grow
+    base = np.empty((6, 2))
+    for k in range(6):
+        way = math.hypot(steps[k, 0], steps[k, 1]) if k not in (NONE, ANY) else 0.0
+        turn = abs(steps[k, 2]) if k not in (NONE, ANY) else 0.0
+        base[k, 0] = still_m + way_share * way + turn_m * turn
+        base[k, 1] = still_rad + turn_share * turn + way_rad * way
+    deviations = factors * base
+    for k in (LAST, VELOCITY, NONE):
+        deviations[k] *= longer
+    deviations[ANY, 0], deviations[ANY, 1] = anything[0] * longer, anything[1] * longer
+    return base, deviations
+
+
+@njit(cache=True)
+def _diagonal(deviations: Array, repeated: float) -> Array:
+    result = np.zeros((3, 3))
+    result[0, 0] = result[1, 1] = repeated * deviations[0] ** 2
+    result[2, 2] = repeated * deviations[1] ** 2
+    return result
+
+
+@njit(cache=True)
+def _learned(
+    steps: Array, usable: NDArray[np.bool_], base: Array, deviations: Array, weights: Array, squares: Array,
+    factors: Array, least: Array, step: Array, walls: Array, joint: Array, gaps: tuple[float, float],
+    numbers: tuple[float, float, float, float, float],
+) -> tuple[float, float]:  # fmt: skip
+    """Move weights ``(6,)``, ``squares`` and ``factors`` ``(6, 2)`` by a match; the wheels' share in it, and the way.
+
+    ``joint`` ``(6, 6)`` is what the last match left open.
+    """
+    learn_rate, learn_m, learn_rad, least_weight, most_factor = numbers
+    by_wheels = steps[TIGHT] if usable[TIGHT] else step
+    way = max(math.hypot(step[0], step[1]), math.hypot(by_wheels[0], by_wheels[1]))
+    rate = learn_rate * min(1.0, way / learn_m + max(abs(step[2]), abs(by_wheels[2])) / learn_rad)
+    if rate <= 0.0:
+        return 0.0, way
+    variance = np.empty((6, 2))
+    variance[:, 0], variance[:, 1] = 0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2]
+    for k, periods in ((LAST, gaps[0]), (VELOCITY, gaps[1])):
+        variance[k, 0] += 0.5 * (joint[3, 3] + joint[4, 4]) * periods**2
+        variance[k, 1] += joint[5, 5] * periods**2
+    errors, shares = _shared(steps, step, deviations, variance, weights, usable)
+    held = (weights * usable).sum()
+    for k in range(6):
+        if usable[k]:
+            weights[k] += rate * (held * shares[k] - weights[k])
+    weights[:] = np.maximum(weights, least_weight)
+    weights /= weights.sum()
+    for k in range(6):
+        for i in range(2):
+            # Of a posterior: what the match leaves open is as likely as it was foretold.
+            known = deviations[k, i] ** 2
+            part = known / (known + variance[k, i])
+            shrunk = errors[k, i] * part**2 + part * variance[k, i]
+            squares[k, i] += rate * shares[k] * (min(shrunk / base[k, i] ** 2, most_factor**2) - squares[k, i])
+            factors[k, i] = min(max(math.sqrt(squares[k, i]), least[k]), most_factor)
+    return shares[TIGHT] + shares[LOOSE], way
 
 
 @njit(cache=True)
@@ -242,8 +284,9 @@ def _shared(
 
 @njit(cache=True)
 def _formed(
-    pose: Array, steps: Array, usable: NDArray[np.bool_], variances: Array, weights: Array, least: Array, share: float
-) -> tuple[Array, Array, Array]:
+    pose: Array, steps: Array, usable: NDArray[np.bool_], own: Array, covariance: Array, last: Array, velocity: Array,
+    walls: Array, weights: Array, least: tuple[float, float], share: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Means, deviations and logarithms of weights of the mixture after ``pose`` ``(3,)``."""
     n = int(usable.sum())
     means, deviations, logs = np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
@@ -252,7 +295,11 @@ def _formed(
     for k in range(len(steps)):
         if usable[k]:
             means[i] = compose(pose, steps[k])
-            deviations[i] = np.sqrt(variances[k] + least**2)
+            spread = last if k == LAST else velocity if k == VELOCITY else covariance
+            more_m, more_rad = (0.0, 0.0) if k in (LAST, VELOCITY) else (own[k, 0], own[k, 1])
+            position = 0.5 * (spread[0, 0] + spread[1, 1] + walls[0, 0] + walls[1, 1])
+            deviations[i, 0] = math.sqrt(more_m**2 + position + least[0] ** 2)
+            deviations[i, 1] = math.sqrt(more_rad**2 + spread[2, 2] + walls[2, 2] + least[1] ** 2)
             logs[i] = max(weights[k], share)
             i += 1
     total = logs.sum()

@@ -1,5 +1,6 @@
 """The last key scans at their poses, as lines to register to and as a score field to search in."""
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -31,8 +32,7 @@ class RollingSubmap:
     def __init__(self, most_scans: int, config: ScoreFieldConfig) -> None:
         self._scans: deque[_Placed] = deque()
         self._most, self._config = most_scans, config
-        self._counts: RayCounts | None = None
-        self._middle = np.zeros(2)
+        self._counts = RayCounts(config, np.zeros(2))
         self._lines: LineMap | None = None
         self._field: ScoreField | None = None
 
@@ -42,7 +42,8 @@ class RollingSubmap:
     def clear(self) -> None:
         """Forget all scans."""
         self._scans.clear()
-        self._counts = self._lines = self._field = None
+        self._counts.begin_at(np.full(2, math.inf))
+        self._lines = self._field = None
 
     def add(self, scan: KeyScan, pose: Array) -> None:
         """Add a scan whose base frame has the pose ``(3,)``; the oldest leaves where there are too many."""
@@ -53,10 +54,10 @@ class RollingSubmap:
         ends = transformed(sensor, np.stack((ranges * np.cos(angles), ranges * np.sin(angles)), axis=-1))
         drawn = joined(points, normals, self._config.cell_m)
         self._scans.append(_Placed(points, normals, line_squares(points, normals), drawn, sensor[:2], ends))
-        if self._counts is not None and np.hypot(*(pose[:2] - self._middle)) < _REDRAWN_M:
+        if np.hypot(*(pose[:2] - self._counts.middle)) < _REDRAWN_M:
             self._counts.add(sensor[:2], ends)
         else:
-            self._counts, self._middle = RayCounts(self._config, pose[:2]), pose[:2].copy()
+            self._counts.begin_at(pose[:2].copy())
             for placed in self._scans:
                 self._counts.add(placed.origin, placed.ends)
         if len(self._scans) > self._most:
@@ -66,7 +67,6 @@ class RollingSubmap:
 
     def walls(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points ``(n, 2)`` in the odometry's frame are on walls ``(n,)``."""
-        assert self._counts is not None
         return self._counts.walls(points)
 
     @property
@@ -84,7 +84,6 @@ class RollingSubmap:
     def field(self) -> ScoreField:
         """The score field round the newest scans."""
         if self._field is None:
-            assert self._counts is not None
             drawn = np.concatenate([placed.drawn for placed in self._scans])
             self._field = self._counts.field(drawn[self.walls(drawn)])
         return self._field
