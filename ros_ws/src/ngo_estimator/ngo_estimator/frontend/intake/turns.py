@@ -52,6 +52,9 @@ class Part:
         """Whether it looks where another part of the same scanner looked."""
         if self.scanner != other.scanner:
             return False
+        ours, its = self.scan, other.scan
+        if (ours.angle_min, ours.angle_increment) == (its.angle_min, its.angle_increment):
+            return True
         shared = 0.0
         for turn in (-math.tau, 0.0, math.tau):
             low = max(self.begin, other.begin + turn)

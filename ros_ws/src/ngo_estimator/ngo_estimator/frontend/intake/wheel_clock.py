@@ -14,7 +14,9 @@ from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
 
 _CELL_S = 0.05
 _KEPT_S = 120.0
-_EVERY_S = 2.0
+_EVERY_S, _EVERY_SHARE = 2.0, 0.05
+"""What is known is looked at so often, and when so much of it is new."""
+
 _MOST_POSES = 20_000
 
 _LEAST_S = 8.0
@@ -103,7 +105,8 @@ class WheelClock:
         self._scans.append((from_ns, to_ns, float(step[2]), float(step[0])))
         while self._scans[0][1] < to_ns - _KEPT_S * 1e9:
             self._scans.popleft()
-        if to_ns < self._looked_ns + _EVERY_S * 1e9 or len(self._wheels) < 10:
+        known_ns = to_ns - self._scans[0][0]
+        if to_ns < self._looked_ns + max(_EVERY_S * 1e9, _EVERY_SHARE * known_ns) or len(self._wheels) < 10:
             return False
         self._looked_ns = to_ns
         before = self.truth
