@@ -22,7 +22,7 @@ WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 
 def test_registration_and_the_search_for_loops_are_compiled() -> None:
     warm_up_scans()
-    points, search = (scan_points._thinned, scan_points._normals), (mode_search._modes, branch_and_bound._best_first)
+    points, search = (scan_points._surfaces,), (mode_search._modes, branch_and_bound._best_first)
     without_wheels = velocity_filter._predicted, velocity_filter._corrected
     for function in (*points, scan_matching._icp, *search, *without_wheels):
         assert function.signatures, function

@@ -177,13 +177,17 @@ def _heading_offsets(config: SearchConfig, window: float) -> np.ndarray:
 def _stamp(grid: np.ndarray, points: np.ndarray, resolution: float, deviation: float, reach: int) -> None:
     """Raise the cells around each point to its likelihood at their centres."""
     scale = -0.5 * (resolution / deviation) ** 2
+    across = np.empty(2 * reach + 1)
     for k in range(len(points)):
         x, y = points[k, 0] / resolution, points[k, 1] / resolution
-        column, row = math.floor(x), math.floor(y)
-        for i in range(row - reach, row + reach + 1):
-            for j in range(column - reach, column + reach + 1):
-                value = np.uint8(round(255.0 * math.exp(scale * ((j + 0.5 - x) ** 2 + (i + 0.5 - y) ** 2))))
-                grid[i, j] = max(grid[i, j], value)
+        column, row = math.floor(x) - reach, math.floor(y) - reach
+        for j in range(2 * reach + 1):
+            across[j] = math.exp(scale * (column + j + 0.5 - x) ** 2)
+        for i in range(2 * reach + 1):
+            up = 255.0 * math.exp(scale * (row + i + 0.5 - y) ** 2)
+            for j in range(2 * reach + 1):
+                value = np.uint8(round(up * across[j]))
+                grid[row + i, column + j] = max(grid[row + i, column + j], value)
 
 
 def _blocks_near(offsets: np.ndarray, reach: float, step: int, columns: int, rows: int) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.planar_motion import Array, transformed
+from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
 
 _LEAST_TRIPLES = 20
 """Triples of neighbouring rays without which a scan's noise is not estimated."""
@@ -122,21 +122,35 @@ def key_scan(
         angles, ranges = _without_motion(angles, ranges, mounting.sensor_xyyaw, sweep)
     order = np.argsort(angles, kind="stable")
     angles, ranges = angles[order], ranges[order]
-    seen = np.isfinite(ranges)
-    polar, distance = angles[seen], ranges[seen]
-    ends = np.stack((distance * np.cos(polar), distance * np.sin(polar)), axis=-1)
-    noise_m = range_noise(polar, distance)
-    spacing_m = max(config.spacing_m, config.spacing_noise * noise_m)
-    thin = _thinned(ends, distance, spacing_m, _WITHIN_NOISE * noise_m, config.most_points)
-    thickness_m = max(config.thickness_m, config.thickness_noise * noise_m)
-    normals = _normals(thin, config.neighbours, thickness_m, config.thickness_share, config.edge_on)
-    turn = np.array((0.0, 0.0, mounting.sensor_xyyaw[2]))
-    parts = transformed(mounting.sensor_xyyaw, thin), transformed(turn, normals), angles, ranges
+    numbers = config.spacing_m, config.spacing_noise, config.thickness_m, config.thickness_noise
+    shares = config.thickness_share, config.edge_on
+    points, normals = _surfaces(
+        angles, ranges, mounting.sensor_xyyaw, numbers, config.most_points, config.neighbours, shares
+    )
     # What messages carry: a live node sees the same as a run over a recording.
-    points, normals, angles, ranges = (part.astype(np.float32).astype(np.float64) for part in parts)
+    angles, ranges = (part.astype(np.float32).astype(np.float64) for part in (angles, ranges))
     return KeyScan(stamp_ns, points, normals, mounting.sensor_xyyaw, angles, ranges, float(np.float32(largest)))
 
 
+@njit(cache=True)
+def _surfaces(
+    angles: Array, ranges: Array, sensor: Array, numbers: tuple[float, float, float, float], most: int,
+    neighbours: int, shares: tuple[float, float],
+) -> tuple[Array, Array]:  # fmt: skip
+    """Points and normals ``(n, 2)`` in the base frame, as single floats hold them, of rays by increasing angle."""
+    spacing, spacing_noise, thickness, thickness_noise = numbers
+    seen = np.isfinite(ranges)
+    polar, distance = angles[seen], ranges[seen]
+    ends = np.empty((len(polar), 2))
+    ends[:, 0], ends[:, 1] = distance * np.cos(polar), distance * np.sin(polar)
+    noise = range_noise(polar, distance)
+    thin = _thinned(ends, distance, max(spacing, spacing_noise * noise), _WITHIN_NOISE * noise, most)
+    normals = _normals(thin, neighbours, max(thickness, thickness_noise * noise), *shares)
+    points, normals = transformed(sensor, thin), rotated(sensor[2], normals)
+    return points.astype(np.float32).astype(np.float64), normals.astype(np.float32).astype(np.float64)
+
+
+@njit(cache=True)
 def range_noise(angles: Array, ranges: Array) -> float:
     """Standard deviation of a range (m), from rays at rising ``angles`` ``(m,)`` (rad) with finite ``ranges`` ``(m,)``.
 
@@ -145,11 +159,6 @@ def range_noise(angles: Array, ranges: Array) -> float:
     """
     if len(ranges) < _LEAST_TRIPLES + 2:
         return 0.0
-    return min(_range_noise(angles, ranges), _LARGEST_NOISE_M)
-
-
-@njit(cache=True)
-def _range_noise(angles: Array, ranges: Array) -> float:
     off, count = np.empty(len(ranges) - 2), 0
     for k in range(1, len(ranges) - 1):
         left, right = angles[k] - angles[k - 1], angles[k + 1] - angles[k]
@@ -164,7 +173,7 @@ def _range_noise(angles: Array, ranges: Array) -> float:
         count += 1
     if count < _LEAST_TRIPLES:
         return 0.0
-    return float(np.quantile(off[:count], 0.25)) / _QUARTER
+    return min(np.quantile(off[:count], 0.25) / _QUARTER, _LARGEST_NOISE_M)
 
 
 def _checked(angles: Array, ranges: Array, range_limits: tuple[float, float]) -> tuple[Array, Array]:

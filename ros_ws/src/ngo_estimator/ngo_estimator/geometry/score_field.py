@@ -63,17 +63,15 @@ class RayCounts:
         while self._scans:
             self.forget_oldest()
         self.middle, self.corner = middle, middle - 0.5 * self.config.side * self.config.cell_m
-        self._low, self._high = np.full(2, self.config.side), np.zeros(2, np.int64)  # row and column of what was seen
+        # Row and column of what was seen.
+        self._low, self._high = np.full(2, self.config.side, np.int64), np.zeros(2, np.int64)
 
     def add(self, origin: Array, ends: Array) -> None:
         """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``."""
         self._mark += 2
-        low, high = (ends.min(axis=0), ends.max(axis=0)) if len(ends) else (origin, origin)
-        both = np.stack((np.minimum(low, origin), np.maximum(high, origin))) - self.corner
-        low, high = np.floor(both[:, ::-1] / self.config.cell_m).astype(np.int64)
-        self._low = np.clip(np.minimum(self._low, low - _MARGIN), 0, self.config.side)
-        self._high = np.clip(np.maximum(self._high, high + _MARGIN + 1), 0, self.config.side)
-        cells = _seen(self._marks, origin - self.corner, ends - self.corner, self.config.cell_m, self._mark)
+        origin, ends = origin - self.corner, ends - self.corner
+        _widen(self._low, self._high, origin, ends, self.config.cell_m, self.config.side)
+        cells = _seen(self._marks, origin, ends, self.config.cell_m, self._mark)
         self._scans.append(cells)
         _count(self.hits, self.passes, *cells, 1)
 
@@ -124,6 +122,17 @@ def _kernel(config: ScoreFieldConfig) -> Field:
     squares = (np.arange(-reach, reach + 1) * config.cell_m / config.deviation_m) ** 2
     result: Field = np.round(255.0 * np.exp(-0.5 * (squares[:, None] + squares))).astype(np.uint8)
     return result
+
+
+@njit(cache=True)
+def _widen(low: NDArray[np.int64], high: NDArray[np.int64], origin: Array, ends: Array, cell: float, side: int) -> None:
+    """Widen the rows and columns of what was seen by the ends of a scan's rays, with a margin."""
+    for axis in range(2):
+        least = most = origin[axis]
+        for k in range(len(ends)):
+            least, most = min(least, ends[k, axis]), max(most, ends[k, axis])
+        low[1 - axis] = min(low[1 - axis], max(math.floor(least / cell) - _MARGIN, 0))
+        high[1 - axis] = max(high[1 - axis], min(math.floor(most / cell) + _MARGIN + 1, side))
 
 
 @njit(cache=True)

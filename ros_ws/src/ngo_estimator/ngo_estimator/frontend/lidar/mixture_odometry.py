@@ -53,9 +53,10 @@ class ScanEstimate:
     """Where a scan was taken.
 
     ``step`` ``(3,)`` is its pose seen from the last scan, with ``step_covariance``; ``pose`` ``(3,)`` that in ``odom``;
-    ``since_key`` ``(3,)`` that seen from the last key scan, with ``since_key_covariance``. ``score`` is how well it
-    fits, 0 to 1. ``unsure`` scans fitted nowhere. With ``segment`` nothing ties the scan to those before. ``scan`` is
-    the scan without the sweep's motion. Of a key scan ``walls`` ``(n,)`` tells which points are on walls.
+    ``since_key`` ``(3,)`` that seen from the last key scan, with ``since_key_covariance`` where it is one itself.
+    ``score`` is how well it fits, 0 to 1. ``unsure`` scans fitted nowhere. With ``segment`` nothing ties the scan to
+    those before. ``scan`` is the scan without the sweep's motion. Of a key scan ``walls`` ``(n,)`` tells which points
+    are on walls.
     """
 
     step: Array
@@ -192,7 +193,7 @@ class MixtureOdometry:
             turned_covariance(-self._pose[2], both),
             pose,
             since_key,
-            turned_covariance(-self._key[2], covariance + self.mixture.filter.shared()),
+            turned_covariance(-self._key[2], covariance + (self.mixture.filter.shared() if is_key else 0.0)),
             is_key,
             score,
             lost,

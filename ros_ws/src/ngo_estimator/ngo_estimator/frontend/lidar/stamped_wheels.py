@@ -101,10 +101,8 @@ class StampedWheels:
             start, end, turn = self._pending.pop(0)
             if start + _LAGS_S[0] < rows[0, 0]:
                 continue
-            first, last = np.searchsorted(rows[:, 0], (start - _LAGS_S[-1], end - _LAGS_S[0]))
-            times, yaws = rows[max(first - 1, 0) : last + 1, 0], rows[max(first - 1, 0) : last + 1, 3]
-            by_wheels = np.interp(end - _LAGS_S, times, yaws) - np.interp(start - _LAGS_S, times, yaws)
-            if max(abs(turn), float(np.abs(by_wheels).max())) < _TURNS_RAD:
+            by_wheels = _turns(rows, start, end)
+            if max(abs(turn), by_wheels.max(), -by_wheels.min()) < _TURNS_RAD:
                 continue
             self._off = _REMEMBERED * self._off + np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
             self._turns = _REMEMBERED * self._turns + 1.0
@@ -138,6 +136,17 @@ def _pose_at(rows: Array, at: float) -> Array:
     i = min(max(int(np.searchsorted(rows[:, 0], at)), 1), len(rows) - 1)
     share = (at - rows[i - 1, 0]) / (rows[i, 0] - rows[i - 1, 0])
     result: Array = rows[i - 1, 1:] + min(max(share, -1.0), 2.0) * (rows[i, 1:] - rows[i - 1, 1:])
+    return result
+
+
+@njit(cache=True)
+def _turns(rows: Array, start_s: float, end_s: float) -> Array:
+    """How far the wheels turned between two times, at each lag."""
+    first = np.searchsorted(rows[:, 0], start_s - _LAGS_S[-1]) - 1
+    last = np.searchsorted(rows[:, 0], end_s - _LAGS_S[0]) + 1
+    near = rows[max(first, 0) : last]
+    times, yaws = near[:, 0].copy(), near[:, 3].copy()
+    result: Array = np.interp(end_s - _LAGS_S, times, yaws) - np.interp(start_s - _LAGS_S, times, yaws)
     return result
 
 
