@@ -1,8 +1,10 @@
 """What is kept of each key scan to find it again: how far it sees in each direction, and where it looks."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, part, require, taken, under
@@ -84,6 +86,27 @@ class KeyScanViews:
         self._middles.restore(part(arrays, "middles"))
         require(len(self._middles) == len(profiles), f"there are not {len(profiles)} middles of key scans")
         self._profiles = list(profiles)
+
+
+@njit(cache=True)
+def one_a_cell(points: np.ndarray, side: float) -> np.ndarray:
+    """The first of the points ``(n, 2)`` in each cell of a side (m), as ascending rows."""
+    size = 16
+    while size < 2 * len(points):
+        size *= 2
+    table, rows, count = np.full(size, -1, np.int64), np.empty(len(points), np.int64), 0
+    for k in range(len(points)):
+        x, y = math.floor(points[k, 0] / side), math.floor(points[k, 1] / side)
+        slot = (x * 73856093 ^ y * 19349663) & (size - 1)
+        while table[slot] >= 0:
+            other = points[table[slot]]
+            if math.floor(other[0] / side) == x and math.floor(other[1] / side) == y:
+                break
+            slot = (slot + 1) & (size - 1)
+        if table[slot] < 0:
+            table[slot], rows[count] = k, k
+            count += 1
+    return rows[:count].copy()
 
 
 def within(points: np.ndarray, range_m: float) -> np.ndarray:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import KDTree
+from numba import njit
 
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.loops.key_scan_views import KeyScanViews
+from ngo_estimator.loops.key_scan_views import KeyScanViews, one_a_cell
 from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, sightings
 
 _CELL_M = 0.15
@@ -38,9 +38,10 @@ _SAID = 40
 
 @dataclass(frozen=True)
 class PlaceEvidence:
-    """``walls``: different straight walls that both see. ``through``: the largest share of sightings through walls.
+    """``walls``: different straight walls that both see, where they were counted.
 
-    ``said``: in how many parts of the stretch there were sightings enough for a share. ``seen``: all sightings, and
+    ``through``: the largest share of sightings through walls. ``said``: in how many parts of the stretch there were
+    sightings enough for a share. ``seen``: all sightings, and
     ``mean``: the share of those of them that go through walls. ``overlap``: the share of points of one side that the
     other one sees, or sees through.
     """
@@ -63,6 +64,7 @@ def evidence_of(
     stretch: tuple[np.ndarray, np.ndarray],
     others: tuple[np.ndarray, np.ndarray],
     most_scans: int = _MOST_SCANS,
+    count_walls: bool = False,
 ) -> PlaceEvidence:
     """How the key scans of a stretch agree with those of others near it; both are keys and their poses ``(n, 3)``.
 
@@ -74,12 +76,13 @@ def evidence_of(
         return placed([scans[key] for key in chosen], [views.profiles[key] for key in chosen], poses)
 
     keys, at = stretch
-    near = np.flatnonzero(np.isfinite(KDTree(at[:, :2]).query(others[1][:, :2], distance_upper_bound=_NEAR_M)[0]))
+    near = np.flatnonzero(_near(others[1], at))
     near = near[:: max(1, -(-len(near) // most_scans))]
     if not len(near):
         return NO_EVIDENCE
     parts = [slice(first, first + _PART) for first in range(0, len(keys), _PART)]
-    return place_evidence(together(others[0][near], others[1][near]), [together(keys[p], at[p]) for p in parts])
+    place = together(others[0][near], others[1][near])
+    return place_evidence(place, [together(keys[p], at[p]) for p in parts], count_walls)
 
 
 def last_stretch(poses: np.ndarray, first: int) -> np.ndarray:
@@ -88,7 +91,7 @@ def last_stretch(poses: np.ndarray, first: int) -> np.ndarray:
     return np.arange(len(poses) - 1 - int(np.searchsorted(to_end, _STRETCH_M)), len(poses))
 
 
-def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans]) -> PlaceEvidence:
+def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans], count_walls: bool = True) -> PlaceEvidence:
     """The evidence of the parts of a stretch, each of some scans, in the frame of the place's scans."""
     counts, possible = [], 1
     place, points, normals = _steady(_thinned(place)), [np.zeros((0, 2))], [np.zeros((0, 2))]
@@ -100,7 +103,7 @@ def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans]) -> PlaceE
         normals.append(part.normals[agree])
         counts += [ours.sum(0), its.sum(0)]
         possible += len(place.sensors) * len(part.points) + len(part.sensors) * len(place.points)
-    walls = distinct_walls(np.concatenate(points), np.concatenate(normals))
+    walls = distinct_walls(np.concatenate(points), np.concatenate(normals)) if count_walls else 0
     # A wall that one side alone has is seen through by the other alone.
     shares = [through / (through + on) for through, on in counts if through + on >= _SAID]
     through, on = np.sum([(0, 0), *counts], axis=0).tolist()
@@ -114,7 +117,7 @@ def distinct_walls(points: np.ndarray, normals: np.ndarray) -> int:
     """How many straight walls explain points ``(n, 2)`` that have normals ``(n, 2)``, those without one left out."""
     known = (normals**2).sum(1) > 0.5
     points, normals = points[known], normals[known]
-    one = _one_a_cell(points)
+    one = one_a_cell(points, _CELL_M)
     one = one[:: max(1, -(-len(one) // _MOST_POINTS))]
     points, normals = points[one], normals[one]
     off = np.abs(normals @ points.T - (normals * points).sum(1)[:, None])
@@ -128,7 +131,7 @@ def distinct_walls(points: np.ndarray, normals: np.ndarray) -> int:
 
 
 def _thinned(scans: PlacedScans) -> PlacedScans:
-    one = _one_a_cell(scans.points)
+    one = one_a_cell(scans.points, _CELL_M)
     return replace(scans, points=scans.points[one], normals=scans.normals[one])
 
 
@@ -138,7 +141,14 @@ def _steady(scans: PlacedScans) -> PlacedScans:
     return replace(scans, points=scans.points[on > through], normals=scans.normals[on > through])
 
 
-def _one_a_cell(points: np.ndarray) -> np.ndarray:
-    """The first of the points ``(n, 2)`` in each cell, as rows."""
-    _, first = np.unique(np.floor(points / _CELL_M).astype(np.int64) @ (1 << 32, 1), return_index=True)
-    return np.sort(first)
+@njit(cache=True)
+def _near(poses: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+    """Which poses ``(n, 3)`` are near one of a stretch ``(m, 3)``."""
+    result = np.zeros(len(poses), np.bool_)
+    for k in range(len(poses)):
+        for i in range(len(stretch)):
+            x, y = poses[k, 0] - stretch[i, 0], poses[k, 1] - stretch[i, 1]
+            if x * x + y * y < _NEAR_M * _NEAR_M:
+                result[k] = True
+                break
+    return result

@@ -10,7 +10,7 @@ import numpy as np
 
 from ngo_estimator.geometry.branch_and_bound import search
 from ngo_estimator.geometry.scan_matching import icp
-from ngo_estimator.loops.key_scan_views import within
+from ngo_estimator.loops.key_scan_views import one_a_cell, within
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import Submap
 from ngo_estimator.loops.walls_seen_through import PlacedScans, seen_through
@@ -60,7 +60,5 @@ def search_points(config: ScanLoopConfig, source: PlacedScans) -> np.ndarray:
 
 def _spread(points: np.ndarray, cell_m: float, most: int) -> np.ndarray:
     """One point ``(n, 2)`` of each cell, and of these every so many that at most ``most`` remain."""
-    row, column = np.floor(points / cell_m).astype(np.int64).T
-    _, first = np.unique((row << 32) + column, return_index=True)
-    chosen = points[np.sort(first)]
+    chosen = points[one_a_cell(points, cell_m)]
     return chosen[np.linspace(0, len(chosen) - 1, most).astype(np.int64)] if len(chosen) > most else chosen

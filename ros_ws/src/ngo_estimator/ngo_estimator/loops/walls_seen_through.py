@@ -60,13 +60,25 @@ def _profile(angles: Array, ranges: Array) -> Array:
 
 def placed(scans: Sequence[KeyScan], profiles: Sequence[Array], poses: Array) -> PlacedScans:
     """Scans and their range profiles at poses ``(scans, 3)`` of their base in one frame."""
-    pairs = list(zip(scans, poses, strict=True))
-    return PlacedScans(
-        np.concatenate([transformed(pose, scan.points) for scan, pose in pairs]),
-        np.concatenate([rotated(pose[2], scan.normals) for scan, pose in pairs]),
-        np.stack([compose(pose, scan.sensor_xyyaw) for scan, pose in pairs]),
-        np.array(profiles, np.float64),
-    )
+    points, normals = np.concatenate([scan.points for scan in scans]), np.concatenate([scan.normals for scan in scans])
+    ends = np.cumsum([len(scan.points) for scan in scans])
+    sensors = np.stack([scan.sensor_xyyaw for scan in scans])
+    return PlacedScans(*_placed(points, normals, ends, sensors, poses), np.array(profiles, np.float64))
+
+
+@njit(cache=True)
+def _placed(
+    points: Array, normals: Array, ends: NDArray[np.int64], sensors: Array, poses: Array
+) -> tuple[Array, Array, Array]:
+    """Points and normals ``(n, 2)``, those of each scan up to its end, and sensors at the poses of the scans."""
+    at, facing, where = np.empty_like(points), np.empty_like(normals), np.empty_like(sensors)
+    begin = 0
+    for k in range(len(ends)):
+        at[begin : ends[k]] = transformed(poses[k], points[begin : ends[k]])
+        facing[begin : ends[k]] = rotated(poses[k, 2], normals[begin : ends[k]])
+        where[k] = compose(poses[k], sensors[k])
+        begin = ends[k]
+    return at, facing, where
 
 
 def seen_through(target: PlacedScans, source: PlacedScans, pose: Array) -> float:

@@ -137,7 +137,7 @@ class OwnMap:
         """How the last stretch of the way agrees with the searched key scans, where the newest one is at a pose."""
         stretch = last_stretch(chain.poses, int(chain.segments[-1]))
         at = se2.compose(pose, se2.between(chain.poses[-1], chain.poses[stretch]))
-        return evidence_of(scans, views, (stretch, at), (self._keys, self._poses))
+        return evidence_of(scans, views, (stretch, at), (self._keys, self._poses), count_walls=True)
 
     def contradicted(
         self, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain, parts: np.ndarray
