@@ -18,7 +18,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem, thresholds, truncated_cost
+from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, thresholds, truncated_cost
+from ngo_estimator.graph.crowds import CrowdAware
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
 from training.common import records
@@ -41,7 +42,8 @@ PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_lm_geman_mcclure": graph_peers.geman_mcclure,
     "pcm": graph_peers.pcm,
 }
-ROWS = ("odometry", *PEERS, "robust", "robust_anew", "right_loops")
+_OURS: dict[str, Callable[[], Corrector]] = {"robust": Robust, "robust_anew": Robust, "crowd_aware": CrowdAware}
+ROWS = ("odometry", *PEERS, *_OURS, "right_loops")
 _SOLVED = 1.5
 """A graph is solved where its error is below so many times that of the right loops."""
 
@@ -146,8 +148,8 @@ def _measure(
     found: dict[str, tuple[np.ndarray, float] | None] = {"odometry": (problem.poses, 0.0)}
     found["right_loops"] = graph_peers.within(graph_peers.least_squares, right, limit_s)
     for row in rows:
-        if row in ("robust", "robust_anew"):
-            solve = correct if correct and row == "robust" else Robust().correct
+        if row in _OURS:
+            solve = correct if correct and row == "robust" else _OURS[row]().correct
             began = time.process_time()
             found[row] = (solve(problem).poses, time.process_time() - began)
         elif row in PEERS and not (row == "pcm" and problem.loops.degrees.min(initial=3) < 3):

@@ -29,7 +29,7 @@ from ngo_estimator.graph.surest_first import believe
 _MISSTATED = 2.0
 """Variances that are off by less than this factor, either way, are taken as stated."""
 
-_LEAST_SCALE = 1e-3
+LEAST_SCALE = 1e-3
 """Edges without any error, as of a computed graph, would give a scale of zero."""
 
 _NEAR = 1.0
@@ -57,7 +57,7 @@ class Robust:
             as neighbouring scans do, small residuals do not say that covariances are stated too large.
     """
 
-    def __init__(self, told: Told = silent, least_scale: float = _LEAST_SCALE) -> None:
+    def __init__(self, told: Told = silent, least_scale: float = LEAST_SCALE) -> None:
         self._told, self._least_scale = told, least_scale
 
     def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
@@ -78,6 +78,15 @@ class Robust:
         anew = _from_nothing(problem, self._told, self._least_scale)
         better = truncated_cost(problem, warm.poses, anew.scale, anew.scale) < anew.cost
         return replace(warm, loops_from_nothing=loops) if better else anew
+
+
+def finished(
+    problem: GraphProblem, poses: np.ndarray, scale: float = 1.0, told: Told = silent, least_scale: float = LEAST_SCALE
+) -> CorrectedGraph:
+    """The solution that poses ``(nodes, 3)`` from elsewhere lead to, with variances ``scale`` times as stated."""
+    scaled = problem.scaled(scale)
+    poses = _looked_again(scaled, poses, map_area(poses), 0.5, told)
+    return _polished(problem, poses, scale, len(problem.loops), least_scale)
 
 
 def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> CorrectedGraph:
