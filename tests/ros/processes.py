@@ -1,5 +1,6 @@
 """Real node processes for tests, and a probe that talks to them over DDS."""
 
+import functools
 import os
 import re
 import signal
@@ -24,16 +25,24 @@ from rclpy.qos import QoSProfile
 
 from demo.graph import NodeSpec
 
+from .node_server import Forked, NodeServer
+
 # Ample for a machine of its own; one that is shared may need more, and `--timeout` of pytest as well.
 TIMEOUT_S = float(os.environ.get("NGO_TEST_TIMEOUT_S", "60"))
 
+_POLL_S = 0.02
+_PYTHON_PATH = os.environ.get("PYTHONPATH")  # of the server: with another one a node imports other modules
 _ASK_AGAIN_S = 0.3  # an answer to who is not known yet never comes
 
 Result = TypeVar("Result")
+node_server = functools.cache(NodeServer)
 
 
 class NodeProcess:
-    """One node as its own process; its output is in ``log``."""
+    """One node as its own process; its output is in ``log``.
+
+    It is a fork of the ``NodeServer``, or with ``fresh`` started as a user does, importing all by itself.
+    """
 
     def __init__(
         self,
@@ -41,12 +50,18 @@ class NodeProcess:
         executable: str,
         parameters: Mapping[str, Any] | None = None,
         ros_arguments: tuple[str, ...] = (),
+        fresh: bool = False,
     ) -> None:
         self.name = executable
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
         command = NodeSpec(package, executable, parameters or {}, ros_arguments).command()
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", "RCUTILS_LOGGING_USE_STDOUT": "0"}
-        self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT, env=environment)
+        self._process: subprocess.Popen[bytes] | Forked
+        if fresh or os.environ.get("PYTHONPATH") != _PYTHON_PATH:
+            self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT, env=environment)
+        else:
+            log = self._log.fileno()
+            self._process = node_server().start(command, environment, log, log)
 
     def __enter__(self) -> "NodeProcess":
         return self
@@ -54,9 +69,9 @@ class NodeProcess:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._process.poll() is None:
+        if self.running:
             self._process.kill()
-            self._process.wait()
+            self.wait()
         self._log.close()
 
     @property
@@ -91,10 +106,11 @@ class NodeProcess:
 
     def wait(self, timeout_s: float = TIMEOUT_S) -> int:
         """Wait for its end and return its exit code."""
-        try:
-            return self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f"{self.name} did not end in {timeout_s:g} s; it wrote:\n{self.log}") from None
+        deadline = time.monotonic() + timeout_s
+        while (code := self._process.poll()) is None:
+            assert time.monotonic() < deadline, f"{self.name} did not end in {timeout_s:g} s; it wrote:\n{self.log}"
+            time.sleep(_POLL_S)
+        return code
 
     def wait_for_log(self, pattern: str, timeout_s: float = TIMEOUT_S) -> None:
         """Wait until it has written what ``pattern`` matches."""
@@ -104,6 +120,21 @@ class NodeProcess:
             timeout_s,
         )
         assert re.search(pattern, self.log), f"{self.name} ended without writing '{pattern}'; it wrote:\n{self.log}"
+
+
+def run_forked(
+    command: list[str], timeout_s: float, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """What a Python program writes, as a fork of the ``NodeServer``, and its exit code."""
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
+        given = dict(os.environ if environment is None else environment)
+        process = node_server().start(command, given, out.fileno(), errors.fileno())
+        try:
+            wait_until(lambda: process.poll() is not None, f"the end of {command}", timeout_s)
+        finally:
+            process.kill()
+        texts = (os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0).decode() for file in (out, errors))
+        return subprocess.CompletedProcess(command, process.poll() or 0, *texts)
 
 
 @contextmanager
@@ -120,7 +151,7 @@ def own_node(name: str, *arguments: str) -> Iterator[Node]:
 
 
 def wait_until(
-    condition: Callable[[], Result], what: str, timeout_s: float = TIMEOUT_S, poll_s: float = 0.02
+    condition: Callable[[], Result], what: str, timeout_s: float = TIMEOUT_S, poll_s: float = _POLL_S
 ) -> Result:
     """Wait until ``condition()`` is true, and return what it gave; a failure names ``what``."""
     deadline = time.monotonic() + timeout_s

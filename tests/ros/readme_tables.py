@@ -108,7 +108,7 @@ def running_nodes() -> Iterator[dict[str, NodeFacts]]:
     processes: list[NodeProcess] = []
     try:
         for name, package in NODES.items():
-            processes.append(NodeProcess(package, name))
+            processes.append(NodeProcess(package, name, fresh=True))
             facts[name] = NodeFacts(probe, name)
 
         def complete() -> bool:

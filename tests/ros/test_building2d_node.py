@@ -80,9 +80,3 @@ def test_it_publishes_what_the_core_gives(probe: Probe) -> None:
     assert 1 - 2 * (q.x**2 + q.y**2) == pytest.approx(-1.0), "its z points down"
     links = {(t.header.frame_id, t.child_frame_id) for message in tf for t in message.transforms}
     assert links == {("odom", "base_link")}, "the truth is not on TF"
-
-
-def test_a_bad_parameter_is_one_line_and_exit_code_2() -> None:
-    with NodeProcess("ngo_sim", "building2d", {"layout": "square"}) as node:
-        assert node.wait() == 2
-        assert [line for line in node.lines if "parameter 'layout' is 'square'; allowed: one of any, ring" in line]

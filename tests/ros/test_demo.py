@@ -90,14 +90,13 @@ def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 60.0
         threading.Event().wait(0.05)
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGHUP])
-def test_interrupted_it_leaves_no_node_behind(signal_number: int, weights: Path, tmp_path: Path) -> None:
+def test_interrupted_it_leaves_no_node_behind(weights: Path, tmp_path: Path) -> None:
     command = [sys.executable, str(DEMO), "--world", "maze2d", "--rate", "20", "--weights", str(weights)]
     with (tmp_path / "log").open("w") as log:
         demo = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stdout=log, stderr=log)
         wait_until(lambda: demo.poll() is not None or len(descendants(demo.pid)) >= 3, "the nodes run")
         started = descendants(demo.pid)
-        demo.send_signal(signal_number)
+        demo.send_signal(signal.SIGHUP)  # as a closed terminal; by the handler of an interrupt
         code = demo.wait(60)
     assert code == 130, (tmp_path / "log").read_text()
     assert len(started) >= 3

@@ -52,6 +52,7 @@ class World:
     def __init__(self, probe: Probe) -> None:
         self.probe, self.pose, self.known = probe, START.copy(), np.full_like(TRUTH, -1)
         self.twist, self.heard, self.moved_m, self.shift, self.silent = (0.0, 0.0), 0, 0.0, 0, False
+        self.clients: list[ActionClient] = []
         node = probe.node
         self._map = node.create_publisher(OccupancyGrid, "map", LATCHED)
         self._updates = node.create_publisher(OccupancyGridUpdate, "map_updates", 10)
@@ -109,11 +110,15 @@ def placed(frame: str, child: str, pose: np.ndarray) -> TransformStamped:
 @pytest.fixture
 def world() -> Iterator[World]:
     with Probe() as probe:
-        yield World(probe)
+        world = World(probe)
+        yield world
+        for client in world.clients:
+            client.destroy()  # it would keep the node, and other tests would see it
 
 
 def ready(world: World, node: NodeProcess) -> ActionClient:
     client = ActionClient(world.probe.node, Explore, "explore")
+    world.clients.append(client)
     world.until(lambda: "ready: " in node.log or not node.running, "the explorer")
     assert node.running, node.log
     world.until(client.server_is_ready, "the action server")

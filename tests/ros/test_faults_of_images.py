@@ -4,20 +4,15 @@ Lost, doubled, late and unusable images are in `test_estimator_nodes.py`; here a
 """
 
 import itertools
-import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import rclpy
 import torch
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset
 from rclpy.executors import SingleThreadedExecutor
@@ -25,7 +20,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from ngo_estimator.checkpoint import write_untrained
-from ngo_estimator.frontend.camera.frame_pairing import FramePairing, PairedFrame
+from ngo_estimator.frontend.camera.frame_pairing import PairedFrame
 from ngo_estimator.nodes.image_input import ImageInput
 from ngo_estimator.nodes.local_node import LocalNode
 from ngo_estimator.nodes.messages import to_ns, to_time
@@ -116,48 +111,6 @@ def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Grap
     graph.diagnostics.wait_for_problem("/ngo_node", "lost: the standard deviation of the position is")
 
 
-class Wire:
-    """An input whose messages wait until they are taken; ``then`` comes to pass while they are."""
-
-    def __init__(self, take: Callable[[int], None], then: Callable[[], None] = lambda: None) -> None:
-        self.waiting: list[int] = []
-        self._take, self._then = take, then
-
-    def take_waiting(self, most: int) -> None:
-        self._then()
-        taken, self.waiting = self.waiting[:most], self.waiting[most:]
-        for step in taken:
-            self._take(step)
-
-
-def test_an_action_that_comes_while_images_are_taken_is_not_lost() -> None:
-    """The action was published before its image, and is read before any later image calls it lost."""
-    second, pairing = 10**9, FramePairing(needs_action=True, timeout_ns=10**9, capacity=8)
-    node, seen = object.__new__(ImageInput), []
-
-    def publish_two_images() -> None:
-        actions.waiting += [0, 299]
-        images.waiting += [1, 300]
-
-    actions = Wire(lambda step: pairing.add_action(step * second, 0))
-    images = Wire(lambda step: pairing.add_frame(step * second, np.zeros(1)), publish_two_images)
-    core = SimpleNamespace(
-        restarts=0, update_all=lambda pairs: seen.extend(pair.stamp_ns // second for pair in pairs) or []
-    )
-    vars(node).update(
-        _pairing=pairing,
-        _core=core,
-        _sensor="image",
-        _status=MagicMock(),
-        _taking=False,
-        _most_at_once=0,
-        _sensor_and_side=(images, [actions]),
-    )
-    pairing.add_frame(0, np.zeros(1))
-    node._update()
-    assert seen == [0, 1, 300] and pairing.dropped == 0
-
-
 def test_gaps_in_a_burst_cost_no_frame(graph: Graph) -> None:
     """Each frame is far beyond the timeout of the one before, so an action that is read after both seems lost."""
     graph.start_run()
@@ -224,39 +177,6 @@ def test_an_image_publisher_of_another_qos_is_named(graph: Graph) -> None:
     graph.finish_run(frames=3)
 
 
-def test_of_two_local_nodes_the_first_is_held_and_both_are_named(graph: Graph, parameters: dict[str, Any]) -> None:
-    """Started twice by mistake: ngo_node used to begin anew with every message."""
-    graph.diagnostics.clear()
-    graph.start_run()
-    graph.play(0, 1, 2)
-    graph.wait_for_step(2)
-    restarts = graph.ngo.log.count("restarted, so")
-    twin = {**parameters, "image_reliability": "reliable", "image_depth": 1000, "publish_odometry": False}
-    with NodeProcess("ngo_estimator", "local_node", {**twin, "publish_tf": False}, ("-r", "__node:=twin")) as process:
-        process.wait_for_log("ready")
-        graph.probe.spin_until(
-            lambda: graph.images.get_subscription_count() == 2 and graph.actions.get_subscription_count() == 2,
-            "the twin's subscriptions",
-        )
-        # The twin listens to images, and ngo_node's subscription knows the twin.
-        step = 3
-
-        def refused() -> bool:
-            nonlocal step
-            graph.play(step)
-            graph.probe.spin_until(
-                lambda: to_ns(graph.out.poses[-1].header.stamp) == graph.stamp_ns(step), f"the pose of step {step}"
-            )
-            step += 1
-            return "/local_node and /twin publish on '/relative_pose'" in graph.ngo.log
-
-        with graph.probe.patient("ngo_node", SOURCE_TIMEOUT_S):
-            graph.probe.spin_until(refused, "a warning that names both")
-        graph.diagnostics.wait_for_problem("/ngo_node", "/local_node and /twin publish on '/relative_pose'")
-    assert graph.ngo.log.count("restarted, so") == restarts
-    assert [to_ns(pose.header.stamp) for pose in graph.out.poses] == [graph.stamp_ns(k) for k in range(1, step)]
-
-
 def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
     parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -302,44 +222,3 @@ def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
-
-
-def test_a_killed_local_node_that_comes_back_begins_a_new_odometry(parameters: dict[str, Any]) -> None:
-    """What moved meanwhile is unknown, and nothing is made up for it."""
-    with Probe("returning") as probe:
-        local = {**parameters, "image_reliability": "reliable", "image_depth": 1000}
-        arguments = ("-r", "__ns:=/returning")
-        with ExitStack() as stack:
-            ngo = stack.enter_context(NodeProcess("ngo_estimator", "ngo_node", parameters, arguments))
-            images = probe.node.create_publisher(Image, "/returning/image", 1000)
-            actions = probe.node.create_publisher(DiscreteAction, "/returning/action", 1000)
-            relative_poses = probe.collect(RelativePose, "/returning/relative_pose")
-            poses = probe.collect(PoseWithCovarianceStamped, "/returning/ngo/pose")
-            ngo.wait_for_log("ready")
-            step = 0
-
-            def drive_until_heard(after_ns: int) -> int:
-                """Until there are poses of an odometry that began later; returns when it did."""
-
-                def origin_ns() -> int:
-                    return to_ns(relative_poses[-1].origin_stamp) if relative_poses else 0
-
-                def heard() -> bool:
-                    nonlocal step
-                    stamp = to_time(RUN_NS + step * STEP_NS)
-                    actions.publish(DiscreteAction(header=Image().header.__class__(stamp=stamp), action=0))
-                    step += 1
-                    images.publish(image_message(scan(step), RUN_NS + step * STEP_NS))
-                    return origin_ns() > after_ns and bool(poses) and to_ns(poses[-1].header.stamp) > origin_ns()
-
-                probe.spin_until(heard, "relative poses")
-                return origin_ns()
-
-            with NodeProcess("ngo_estimator", "local_node", local, arguments) as process:
-                first_ns = drive_until_heard(0)
-                process.send(signal.SIGKILL)
-                process.wait()
-            stack.enter_context(NodeProcess("ngo_estimator", "local_node", local, arguments))
-            assert drive_until_heard(first_ns) > first_ns
-            ngo.wait_for_log("the relative poses have a new origin: their source restarted")
-            assert "only the first that was heard" not in ngo.log

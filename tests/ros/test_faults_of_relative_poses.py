@@ -23,7 +23,7 @@ from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe
-from .relative_poses import Optimizer, assert_pose_is
+from .relative_poses import Drive, Optimizer, assert_pose_is
 
 pytestmark = pytest.mark.processes
 
@@ -142,38 +142,14 @@ def test_time_that_jumps_back_is_a_clean_reset(optimizer: Optimizer) -> None:
     optimizer.wait_for_value("restarts", lambda value: int(value) == restarts + 1)
 
 
-def broken(message: RelativePose, what: str) -> RelativePose:
-    """A message spoilt in one way."""
-    if what == "nan":
-        message.x = float("nan")
-    elif what == "infinity":
-        message.odom_y = float("inf")
-    elif what == "short feature":
-        message.motion_feature = message.motion_feature[:-1]
-    elif what == "long code":
-        message.place_code = [*message.place_code, 0.0]
-    elif what == "no feature":
-        message.motion_feature = []
-    elif what == "negative covariance":
-        message.covariance[4] = -1.0
-    elif what == "backwards":
-        message.from_stamp, message.header.stamp = message.header.stamp, message.from_stamp
-    else:
-        message.yaw = 1e300
-    return message
-
-
-@pytest.mark.parametrize(
-    "what",
-    ["nan", "infinity", "short feature", "long code", "no feature", "negative covariance", "backwards", "huge"],
-)
-def test_unusable_values_are_dropped_and_nothing_wrong_is_published(optimizer: Optimizer, what: str) -> None:
+def test_a_new_origin_of_later_stamps_begins_anew(optimizer: Optimizer) -> None:
+    """A local node that was killed comes back: what moved meanwhile is unknown, and nothing is made up for it."""
     drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 4), broken(drive.step(5), what), *drive.steps(6, 8))
-    pose = optimizer.wait_for_stamp(drive.stamp_ns(8))
-    good = [*drive.steps(1, 4), *drive.steps(6, 8)]
-    assert optimizer.stamps_ns() == [to_ns(message.header.stamp) for message in good]
-    assert_pose_is(pose, optimizer.expected(good))
+    optimizer.pose_after(*drive.steps(1, 5))
+    returned = Drive(optimizer.core, drive.stamp_ns(20))
+    pose = optimizer.pose_after(*returned.steps(1, 5))
+    assert_pose_is(pose, optimizer.expected(returned.steps(1, 5)))
+    optimizer.process.wait_for_log("the relative poses have a new origin: their source restarted")
 
 
 def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:

@@ -183,12 +183,6 @@ def test_a_reset_forgets_the_pose_and_initialpose_gives_it(again: Again) -> None
     assert np.hypot(*(_planar(node.wait_for_stamp(_stamp_ns(again.steps[2]))) - given)[:2]) < 0.5
 
 
-def test_a_localization_without_a_map_is_one_line_and_exit_code_2() -> None:
-    with NodeProcess("ngo_estimator", "ngo_node", {"mode": "localization"}) as process:
-        assert process.wait() == 2, process.log
-        assert len(process.lines) == 1 and "parameter 'state' is ''" in process.lines[0], process.log
-
-
 def _later(message: RelativePose, hours: int = 1) -> RelativePose:
     """The same message so many hours later."""
     moved = deepcopy(message)

@@ -17,6 +17,8 @@ from ngo_msgs.msg import RelativePose
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
+from .processes import run_forked
+
 TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 
@@ -41,10 +43,7 @@ def environment() -> dict[str, str]:
 
 
 def ros2(*arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(ROS2), *arguments],
-        capture_output=True, text=True, timeout=TIMEOUT_S, env={**environment(), **changes}, check=False,
-    )  # fmt: skip
+    return run_forked([str(ROS2), *arguments], TIMEOUT_S, {**environment(), **changes})
 
 
 def listed(*arguments: str, expected: list[str]) -> list[str]:
@@ -70,7 +69,7 @@ def talker() -> Iterator[None]:
 
 
 def test_help_says_that_it_is_a_stand_in_and_what_it_serves() -> None:
-    text = ros2("--help").stdout
+    text = subprocess.run([ROS2, "--help"], capture_output=True, text=True, env=environment()).stdout
     assert "not the real `ros2` command but a stand-in" in text
     assert cli.SERVED in text
 

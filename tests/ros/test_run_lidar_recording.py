@@ -83,8 +83,13 @@ def test_nodes_of_a_lidar_need_no_networks(for_lidar: Path) -> None:
     lines = [f"import ngo_estimator.nodes.{module}" for module in (*modules, "join_sessions", "optimize_graph")]
     lines += [
         "from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar",
+        "from ngo_estimator.nodes.lidar_input import warm_up_odometry",
         "from ngo_estimator.nodes.run_recording import get_package_share_directory as share, Path",
+        "from ngo_estimator.offline.lidar_run import LidarRun",
+        "from ngo_estimator.offline.warm_up_scans import warm_up_scans",
         "from ngo_estimator.slam.scan_trajectory import ScanTrajectory",
+        "from ngo_estimator.slam.session import Session",
+        "warm_up_odometry(), warm_up_scans()",
         "folder = Path(share('ngo_estimator'), 'weights', 'scan')",
         "print(MixtureLidar.load(folder, 'scan'), ScanTrajectory.load(folder, 'scan'))",
     ]

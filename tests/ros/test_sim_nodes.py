@@ -35,7 +35,6 @@ pytestmark = pytest.mark.processes
 
 SEED = 7
 FRAMES = 25
-DRIVERS = {"maze2d": "corners", "maze3d": "random_goals"}
 
 
 @pytest.fixture
@@ -104,7 +103,7 @@ class Run:
 
 def test_maze2d_publishes_what_the_core_records(probe: Probe) -> None:
     run = Run(probe, "maze2d", LaserScan, "scan")
-    episode = record_episode(Maze2D(), DRIVERS["maze2d"], FRAMES, SEED)
+    episode = record_episode(Maze2D(), "corners", FRAMES, SEED)
     run.check(episode, 0.1)
     image, scan = run.images[0], run.sensor[0]
     assert (image.height, image.width, image.encoding, image.step) == (1, 241, "32FC4", 241 * 16)
@@ -119,9 +118,9 @@ def test_maze2d_publishes_what_the_core_records(probe: Probe) -> None:
 
 def test_maze3d_publishes_what_the_core_records(probe: Probe, latched: QoSProfile) -> None:
     mounted = probe.collect(TFMessage, "/tf_static", latched)
-    run = Run(probe, "maze3d", CameraInfo, "camera_info")
+    run = Run(probe, "maze3d", CameraInfo, "camera_info", policy="learned")
     env = Maze3D()
-    episode = record_episode(env, DRIVERS["maze3d"], FRAMES, SEED)
+    episode = record_episode(env, "learned", FRAMES, SEED)
     env.close()
     run.check(episode, 2 / 35)
     image, info = run.images[0], run.sensor[0]
@@ -139,14 +138,6 @@ def test_maze3d_publishes_what_the_core_records(probe: Probe, latched: QoSProfil
     assert forward == (1.0, 0.0, 0.0), "the optical axis z is forward in base_link"
     right = (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y))
     assert right == (0.0, -1.0, 0.0), "x of the picture is right"
-
-
-def test_the_learned_driver_drives_as_without_ros(probe: Probe) -> None:
-    run = Run(probe, "maze3d", CameraInfo, "camera_info", policy="learned")
-    env = Maze3D()
-    episode = record_episode(env, "learned", FRAMES, SEED)
-    env.close()
-    run.check(episode, 2 / 35)
 
 
 def test_none_is_lost_by_a_slow_subscriber(probe: Probe) -> None:
@@ -246,17 +237,6 @@ def test_parameters_can_be_described_and_changed_only_where_it_makes_sense(probe
         probe.spin_until(lambda: len(images) > 100, "many frames")
 
 
-def test_wall_stamps_and_a_namespace(probe: Probe) -> None:
-    images = probe.collect(Image, "/robot/camera")
-    before = time.time_ns()
-    remapped = ("-r", "__ns:=/robot", "-r", "image:=camera")
-    with simulator("maze2d", *remapped, frames=5, rate=0, use_wall_stamps=True, wait_for_subscribers=1) as node:
-        probe.spin_until(lambda: len(images) == 5, "the frames")
-        assert node.wait() == 0, node.log
-    received = stamps(images)
-    assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
-
-
 @pytest.fixture
 def latched() -> QoSProfile:
     return QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -343,40 +323,36 @@ def test_bad_parameters_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
             assert node.lines[0].startswith("[FATAL]") and expected in node.lines[0]
 
 
-@pytest.mark.parametrize(("executable", "flag"), [("maze3d", "--help"), ("local_node", "-h")])
-def test_help_lists_the_parameters_and_starts_no_node(executable: str, flag: str) -> None:
-    package = "ngo_sim" if executable.startswith("maze") else "ngo_estimator"
-    with NodeProcess(package, executable, {}, ("--", flag)) as node:
+def test_help_lists_the_parameters_and_starts_no_node() -> None:
+    with simulator("maze3d", "--", "--help") as node:
         assert node.wait() == 0, node.log
-        assert node.lines[0].startswith(f"usage: ros2 run {package} {executable} ")
+        assert node.lines[0].startswith("usage: ros2 run ngo_sim maze3d ")
         assert any(line.startswith("  frame_prefix:=''  (") for line in node.lines)
         assert "ready" not in node.log
 
 
-def test_a_start_is_told_in_one_line(probe: Probe) -> None:
-    images = probe.collect(Image, "/red/image")
-    with simulator("maze2d", "-r", "__ns:=/red", seed=3, rate=100.0, wait_for_subscribers=1) as node:
-        probe.spin_until(lambda: images, "the first frame")
-        assert len(node.lines) == 1
+def test_a_start_is_told_in_one_line_and_a_signal_ends_it(probe: Probe) -> None:
+    images = probe.collect(Image, "/red/camera")
+    before = time.time_ns()
+    remapped = ("-r", "__ns:=/red", "-r", "image:=camera")
+    settings = {"seed": 3, "rate": 100.0, "use_wall_stamps": True, "wait_for_subscribers": 1}
+    with simulator("maze2d", *remapped, **settings) as node:
+        probe.spin_until(lambda: len(images) >= 5, "the frames")
+        assert len(node.lines) == 1 and "XMLPARSER" not in node.log, node.log
         assert node.lines[0].endswith(
-            "ready: /red/maze2d, seed 3, 100 frames a second, publishes /red/action, /red/ground_truth, /red/image, "
+            "ready: /red/maze2d, seed 3, 100 frames a second, publishes /red/action, /red/camera, /red/ground_truth, "
             "/red/scan; waits for 1 subscribers of the image"
         )
-
-
-@pytest.mark.parametrize(("world", "number"), [("maze2d", signal.SIGTERM), ("maze3d", signal.SIGINT)])
-def test_a_signal_ends_it_cleanly(probe: Probe, world: str, number: signal.Signals) -> None:
-    images = probe.collect(Image, "image")
-    with simulator(world, rate=200) as node:
-        probe.spin_until(lambda: len(images) > 3, "some frames")
-        node.send(number)
+        received = stamps(images)
+        assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
+        node.send(signal.SIGTERM)
         assert node.wait() == 0, node.log
         assert "Traceback" not in node.log
 
 
 def test_signals_while_it_starts_end_it_cleanly(probe: Probe) -> None:
     """The node is in the graph before it makes its world."""
-    with simulator("maze3d") as node:
+    with NodeProcess("ngo_sim", "maze3d", fresh=True) as node:
         probe.spin_until(lambda: "maze3d" in probe.node.get_node_names(), "the node")
         for number in (signal.SIGINT, signal.SIGTERM):
             node.send(number)

@@ -1,10 +1,9 @@
-"""What a simulator records is what it publishes: whole, readable by other tools, and after a kill to its last chunk."""
+"""What a simulator records is what it publishes: whole, and after a kill to its last chunk."""
 
 import resource
 import signal
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from ngo_recordings.errors import RecordingError
@@ -54,24 +51,10 @@ def record(world: str, path: Path, **parameters: Any) -> None:
         assert node.wait() == 0, node.log
 
 
-@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
-@pytest.mark.parametrize("name", ["drive.mcap", "drive"])
-def test_every_message_is_read_by_the_mcap_and_the_rosbags_library_and_by_ours(
-    tmp_path: Path, world: str, name: str
-) -> None:
+@pytest.mark.parametrize(("world", "name"), [("maze2d", "drive.mcap"), ("maze3d", "drive")])
+def test_a_recording_holds_what_the_core_records(tmp_path: Path, world: str, name: str) -> None:
     path = tmp_path / name
     record(world, path)
-    file = path if path.is_file() else path / "drive_0.mcap"
-    with file.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        decoded = [(channel.topic, message.data) for _, channel, message, _ in reader.iter_decoded_messages()]
-    assert Counter(topic for topic, _ in decoded) == counts(world)
-    with AnyReader([path]) as bag:
-        found = [(connection.topic, bytes(data)) for connection, _, data in bag.messages()]
-        kinds = {type(bag.deserialize(data, connection.msgtype)).__name__ for connection, _, data in bag.messages()}
-    assert sorted(found) == sorted(decoded)
-    assert {"sensor_msgs__msg__Image", "ngo_msgs__msg__DiscreteAction"} <= kinds
-
     make = {"maze2d": Maze2D, "maze3d": Maze3D}[world]
     episode = record_episode(make(), DRIVERS[world], FRAMES, 1007)
     with open_recording([path]) as recording:
@@ -163,7 +146,8 @@ def full_disk(size: int) -> Iterator[None]:
 
 def test_a_full_disk_ends_the_node_with_one_line(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with full_disk(2**20 + 2**19), NodeProcess("ngo_sim", "maze2d", {"rate": 0.0, "record": str(path)}) as node:
+    parameters = {"rate": 0.0, "record": str(path)}
+    with full_disk(2**20 + 2**19), NodeProcess("ngo_sim", "maze2d", parameters, fresh=True) as node:
         assert node.wait() == 1, node.log
         assert "Traceback" not in node.log, node.log
         assert f"parameter 'record': {path} cannot be written any further: File too large" in node.lines[-1]

@@ -28,31 +28,6 @@ def test_registration_and_the_search_for_loops_are_compiled() -> None:
         assert function.signatures, function
 
 
-ODOMETRY = """
-from ngo_estimator.nodes.lidar_input import MixtureLidar, warm_up_odometry
-MixtureLidar.load(WEIGHTS, "scan")
-warm_up_odometry()
-"""
-TRAJECTORY = """
-from ngo_estimator.offline.warm_up_scans import warm_up_scans
-from ngo_estimator.slam.scan_trajectory import ScanTrajectory
-from ngo_estimator.slam.session import Session
-warm_up_scans()
-ScanTrajectory.load(WEIGHTS, "scan")
-"""
-RECORDING = """
-from ngo_estimator.nodes import recorded_output, run_recording
-from ngo_estimator.offline.lidar_run import LidarRun
-"""
-
-
-@pytest.mark.parametrize("estimators", [ODOMETRY, TRAJECTORY, RECORDING])
-def test_the_estimators_of_a_lidar_do_without_torch(estimators: str) -> None:
-    begin = f"import sys; from pathlib import Path; WEIGHTS = Path({str(WEIGHTS / 'scan')!r})"
-    program = f"{begin}\n{estimators}\nassert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_the_odometry_of_networks_does_without_the_compiler() -> None:
     program = "import sys; from ngo_estimator.frontend.camera import local_odometry; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)
