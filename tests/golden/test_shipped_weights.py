@@ -62,25 +62,6 @@ def test_a_session_with_shipped_weights_goes_on_from_its_files_to_the_last_bit(w
         np.testing.assert_array_equal(theirs[name], array, err_msg=name)
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_a_session_goes_on_from_each_frame_of_a_meta_pose(world: str) -> None:
-    """A state may be saved after each; what is due is done before."""
-    _, steps = golden(world)
-    first, last = len(steps) - 56, len(steps)
-    original, states = OnlineTrajectory.load(WEIGHTS / world, 200, world, 8, 1), {}
-    for frame, step in enumerate(steps[:last]):
-        if first <= frame < first + 16:
-            states[frame] = original.state()
-        original.update(step)
-    expected = original.state()
-    for frame, state in states.items():
-        loaded = OnlineTrajectory.load(WEIGHTS / world, 200, world, 8, 1).restored(state)
-        for step in steps[frame:last]:
-            loaded.update(step)
-        for name, array in loaded.state().items():
-            np.testing.assert_array_equal(array, expected[name], err_msg=f"{name}, from frame {frame} on")
-
-
 # Measured: steps 0.06 um, odometry 2 um, poses 0.1 um (2D) and 2 um (3D).
 @pytest.mark.parametrize("world", WORLDS)
 def test_networks_over_several_frames_at_once_give_the_same_but_for_rounding(world: str) -> None:

@@ -56,13 +56,6 @@ def test_ends_with_the_table_as_json(weights: Path, tmp_path: Path) -> None:
     assert counts["/ngo/path"] >= FRAMES - 1, "one more where an optimisation ends by itself"
 
 
-def test_says_which_node_failed_and_why(tmp_path: Path) -> None:
-    done = run_demo("--weights", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
-    assert done.returncode == 1
-    assert "ended with exit code 2; it wrote last:" in done.stderr and "nowhere" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def descendants(pid: int) -> set[int]:
     """Processes that ``pid`` started, and those that they started."""
     parents = {}

@@ -59,7 +59,7 @@ def take(core: OnlineTrajectory, steps: list[RelativeStep]) -> list[TrajectoryUp
 
 
 @pytest.mark.parametrize("world", ["maze2d", "maze3d"])
-@pytest.mark.parametrize("variance", [1e3, 1e4, 1e5, 1e300])
+@pytest.mark.parametrize("variance", [1e4, 1e300])
 @pytest.mark.parametrize("places", ["x and y", "all"])
 def test_huge_variances_and_unusual_codes_break_nothing(
     world: str, variance: float, places: str, request: pytest.FixtureRequest

@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ngo_estimator.checkpoint import write_untrained
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RejectedStep, RelativeStep
@@ -459,59 +457,7 @@ def test_the_callers_arrays_may_change_afterwards() -> None:
         assert_same_updates(update, take(other, step))
 
 
-# ---- any sequence of steps
-
-
-finite = st.floats(-1.0, 1.0)
-wild = st.one_of(finite, st.floats(-1e4, 1e4), st.floats(allow_nan=True, allow_infinity=True))
-
-
-@st.composite
-def any_step(draw: st.DrawFn) -> dict[str, object]:
-    numbers = draw(st.sampled_from([finite, finite, finite, wild]))
-    vector = st.lists(numbers, min_size=3, max_size=3).map(np.array)
-    exponent = draw(st.sampled_from([st.integers(-6, -2), st.integers(-300, 300)]))
-    return {
-        "advance_ns": draw(st.sampled_from([PERIOD_NS] * 6 + [1, 0, -1, -PERIOD_NS, -2 * RESTART_AFTER_NS, 10**15])),
-        "from_gap_ns": draw(st.sampled_from([0] * 6 + [1, -1, PERIOD_NS])),
-        "relative_xyyaw": draw(vector),
-        "odom_xyyaw": draw(vector),
-        "variances": np.array([10.0 ** draw(exponent) for _ in range(3)]),
-        "origin_stamp_ns": draw(st.sampled_from([0] * 12 + [1])),
-        "feature": np.float32(np.clip(draw(numbers), -3e38, 3e38)),
-        "repeat": draw(st.sampled_from([1, 1, 5])),
-    }
-
-
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
-@given(st.lists(any_step(), min_size=1, max_size=14), st.sampled_from(FORMS))
-def test_no_sequence_of_steps_breaks_it(plans: list[dict[str, object]], form: str) -> None:
-    core = CORES[form]
-    core.reset()
-    stamp_ns = 10**18
-    for plan in plans:
-        for _ in range(plan["repeat"]):  # type: ignore[call-overload]
-            before = stamp_ns
-            stamp_ns += plan["advance_ns"]  # type: ignore[operator]
-            step = RelativeStep(
-                stamp_ns=stamp_ns,
-                from_stamp_ns=before + plan["from_gap_ns"],  # type: ignore[operator]
-                relative_xyyaw=plan["relative_xyyaw"],  # type: ignore[arg-type]
-                covariance=np.diag(plan["variances"]),  # type: ignore[call-overload]
-                origin_stamp_ns=plan["origin_stamp_ns"],  # type: ignore[arg-type]
-                odom_xyyaw=plan["odom_xyyaw"],  # type: ignore[arg-type]
-                motion_feature=np.full(6, plan["feature"]),
-                place_code=np.full(12, plan["feature"]),  # type: ignore[arg-type]
-            )
-            try:
-                update = take(core, step)
-            except RejectedStep:
-                continue
-            assert_sound(update)
-            assert update.stamps_ns[-1] == stamp_ns
-
-
-CORES = {form: make(form, window_frames=40) for form in FORMS}
+# ---- extreme values
 
 
 @pytest.mark.parametrize("form", FORMS)
