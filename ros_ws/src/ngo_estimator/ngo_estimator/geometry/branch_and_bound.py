@@ -207,30 +207,18 @@ def _blocks_near(offsets: np.ndarray, reach: float, step: int, columns: int, row
 
 @njit(cache=True)
 def _bound(level: np.ndarray, cells: np.ndarray, across: int, up: int, least: float) -> int:
-    """The sum of ``_sum``, or -1 where it is below ``least``."""
+    """Sum of the likelihoods at cells ``(n, 2)`` moved by ``across`` columns and ``up`` rows; -1 below ``least``."""
     rows, columns = level.shape
-    total, missing = 0, 255 * len(cells) - least
+    # Negative numbers are large ones without a sign: one comparison tells both borders.
+    high, wide = np.uint32(rows), np.uint32(columns)
+    total, lowest = 0, least - 255.0 * len(cells)  # what the points so far must reach where all others are sure
     for k in range(len(cells)):
-        column, row = cells[k, 0] + across, cells[k, 1] + up
-        value = 0
-        if 0 <= column < columns and 0 <= row < rows:
-            value = level[row, column]
-        total += value
-        missing -= 255 - value
-        if missing < 0.0:
-            return -1
-    return total
-
-
-@njit(cache=True)
-def _sum(level: np.ndarray, cells: np.ndarray, across: int, up: int) -> int:
-    """Sum of the likelihoods at cells ``(n, 2)`` moved by ``across`` columns and ``up`` rows."""
-    rows, columns = level.shape
-    total = 0
-    for k in range(len(cells)):
-        column, row = cells[k, 0] + across, cells[k, 1] + up
-        if 0 <= column < columns and 0 <= row < rows:
+        column, row = np.uint32(cells[k, 0] + across), np.uint32(cells[k, 1] + up)
+        if column < wide and row < high:
             total += level[row, column]
+        lowest += 255.0
+        if total < lowest:
+            return -1
     return total
 
 

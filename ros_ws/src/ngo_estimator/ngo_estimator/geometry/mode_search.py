@@ -73,20 +73,17 @@ def two_modes(
     cell = field.config.cell_m
     half = max(1, math.ceil(window.half_m / cell))
     turns = max(1, math.ceil(window.half_rad / window.step_rad))
-    headings = window.centre[2] + window.step_rad * np.arange(-turns, turns + 1)
-    means = prior.means - window.centre
-    means[:, 2] = np.array([wrap(float(turn)) for turn in means[:, 2]])
     found = _modes(
         field.levels,
         round(255 * field.config.unknown),
         points,
-        window.centre[:2] - field.corner,
-        headings - window.centre[2],
-        window.centre[2],
+        field.corner,
+        window.centre,
+        (turns, window.step_rad),
         half,
         cell,
-        means,
-        1.0 / prior.deviations**2,
+        prior.means,
+        prior.deviations,
         prior.log_weights,
         weight,
         apart[0] / cell,
@@ -94,9 +91,10 @@ def two_modes(
         margin,
         _MOST_BLOCKS,
     )
+    x, y, yaw = window.centre.tolist()
     return [
-        (np.array((window.centre[0] + x * cell, window.centre[1] + y * cell, wrap(float(headings[int(a)])))), total)
-        for total, a, x, y in found
+        (np.array((x + column * cell, y + row * cell, wrap(yaw + (a - turns) * window.step_rad))), total)
+        for total, a, column, row in found
     ]
 
 
@@ -117,10 +115,12 @@ def _logs(means: Array, deviations: Array, log_weights: Array, pose: Array) -> A
 @njit(cache=True)
 def _sum(level: NDArray[np.uint8], cells: NDArray[np.int32], across: int, up: int, unknown: int) -> int:
     rows, columns = level.shape
+    # Negative numbers are large ones without a sign: one comparison tells both borders.
+    high, wide = np.uint32(rows), np.uint32(columns)
     total = 0
     for k in range(len(cells)):
-        column, row = cells[k, 0] + across, cells[k, 1] + up
-        total += level[row, column] if 0 <= column < columns and 0 <= row < rows else unknown
+        column, row = np.uint32(cells[k, 0] + across), np.uint32(cells[k, 1] + up)
+        total += level[row, column] if column < wide and row < high else unknown
     return total
 
 
@@ -141,11 +141,15 @@ def _log_prior(
 
 @njit(cache=True)
 def _modes(
-    levels: NDArray[np.uint8], unknown: int, points: Array, centre: Array, turns: Array, yaw: float, half: int,
-    cell: float, means: Array, information: Array, logs: Array, weight: float, apart: float, apart_rad: float,
-    margin: float, most_blocks: int,
+    levels: NDArray[np.uint8], unknown: int, points: Array, corner: Array, centre: Array, headings: tuple[int, float],
+    half: int, cell: float, poses: Array, deviations: Array, logs: Array, weight: float, apart: float,
+    apart_rad: float, margin: float, most_blocks: int,
 ) -> list[tuple[float, int, int, int]]:  # fmt: skip
-    """Total, heading, column and row of one or two modes."""
+    """Total, heading, column and row of one or two modes; ``headings`` are so many to each side, and their step."""
+    turns, yaw = headings[1] * np.arange(-headings[0], headings[0] + 1), centre[2]
+    means, information = poses - centre, 1.0 / deviations**2
+    for k in range(len(means)):
+        means[k, 2] = wrap(means[k, 2])
     depth = len(levels) - 1
     while depth > 0 and (1 << depth) > half + 1:
         depth -= 1
@@ -153,8 +157,8 @@ def _modes(
     for a in range(len(turns)):
         cos, sin = math.cos(yaw + turns[a]), math.sin(yaw + turns[a])
         for k in range(len(points)):
-            x = cos * points[k, 0] - sin * points[k, 1] + centre[0]
-            y = sin * points[k, 0] + cos * points[k, 1] + centre[1]
+            x = cos * points[k, 0] - sin * points[k, 1] + centre[0] - corner[0]
+            y = sin * points[k, 0] + cos * points[k, 1] + centre[1] - corner[1]
             cells[a, k, 0], cells[a, k, 1] = math.floor(x / cell), math.floor(y / cell)
     scale = 1.0 / (255.0 * len(points))
     heap = [(0.0, 0, 0, 0, 0) for _ in range(0)]

@@ -113,8 +113,6 @@ def icp(
             f"start, mean and information have shapes {start.shape}, {mean.shape} and {information.shape}; expected "
             "(3,), (3,) and (3, 3)"
         )
-    if not _all_finite(start, mean, information):
-        raise ValueError("start or prior are not finite; expected finite numbers")
     pose, covariance, data, fitted, tried = _icp(
         lines.points,
         lines.normals,
@@ -141,11 +139,6 @@ def icp(
 
 
 @njit(cache=True)
-def _all_finite(start: Array, mean: Array, information: Array) -> bool:
-    return bool(np.isfinite(start).all() and np.isfinite(mean).all() and np.isfinite(information).all())
-
-
-@njit(cache=True)
 def _icp(
     map_points: Array,
     map_normals: Array,
@@ -168,6 +161,8 @@ def _icp(
     correlation: float,
     noisy: tuple[float, float],
 ) -> tuple[Array, Array, Array, int, int]:
+    if not (np.isfinite(start).all() and np.isfinite(mean).all() and np.isfinite(prior).all()):
+        raise ValueError("start or prior are not finite; expected finite numbers")
     pose = start.copy()
     data = np.zeros((3, 3))
     total = prior.copy()

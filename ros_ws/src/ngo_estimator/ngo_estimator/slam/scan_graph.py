@@ -181,7 +181,10 @@ class ScanGraph(PoseGraph):
     @property
     def lost_since(self) -> int | None:
         """The frame from which on nobody knows where the newest is in the map, for no loop joins its segment."""
-        segments, known = self._nodes.segments, np.flatnonzero(self._parts == 0)
+        segments = self._nodes.segments
+        if len(segments) == 1:
+            return None
+        known = np.flatnonzero(self._parts == 0)
         last = int(known[-1]) if len(known) else 0  # of the segments that are joined with the first
         return None if last == len(segments) - 1 else int(self._nodes.frames.nodes[segments[last + 1]])
 

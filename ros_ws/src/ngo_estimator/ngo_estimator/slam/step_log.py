@@ -1,5 +1,6 @@
 """The steps of a trajectory in their order: stamps, odometry, gaps and new beginnings."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,7 +130,8 @@ class StepLog:
         self.stamps_ns.append(stamp_ns)
         self.odometry.append(odometry)
         # Beyond it the motion is unknown all the same, and float32 would hold infinity, which no file takes.
-        self.odometry_std.append(np.sqrt(np.diagonal(covariance)).clip(max=LARGEST_ODOMETRY))
+        variances = np.diagonal(covariance).tolist()
+        self.odometry_std.append([min(math.sqrt(variance), LARGEST_ODOMETRY) for variance in variances])
 
     def _laid(self, odom_xyyaw: np.ndarray) -> np.ndarray:
         """A pose ``(3,)`` of the present odometry, as ``odometry`` has it."""
