@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, overload
 
 import numpy as np
@@ -94,9 +93,8 @@ class KeyScanStore(Sequence[KeyScan]):
         """Drop the rays of all key scans so far, and keep points and normals as single floats, as messages do."""
         for k in range(self._compact, len(self._scans)):
             scan = self._scans[k]
-            points: Any = scan.points.astype(np.float32)
-            normals: Any = scan.normals.astype(np.float32)
-            self._scans[k] = replace(scan, points=points, normals=normals, angles=_NOTHING, ranges=_NOTHING)
+            points, normals = scan.points.astype(np.float32), scan.normals.astype(np.float32)
+            self._scans[k] = _with(scan, points=points, normals=normals, angles=_NOTHING, ranges=_NOTHING)
         self._compact = len(self._scans)
 
     def thin(self, keep: np.ndarray) -> None:
@@ -108,7 +106,11 @@ class KeyScanStore(Sequence[KeyScan]):
 def _whole(scan: KeyScan) -> KeyScan:
     if scan.points.dtype == np.float64:
         return scan
-    whole = copy.copy(scan)  # not a new one: nothing needs to be checked again
-    object.__setattr__(whole, "points", scan.points.astype(np.float64))
-    object.__setattr__(whole, "normals", scan.normals.astype(np.float64))
-    return whole
+    return _with(scan, points=scan.points.astype(np.float64), normals=scan.normals.astype(np.float64))
+
+
+def _with(scan: KeyScan, **parts: Any) -> KeyScan:
+    other = copy.copy(scan)  # not a new one: nothing needs to be checked again
+    for name, part_of_it in parts.items():
+        object.__setattr__(other, name, part_of_it)
+    return other

@@ -81,7 +81,8 @@ class ScanTrajectory(CorrectedTrajectory):
 
     def _checked(self, step: RelativeStep) -> RelativeStep:
         check_step(step, 0, None)
-        return replace(step, covariance=bounded(step.covariance))
+        covariance = bounded(step.covariance)
+        return step if np.array_equal(covariance, step.covariance) else replace(step, covariance=covariance)
 
     def _begin_at(self, step: RelativeStep) -> None:
         self._graph.begin_at(step)

@@ -23,7 +23,6 @@ from ngo_estimator.geometry.mode_search import Mixture, SearchWindow, two_modes
 from ngo_estimator.geometry.planar_motion import (
     Array,
     between,
-    compose,
     inverted,
     squared_deviations,
     transformed,
@@ -292,9 +291,9 @@ class MixtureOdometry:
 
     def _fit(self, few: _Points, hypothesis: int, start: Array | None, prior: Mixture, weight: float) -> _Mode:
         """A mode, registered under a hypothesis from where that has it, or from ``start`` ``(3,)``."""
-        mean = compose(self._pose, self.mixture.steps[hypothesis])
+        mean, covariance = self.mixture.expected(hypothesis, self._pose, self._covariance)
         if start is None:
-            start, information = mean, inverted(self.mixture.pose_covariance(hypothesis, self._covariance, mean))
+            start, information = mean, inverted(covariance)
         else:
             broad = np.diag(np.full(3, _BROAD**-2))
             information = broad * min(1.0, _FAR / max(squared_deviations(start, mean, broad), 1e-9))
@@ -306,8 +305,7 @@ class MixtureOdometry:
         """A mode of the ``few`` points, registered with all of the scan's under the hypothesis that is likeliest."""
         mixture, walls = self.mixture, mode.walls
         likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
-        mean = compose(self._pose, mixture.steps[likeliest])
-        covariance = mixture.pose_covariance(likeliest, self._covariance, mean)
+        mean, covariance = mixture.expected(likeliest, self._pose, self._covariance)
         squared = squared_deviations(mode.pose, mean, inverted(covariance + walls))
         information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
         found = self._icp(scan, mode.pose, mean, information, self._last_steps)

@@ -134,12 +134,13 @@ class MotionMixture:
         """The hypothesis that is likeliest at a pose ``(3,)``."""
         return int(np.flatnonzero(self._usable)[int(mixture.logs(pose).argmax())])
 
-    def pose_covariance(self, hypothesis: int, covariance: Array, mean: Array) -> Array:
-        """Covariance ``(3, 3)`` of the ``mean`` ``(3,)`` that a hypothesis foretells from a pose of ``covariance``."""
+    def expected(self, hypothesis: int, pose: Array, covariance: Array) -> tuple[Array, Array]:
+        """The pose ``(3,)`` that a hypothesis foretells after ``pose`` of ``covariance``, and its covariance."""
+        repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
+        mean, spread = _expected(pose, covariance, self._steps[hypothesis], self._deviations[hypothesis], repeated)
         if hypothesis in (LAST, VELOCITY):
-            result: Array = self._foretold[hypothesis][0][:3, :3].copy()
-            return result
-        return propagated(covariance, mean, self._steps[hypothesis], self.step_covariance(hypothesis))
+            spread = self._foretold[hypothesis][0][:3, :3].copy()
+        return mean, spread
 
     def step_covariance(self, hypothesis: int) -> Array:
         """Covariance ``(3, 3)`` of a hypothesis' motion; errors of wheels repeat from step to step."""
@@ -150,13 +151,13 @@ class MotionMixture:
     def foretold(self, pose: Array, covariance: Array) -> tuple[Array, Array]:
         """The pose ``(3,)`` after one of ``covariance`` ``(3, 3)`` by the likeliest hypothesis, with the covariance of
         all."""
-        means = [compose(pose, step) for step in self._steps]
-        best, total = means[self.heaviest], np.zeros((3, 3))
+        best, total = compose(pose, self._steps[self.heaviest]), np.zeros((3, 3))
         weights = np.where(self._usable, self._weights, 0.0)
         for k in map(int, np.flatnonzero(self._usable)):
-            off = means[k] - best
+            mean, spread = self.expected(k, pose, covariance)
+            off = mean - best
             off[2] = wrap(float(off[2]))
-            total += weights[k] / weights.sum() * (self.pose_covariance(k, covariance, means[k]) + np.outer(off, off))
+            total += weights[k] / weights.sum() * (spread + np.outer(off, off))
         return best, total
 
     def take(self, hypothesis: int, before: Array, pose: Array, covariance: Array, walls: Array | None) -> None:
@@ -216,6 +217,14 @@ def _grown(
         deviations[k] *= longer
     deviations[ANY, 0], deviations[ANY, 1] = anything[0] * longer, anything[1] * longer
     return base, deviations
+
+
+@njit(cache=True)
+def _expected(
+    pose: Array, covariance: Array, step: Array, deviations: Array, repeated: float
+) -> tuple[Array, Array]:  # fmt: skip
+    mean = compose(pose, step)
+    return mean, propagated(covariance, mean, step, _diagonal(deviations, repeated))
 
 
 @njit(cache=True)
