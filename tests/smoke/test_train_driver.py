@@ -27,30 +27,36 @@ def arguments(folder: Path, **changes: Any) -> Arguments:
     return Arguments(**{**toy, **changes}, out=folder / "driver.safetensors", runs=folder / "runs")
 
 
-def test_a_training_ends_with_weights_that_drive(tmp_path: Path) -> None:
-    description = main(arguments(tmp_path))
-    assert json.loads(json.dumps(description)) == json.loads((tmp_path / "driver.json").read_text())
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("driver")
+    return folder, main(arguments(folder))
+
+
+def test_a_training_ends_with_weights_that_drive(trained: tuple[Path, dict[str, Any]]) -> None:
+    made, description = trained
+    assert json.loads(json.dumps(description)) == json.loads((made / "driver.json").read_text())
     training = description["training"]
     assert training["decisions"] == 16 and training["arguments"]["seed"] == 0
     assert training["command"].startswith("python -m training.train_driver --lessons 1") and training["revision"]
-    assert (tmp_path / "driver.safetensors").stat().st_size < 300_000
-    folder = tmp_path / "runs" / "maze3d" / "driver"
+    assert (made / "driver.safetensors").stat().st_size < 300_000
+    folder = made / "runs" / "maze3d" / "driver"
     rows = (folder / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["decisions", "8", "16"]
     assert json.loads((folder / "run.json").read_text())["state"] == "complete"
 
     env = Maze3D()
-    driver = LearnedDriver(np.random.default_rng(0), load_policy(tmp_path / "driver.safetensors"))
+    driver = LearnedDriver(np.random.default_rng(0), load_policy(made / "driver.safetensors"))
     observation, info = env.reset(seed=TRAIN_SEEDS[0])
     for _ in range(20):
         observation, *_, info = env.step(driver.action(info["pose_xyyaw"], observation))
     env.close()
 
 
-def test_the_simulators_forward_pass_is_that_of_the_training(tmp_path: Path) -> None:
-    main(arguments(tmp_path))
-    network, config = load_policy(tmp_path / "driver.safetensors"), PolicyConfig()
-    state = torch.load(tmp_path / "runs" / "maze3d" / "driver" / "last.pt", weights_only=True)["policy"]
+def test_the_simulators_forward_pass_is_that_of_the_training(trained: tuple[Path, dict[str, Any]]) -> None:
+    made, _ = trained
+    network, config = load_policy(made / "driver.safetensors"), PolicyConfig()
+    state = torch.load(made / "runs" / "maze3d" / "driver" / "last.pt", weights_only=True)["policy"]
     task = DrivingTask(world_named("maze3d"), config, (3,), frames=30, mazes=1)
     features = Features(task.observation_space, config)
     features.load_state_dict({k[19:]: v for k, v in state.items() if k.startswith("features_extractor.")})
