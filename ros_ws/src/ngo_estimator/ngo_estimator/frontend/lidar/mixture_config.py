@@ -34,22 +34,19 @@ class MixtureConfig:
 
     # Learning, by distance.
     learn_rate: float = 0.05  # what one match counts at most
-    learn_m: float = 0.2  # way and turn that make it count so much
-    learn_rad: float = 0.2
+    learn_way: float = 0.2  # way (m) and turn (rad) that make it count so much
     certain_m: float = 5.0  # way and turn that the wheels' calibration counts as known at first
     certain_rad: float = 3.0
     remembered_m: float = 100.0  # way after which it is forgotten
 
     # Search: windows cover all hypotheses, within limits.
-    least_m: float = 0.07  # no hypothesis is surer than this where the place is chosen
-    least_rad: float = 0.07
+    least: float = 0.07  # no hypothesis is surer than this where the place is chosen (m, rad)
     least_share: float = 0.1  # and none rarer
     prior_weight: float = 0.025  # of the prior's logarithm against the mean score of search_points
     search_points: int = 120
     least_window_m: float = 0.4
     least_window_deg: float = 10.0
     most_window_m: float = 2.5
-    most_window_deg: float = 180.0
     heading_step_deg: float = 1.25
     apart_m: float = 0.3  # modes closer than this are one
     apart_deg: float = 6.0
@@ -72,9 +69,6 @@ class MixtureConfig:
     key_deg: float = 15.0
     new_share: float = 0.8  # of the usual score, below which one comes earlier
     submap_scans: int = 20
-
-    wheel_wait_s: float = 0.25  # a scan waits so long for wheels
-    most_rays: int = 20_000  # of a scan that is not refused
 
     cells: ScoreFieldConfig = field(default_factory=ScoreFieldConfig)
     icp: IcpConfig = field(default_factory=IcpConfig)

@@ -29,6 +29,12 @@ _LONGEST_SWEEP_S = 1.0
 _LEAST_POINTS = 3
 """Points without which a scan says nothing."""
 
+_MOST_RAYS = 20_000
+"""A scan with more is refused."""
+
+_WHEEL_WAIT_S = 0.25
+"""A scan waits so long for wheels."""
+
 _SILENT_S = 1.0
 """Wheels that were silent for longer are not waited for."""
 
@@ -110,8 +116,8 @@ class MixtureLidar:
             DuplicateFrame, LateFrame: it is not newer than the last one, but not as old as after a restart.
             UnusableImage: it has too many rays.
         """
-        if len(scan.ranges) > self.config.most_rays:
-            raise UnusableImage(f"the scan has {len(scan.ranges)} rays; expected at most {self.config.most_rays}")
+        if len(scan.ranges) > _MOST_RAYS:
+            raise UnusableImage(f"the scan has {len(scan.ranges)} rays; expected at most {_MOST_RAYS}")
         newest = self._newest_ns
         if newest is not None and scan.stamp_ns <= newest:
             if scan.stamp_ns == newest:
@@ -170,7 +176,7 @@ class MixtureLidar:
         return (
             newest_s >= until
             or newest_s < min(until, self._last_s or until) - _SILENT_S
-            or self._newest_ns * 1e-9 >= at_s + self.config.wheel_wait_s
+            or self._newest_ns * 1e-9 >= at_s + _WHEEL_WAIT_S
         )
 
     def _step(self, scan: LidarScan, at_s: float) -> LidarStep | None:

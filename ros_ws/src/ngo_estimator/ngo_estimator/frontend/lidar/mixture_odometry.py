@@ -209,7 +209,7 @@ class MixtureOdometry:
 
     def _prior(self, share: float) -> Mixture:
         """The prior of where the place is chosen, without a hypothesis below a ``share``."""
-        least = self.config.least_m, self.config.least_rad
+        least = self.config.least, self.config.least
         return self.mixture.prior(self._pose, self._covariance, None, least, share)
 
     def _weight(self, points: Array) -> float:
@@ -233,7 +233,7 @@ class MixtureOdometry:
         fits = [self._fit(few, k, None, prior, weight) for k in self._starts()]
         for wide in (False, True):
             if wide:
-                prior = prior.widened(0.5 * config.most_window_m, 0.5 * math.radians(config.most_window_deg))
+                prior = prior.widened(0.5 * config.most_window_m, 0.5 * math.pi)
             for pose, _ in two_modes(
                 self._submap.field, points, self._window(prior, wide), prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
@@ -278,7 +278,7 @@ class MixtureOdometry:
     def _window(self, prior: Mixture, wide: bool) -> SearchWindow:
         config = self.config
         centre = prior.means[int(prior.log_weights.argmax())].copy()
-        most_m, most_rad = config.most_window_m, math.radians(config.most_window_deg)
+        most_m, most_rad = config.most_window_m, math.pi
         if wide:
             return SearchWindow(centre, most_m, most_rad, math.radians(config.heading_step_deg))
         metres, radians = _reach(prior.means[:-1], prior.deviations[:-1], centre)

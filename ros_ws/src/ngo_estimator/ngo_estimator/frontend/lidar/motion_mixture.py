@@ -176,13 +176,13 @@ class MotionMixture:
     def learn(self, step: Array, walls: Array) -> None:
         """Take the motion ``(3,)`` that a match found, with the covariance ``(3, 3)`` that walls alone leave it."""
         c = self._config
-        numbers = c.learn_rate, c.learn_m, c.learn_rad, c.least_weight, c.most_factor
+        numbers = c.learn_rate, c.learn_way, c.least_weight, c.most_factor
         foretold = self._steps, self._usable, self._base, self._deviations
         known = self.filter.joint, (self._last_gap, self._gap)
         share, way = _learned(
             *foretold, self._weights, self._squares, self._factors, self._least, step, walls, *known, numbers
         )
-        if share > 0.0 and self._raw is not None and abs(self._raw[2]) < c.learn_rad and way < 2.0 * c.learn_m:
+        if share > 0.0 and self._raw is not None and abs(self._raw[2]) < c.learn_way and way < 2.0 * c.learn_way:
             self.calibration.learn(self._raw, step, share)
 
 
@@ -239,16 +239,16 @@ def _diagonal(deviations: Array, repeated: float) -> Array:
 def _learned(
     steps: Array, usable: NDArray[np.bool_], base: Array, deviations: Array, weights: Array, squares: Array,
     factors: Array, least: Array, step: Array, walls: Array, joint: Array, gaps: tuple[float, float],
-    numbers: tuple[float, float, float, float, float],
+    numbers: tuple[float, float, float, float],
 ) -> tuple[float, float]:  # fmt: skip
     """Move weights ``(6,)``, ``squares`` and ``factors`` ``(6, 2)`` by a match; the wheels' share in it, and the way.
 
     ``joint`` ``(6, 6)`` is what the last match left open.
     """
-    learn_rate, learn_m, learn_rad, least_weight, most_factor = numbers
+    learn_rate, learn_way, least_weight, most_factor = numbers
     by_wheels = steps[TIGHT] if usable[TIGHT] else step
     way = max(math.hypot(step[0], step[1]), math.hypot(by_wheels[0], by_wheels[1]))
-    rate = learn_rate * min(1.0, way / learn_m + max(abs(step[2]), abs(by_wheels[2])) / learn_rad)
+    rate = learn_rate * min(1.0, way / learn_way + max(abs(step[2]), abs(by_wheels[2])) / learn_way)
     if rate <= 0.0:
         return 0.0, way
     variance = np.empty((6, 2))
