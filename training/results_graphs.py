@@ -13,16 +13,13 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ngo_estimator.checkpoint import load_loop_attention
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, thresholds, truncated_cost
 from ngo_estimator.graph.crowds import CrowdAware
-from ngo_estimator.graph.learned import LearnedCorrector
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
 from training.common import records
@@ -45,10 +42,7 @@ PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_lm_geman_mcclure": graph_peers.geman_mcclure,
     "pcm": graph_peers.pcm,
 }
-_LEARNED = {"learned": "graphs", "learned_without_attention": "graphs_without_attention"}
-"""Folders of the weights of learned rows."""
-
-_OURS = ("robust", "robust_anew", "crowd_aware", *_LEARNED)
+_OURS: dict[str, Callable[[], Corrector]] = {"robust": Robust, "robust_anew": Robust, "crowd_aware": CrowdAware}
 ROWS = ("odometry", *PEERS, *_OURS, "right_loops")
 _SOLVED = 1.5
 """A graph is solved where its error is below so many times that of the right loops."""
@@ -75,9 +69,8 @@ class Arguments:
     """Wrong loops in percent of all."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of a cell's graphs."""
-    rows: tuple[str, ...] = tuple(row for row in ROWS if row != "robust_anew" and row not in _LEARNED)
-    """Rows to measure; odometry and right_loops are always measured. robust_anew solves each block from nothing;
-    learned rows need the weights of train_graph_corrector."""
+    rows: tuple[str, ...] = tuple(row for row in ROWS if row != "robust_anew")
+    """Rows to measure; odometry and right_loops are always measured. robust_anew solves each block from nothing."""
     limit_s: int = 300
     """Computing time after which a peer is stopped; its answer is the odometry then, which counts as not solved."""
     out: Path = records.ROOT / "training" / "results"
@@ -156,7 +149,7 @@ def _measure(
     found["right_loops"] = graph_peers.within(graph_peers.least_squares, right, limit_s)
     for row in rows:
         if row in _OURS:
-            solve = correct if correct and row == "robust" else corrector(row).correct
+            solve = correct if correct and row == "robust" else _OURS[row]().correct
             began = time.process_time()
             found[row] = (solve(problem).poses, time.process_time() - began)
         elif row in PEERS and not (row == "pcm" and problem.loops.degrees.min(initial=3) < 3):
@@ -171,14 +164,6 @@ def _measure(
         numbers[row]["stopped"] = float(found[row] is None)
         numbers[row]["solved"] *= float(found[row] is not None)
     return numbers
-
-
-@cache
-def corrector(row: str) -> Corrector:
-    """The corrector of a row; a learned one has the shipped weights."""
-    if row not in _LEARNED:
-        return CrowdAware() if row == "crowd_aware" else Robust()
-    return LearnedCorrector(load_loop_attention(records.WEIGHTS / _LEARNED[row])[0])
 
 
 def _measure_online(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) -> dict[str, dict[str, float]]:

@@ -23,7 +23,6 @@ TASKS = {
     "end_to_end": "all networks of a world together",
     "ranges": "the ranges that Doom's place encoder sees in pictures",
     "loop_judge": "the judge of Doom's loops",
-    "graph_corrector": "the network of the learned corrector of pose graphs",
     "deepvo": "DeepVO, the baseline",
     "driver": "the learned driver of the 3D world, by DAgger and PPO",
 }

@@ -26,9 +26,9 @@ look alike; by one and the same offset."""
 _GROUP, _STRETCH = 10, 50
 _NEAR_M = 2.0  # of a loop's two nodes
 _PLACE_STD = 0.5
-STEP_STD = np.array((0.03, 0.03, 0.006))
+_STEP_STD = np.array((0.03, 0.03, 0.006))
 _POOR_STEP_STD = np.array((0.06, 0.04, 0.03))
-LOOP_STD = np.array((0.05, 0.05, 0.02))
+_LOOP_STD = np.array((0.05, 0.05, 0.02))
 _APART = 40  # nodes between a loop's two
 _OFFSET_M = 3.0
 _LEAST_ATE_M = 0.5  # of Manhattan, whose steps are of a metre
@@ -59,13 +59,13 @@ def synthetic(kind: str, percent: float, nodes: int, metric: bool, seed: int, ha
     A ``hard`` one has the odometry of poor wheels, and twice as many loops: its chain alone tells few of them apart.
     """
     rng = np.random.default_rng((seed, nodes, KINDS.index(kind), round(percent), int(metric)))
-    true, std = drive(nodes, rng), _POOR_STEP_STD if hard else STEP_STD
+    true, std = _drive(nodes, rng), _POOR_STEP_STD if hard else _STEP_STD
     steps = between(true[:-1], true[1:]) + rng.normal(0.0, std, (nodes - 1, 3))
     ends = np.stack((np.arange(nodes - 1), np.arange(1, nodes)), axis=1)
     chain = RelativePoses.of_deviations(ends, steps, np.tile(std, (nodes - 1, 1)))
-    pairs = right_pairs(true, rng, nodes if hard else nodes // 2, _NEAR_M if metric else _PLACE_STD)
-    relative = between(true[pairs[:, 0]], true[pairs[:, 1]]) + rng.normal(0.0, LOOP_STD, (len(pairs), 3))
-    right = RelativePoses.of_deviations(pairs, relative, np.tile(LOOP_STD, (len(pairs), 1)))
+    pairs = _right_pairs(true, rng, nodes if hard else nodes // 2, _NEAR_M if metric else _PLACE_STD)
+    relative = between(true[pairs[:, 0]], true[pairs[:, 1]]) + rng.normal(0.0, _LOOP_STD, (len(pairs), 3))
+    right = RelativePoses.of_deviations(pairs, relative, np.tile(_LOOP_STD, (len(pairs), 1)))
     loops = with_wrong(right, true, kind, percent, rng)
     if not metric:
         deviations = np.tile((_PLACE_STD, _PLACE_STD, math.inf), (len(loops), 1))
@@ -74,7 +74,7 @@ def synthetic(kind: str, percent: float, nodes: int, metric: bool, seed: int, ha
     return JudgedProblem(problem, true[:, :2], np.arange(len(loops)) < len(right))
 
 
-def drive(nodes: int, rng: np.random.Generator) -> np.ndarray:
+def _drive(nodes: int, rng: np.random.Generator) -> np.ndarray:
     """True poses ``(nodes, 3)``: half a metre a step along the streets of a square town, of nine metres a block."""
     side = max(3, round(math.sqrt(nodes / 60.0)))
     at, heading, steps = np.array((side // 2, side // 2)), 0, np.zeros((nodes - 1, 3))
@@ -91,7 +91,7 @@ def drive(nodes: int, rng: np.random.Generator) -> np.ndarray:
     return chain_poses(steps)
 
 
-def right_pairs(true: np.ndarray, rng: np.random.Generator, count: int, near_m: float) -> np.ndarray:
+def _right_pairs(true: np.ndarray, rng: np.random.Generator, count: int, near_m: float) -> np.ndarray:
     """Pairs ``(n, 2)`` of nodes near each other, the earlier one first."""
     pairs = KDTree(true[:, :2]).query_pairs(near_m, output_type="ndarray")
     apart = np.hypot(*(true[pairs[:, 0], :2] - true[pairs[:, 1], :2]).T)
@@ -140,7 +140,7 @@ def _alike(
     relative = between(true[pairs[:, 0]], seeming)
     far = (np.abs(pairs[:, 1] - pairs[:, 0]) > length) & _wrong(true, pairs, relative)
     kept = np.flatnonzero(far)[:count]
-    return pairs[kept], relative[kept] + rng.normal(0.0, 0.2 * LOOP_STD, (len(kept), 3))
+    return pairs[kept], relative[kept] + rng.normal(0.0, 0.2 * _LOOP_STD, (len(kept), 3))
 
 
 def _wrong(true: np.ndarray, pairs: np.ndarray, relative: np.ndarray) -> np.ndarray:

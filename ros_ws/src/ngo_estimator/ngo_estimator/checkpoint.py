@@ -16,7 +16,6 @@ from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.weights_file import FORMAT, CheckpointError, load_description, read_weights
 from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
-from ngo_estimator.networks.loop_attention import LoopAttention, LoopAttentionConfig
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, NeuralGraphOptimizerConfig
@@ -29,7 +28,6 @@ LOCAL, PLACE, SMOOTHER, OPTIMIZER = (
     "neural_graph_optimizer",
 )
 FAMILIARITY = "familiarity"
-LOOP_ATTENTION = "loop_attention"
 WORLD_IMAGES = {
     "maze2d": ImageFormat(height=1, width=241, channels=4, dtype="float32"),
     "maze3d": ImageFormat(height=60, width=80, channels=3, dtype="uint8"),
@@ -142,12 +140,6 @@ def load_familiarity(weights: Path, world: str | None = None) -> Familiarity | N
         if description.get(f"{kind}_sha256") != load_description(weights / f"{kind}.safetensors", kind)["sha256"]:
             raise CheckpointError(f"{path}: was fitted to another {kind} than the one beside it; fit it again")
     return familiarity
-
-
-def load_loop_attention(weights: Path) -> tuple[LoopAttention, dict[str, Any]]:
-    """The network of the learned corrector in the folder ``weights``."""
-    path = weights / f"{LOOP_ATTENTION}.safetensors"
-    return load_network(path, LOOP_ATTENTION, LoopAttention, LoopAttentionConfig)
 
 
 def write_untrained(weights: Path, world: str, image: ImageFormat | None = None) -> None:
