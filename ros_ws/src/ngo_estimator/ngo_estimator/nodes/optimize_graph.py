@@ -40,7 +40,7 @@ class Arguments:
     out: Path
     """g2o file to write; a picture and a list of all loops lie beside it."""
     corrector: Literal["robust", "crowd_aware"] = "robust"
-    """crowd_aware: a solution in which many loops at one place count as a few is tried, too; it takes twice as long."""
+    """crowd_aware: one in which many loops at one place count as a few is tried, too; it takes 2 to 3 times as long."""
     picture: bool = True
     """Whether to draw the picture."""
     overwrite: bool = False
