@@ -14,6 +14,8 @@ from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, Un
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from tests.unit.ngo_estimator.ray_casting import CORRIDOR, HALLWAY, ROOM, cast, fan, walls
+from training.data.scans import CONDITIONS
+from training.data.simulated_drives import scanned_maze_drive
 
 ANGLES = fan(181, 240.0)
 PERIOD_NS = 100_000_000
@@ -112,6 +114,13 @@ def test_without_wheels_a_robot_goes_on_where_nothing_changes() -> None:
     steps = fed(scan(hallway, pose, k, 6.0) for k, pose in enumerate(poses))
     assert steps[-1].odom_xyyaw[0] == pytest.approx(6.9, rel=0.25)
     assert steps[-1].odom_xyyaw[1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_without_wheels_a_robot_that_starts_at_once_is_followed() -> None:
+    """From a turn on the spot at 0.15 m a scan: few rays meet the walls that tell it, and all of these do."""
+    drive = scanned_maze_drive(1103, 230, CONDITIONS["noise 1 cm"])
+    steps = fed(drive.records(False))
+    assert off(steps, drive.reference.poses_xyyaw) < 0.5
 
 
 def test_a_robot_that_was_carried_while_all_was_silent_begins_a_segment() -> None:

@@ -42,7 +42,8 @@ class MixtureConfig:
     # Search: windows cover all hypotheses, within limits.
     least: float = 0.07  # no hypothesis is surer than this where the place is chosen (m, rad)
     least_share: float = 0.1  # and none rarer
-    prior_weight: float = 0.025  # of the prior's logarithm against the mean score of search_points
+    prior_weight: float = 0.025  # of the prior's logarithm against a mean score, which is less where scans usually fit:
+    usual_misfit: float = 0.05  # what their points usually lack to 1, below which it is
     search_points: int = 120
     least_window_m: float = 0.4
     least_window_deg: float = 10.0

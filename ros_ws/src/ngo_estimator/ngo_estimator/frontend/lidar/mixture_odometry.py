@@ -43,6 +43,9 @@ _UNKNOWN = np.eye(3)
 _OPEN_SHARE = 1e-6
 """Mean squared slope of the lines below which a direction is open; what normals agree on counts, however little."""
 
+_LEAST_WEIGHT = 0.1
+"""Of the prior, where each scan fits: the walls of simulators are perfect, and what follows is not."""
+
 _FEWEST = 12
 """Points without which a scan does not contradict what was seen."""
 
@@ -213,9 +216,14 @@ class MixtureOdometry:
         return self.mixture.prior(self._pose, self._covariance, None, least, share)
 
     def _weight(self, points: Array) -> float:
-        """Weight of a log likelihood against a score, which is a mean: of few points it says less."""
-        most = self.config.search_points
-        return self.config.prior_weight * most / min(len(points), most)
+        """Weight of a log likelihood against a score, which is a mean: of few points it says less.
+
+        Where scans usually fit well, a point that does not says more.
+        """
+        config = self.config
+        misfit = 1.0 - self._usual if self._usual else 1.0
+        sure = min(max(misfit / config.usual_misfit, _LEAST_WEIGHT), 1.0)
+        return config.prior_weight * sure * config.search_points / min(len(points), config.search_points)
 
     def _found(self, scan: KeyScan) -> _Mode | None:
         """The best mode, with the doubt that others leave; None where the scan fits nowhere.

@@ -66,7 +66,7 @@ class MotionMixture:
         self._steps = np.zeros((6, 3))
         self._usable = np.zeros(6, np.bool_)
         self._base = self._deviations = np.ones((6, 2))
-        self._gap = 1.0
+        self._gap, self._yaw = 1.0, 0.0
         self.filter = VelocityFilter()
         self._foretold = {k: self.filter.predicted(0.0, np.zeros(3), 1.0, np.zeros(2)) for k in (LAST, VELOCITY)}
         self._last_gap = 1.0
@@ -110,8 +110,15 @@ class MotionMixture:
         c = self._config
         grow = c.still_m, c.way_share, c.turn_m, math.radians(c.still_deg), c.turn_share, c.way_rad
         self._base, self._deviations = _grown(self._steps, self._factors, max(self._gap, 1.0), grow, c.anything)
-        for k, periods in ((LAST, self._last_gap), (VELOCITY, self._gap)):
-            self._foretold[k] = self.filter.predicted(yaw, self._steps[k], periods, self._deviations[k])
+        self._yaw = yaw
+        for k in (LAST, VELOCITY):
+            self._expect(k, 0.0)
+
+    def _expect(self, hypothesis: int, share: float) -> None:
+        """Where the velocity leads, which has become anything with a ``share`` of the probability."""
+        periods = self._last_gap if hypothesis == LAST else self._gap
+        changes = np.sqrt(self._deviations[hypothesis] ** 2 + share * self._deviations[ANY] ** 2)
+        self._foretold[hypothesis] = self.filter.predicted(self._yaw, self._steps[hypothesis], periods, changes)
 
     def prior(
         self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float], share: float = 0.0
@@ -131,8 +138,16 @@ class MotionMixture:
         return int(np.where(self._usable, self._weights, 0.0).argmax())
 
     def likeliest(self, pose: Array, mixture: Mixture) -> int:
-        """The hypothesis that is likeliest at a pose ``(3,)``."""
-        return int(np.flatnonzero(self._usable)[int(mixture.logs(pose).argmax())])
+        """The hypothesis that is likeliest at a pose ``(3,)`` under the ``mixture`` as walls measure it.
+
+        Where they measure little, a velocity that goes on is as unsure as a change of it is likely.
+        """
+        logs = mixture.logs(pose)
+        result = int(np.flatnonzero(self._usable)[int(logs.argmax())])
+        if result in (LAST, VELOCITY):
+            shares = np.exp(logs - logs.max())
+            self._expect(result, float(shares[-1] / shares.sum()))
+        return result
 
     def expected(self, hypothesis: int, pose: Array, covariance: Array) -> tuple[Array, Array]:
         """The pose ``(3,)`` that a hypothesis foretells after ``pose`` of ``covariance``, and its covariance."""
