@@ -14,7 +14,7 @@ from ngo_recordings.scan_stream import LidarScan
 _STEP_NS = 100_000_000
 _RAYS = 180
 _HALF_M = np.array([6.0, 4.0])  # of the room
-_STEP_M = 0.45
+_STEP_M = 0.35
 _STEPS = 60
 _SILENT = range(3, 13)
 """Steps without wheels: without them other things are run."""

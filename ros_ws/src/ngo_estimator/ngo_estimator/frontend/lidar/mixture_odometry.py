@@ -216,14 +216,12 @@ class MixtureOdometry:
         return self.mixture.prior(self._pose, self._covariance, None, least, share)
 
     def _weight(self, points: Array) -> float:
-        """Weight of a log likelihood against a score, which is a mean: of few points it says less.
-
-        Where scans usually fit well, a point that does not says more.
-        """
+        """Weight of a log likelihood against a score, which is a mean: of few points it says less, but neighbouring
+        points share their errors. Where scans usually fit well, a point that does not says more."""
         config = self.config
         misfit = 1.0 - self._usual if self._usual else 1.0
         sure = min(max(misfit / config.usual_misfit, _LEAST_WEIGHT), 1.0)
-        return config.prior_weight * sure * config.search_points / min(len(points), config.search_points)
+        return config.prior_weight * sure * math.sqrt(config.search_points / min(len(points), config.search_points))
 
     def _found(self, scan: KeyScan) -> _Mode | None:
         """The best mode, with the doubt that others leave; None where the scan fits nowhere.
