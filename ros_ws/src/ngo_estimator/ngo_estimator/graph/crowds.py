@@ -4,7 +4,6 @@ Where most loops of a place are wrong in one way, as by a constant offset, they 
 solution is the cheapest. Where a crowd counts as a few loops, the odometry that it bends speaks against it.
 """
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +30,7 @@ def without_crowds(problem: GraphProblem) -> GraphProblem:
 
 
 class CrowdAware:
-    """A ``Corrector`` that has more candidates than the robust one, judged by the truncated cost ``without_crowds``.
+    """A ``Corrector`` that solves the problem ``without_crowds``, too; the truncated cost of that one judges.
 
     No solution costs more by this cost than the robust one's. One that was reached warm stays.
 
@@ -44,18 +43,12 @@ class CrowdAware:
 
     def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
         """Solve a problem; see ``Corrector``."""
-        best = Robust(self._told, self._least_scale).correct(problem, start)
+        robust = Robust(self._told, self._least_scale)
+        best = robust.correct(problem, start)
         if len(problem.loops) == 0 or best.loops_from_nothing < len(problem.loops):
             return best
-        scale, fair = best.scale, without_crowds(problem.scaled(best.scale))
-        least = (1.0 - _MARGIN) * truncated_cost(fair, best.poses)
-        for poses in self.candidates(problem, fair):
-            found = finished(problem, poses, scale, self._told, self._least_scale)
-            cost = truncated_cost(fair, found.poses)
-            if cost < least:
-                best, least = found, cost
-        return best
-
-    def candidates(self, problem: GraphProblem, fair: GraphProblem) -> Iterable[np.ndarray]:
-        """Poses ``(nodes, 3)`` to go on from; ``fair`` is the problem without crowds, with variances as they are."""
-        yield Robust(self._told, self._least_scale).correct(without_crowds(problem)).poses
+        fair = without_crowds(problem.scaled(best.scale))
+        begun = robust.correct(without_crowds(problem)).poses
+        found = finished(problem, begun, best.scale, self._told, self._least_scale)
+        cheaper = truncated_cost(fair, found.poses) < (1.0 - _MARGIN) * truncated_cost(fair, best.poses)
+        return found if cheaper else best
