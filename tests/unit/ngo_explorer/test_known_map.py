@@ -57,18 +57,6 @@ def test_clearance_is_the_distance_to_the_nearest_occupied_cell() -> None:
     np.testing.assert_allclose(placed(found, found.clearance_m, values.shape, np.zeros(2)), exact, atol=1e-6)
 
 
-def test_a_part_gives_what_the_whole_gives() -> None:
-    values = random_map(np.random.default_rng(6), 140, 140)
-    whole, parts = known(), known()
-    parts.update(values, 0.05, np.zeros(2))
-    values[20:50, 30:90] = 100
-    assert parts.update_part(values[20:50, 30:90], 20, 30, np.zeros(2))
-    whole.update(values, 0.05, np.zeros(2))
-    np.testing.assert_array_equal(whole.frontier, parts.frontier)
-    np.testing.assert_array_equal(whole.clearance_m, parts.clearance_m)
-    assert not parts.update_part(values[20:50, 30:90], 20, 30, np.zeros(2)), "nothing changed"
-
-
 def test_cells_that_a_smaller_map_does_not_hold_are_unknown() -> None:
     found = known()
     found.update(np.zeros((100, 100), np.int8), 0.05, np.zeros(2))
@@ -87,12 +75,8 @@ def test_a_frontier_is_free_and_beside_the_unknown() -> None:
     np.testing.assert_array_equal(found.frontier[:9, :9], expected)
 
 
-def test_another_resolution_is_refused_and_a_part_needs_a_whole() -> None:
+def test_another_resolution_is_refused() -> None:
     found = known()
-    with pytest.raises(ValueError, match="before any map"):
-        found.update_part(np.zeros((2, 2), np.int8), 0, 0, np.zeros(2))
     found.update(np.zeros((9, 9), np.int8), 0.1, np.zeros(2))
     with pytest.raises(ValueError, match="resolution"):
         found.update(np.zeros((9, 9), np.int8), 0.05, np.zeros(2))
-    with pytest.raises(ValueError, match="outside"):
-        found.update_part(np.zeros((900, 2), np.int8), 0, 0, np.zeros(2))

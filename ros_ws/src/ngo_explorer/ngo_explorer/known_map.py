@@ -62,20 +62,6 @@ class KnownMap:
         placed[inside, across] = whole
         return self._take(placed, slice(0, placed.shape[0]), slice(0, placed.shape[1]))
 
-    def update_part(self, values: NDArray[np.int8], row: int, column: int, origin_xy: Floats) -> bool:
-        """Take a part of the last whole map, whose cell [0, 0] there is [row, column]; returns whether a cell changed.
-
-        Raises ValueError for a part that the map does not hold.
-        """
-        if self.empty:
-            raise ValueError("a part of a map came before any map")
-        own = self._offset(origin_xy)
-        low_row, low_column = row + own[0] - self._low[0], column + own[1] - self._low[1]
-        rows, columns = slice(low_row, low_row + values.shape[0]), slice(low_column, low_column + values.shape[1])
-        if low_row < 0 or low_column < 0 or rows.stop > self.state.shape[0] or columns.stop > self.state.shape[1]:
-            raise ValueError(f"a part of {values.shape} cells at row {row}, column {column} is outside of the map")
-        return self._take(_states(values), rows, columns)
-
     def points(self, cells: NDArray[np.int64]) -> Floats:
         """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
         return self._corner + (cells[:, ::-1] + 0.5) * self.resolution_m

@@ -25,7 +25,10 @@ def test_frames_follow_corrected_nodes_as_in_the_optimizer(blocks: int, behind: 
     starts, whole = steps[: blocks * BLOCK + 1 : BLOCK].unsqueeze(1), blocks * BLOCK
     in_blocks = se2.between(starts[:-1], steps[1 : whole + 1].reshape(blocks, BLOCK, 3)).unsqueeze(0)
     relative = se2.between(corrected[:-1], corrected[1:]).unsqueeze(0)
-    bent = in_block_poses(in_blocks, relative, torch.from_numpy(shares))
+    if joins.size:
+        bent = in_blocks + torch.from_numpy(shares)[..., None] * se2.wrapped(relative - in_blocks[:, :, -1])[:, :, None]
+    else:
+        bent = in_block_poses(in_blocks, relative)
     expected = torch.cat(
         (
             corrected[:1],

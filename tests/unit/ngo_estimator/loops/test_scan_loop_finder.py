@@ -152,21 +152,6 @@ def test_a_loop_in_a_corridor_is_uncertain_along_it() -> None:
     assert (along > 10.0 * across).all()
 
 
-def test_a_place_match_is_verified_where_the_robot_could_not_be() -> None:
-    scans, lost, round_length = scanned(HALLWAY, TWICE), TWICE.copy(), len(TWICE) // 2
-    lost[round_length:, :2] += (30.0, -20.0)
-    narrow = np.tile((0.1, 0.1, 0.02), (len(scans), 1))
-    config = ScanLoopConfig(reach_m=0.0, most_disagreement=math.inf, agreeing_per_deviation=0.0)
-    finders = [ScanLoopFinder(config) for _ in range(2)]
-    for count in range(round_length + 20, len(scans) + 1):
-        for finder, matches in zip(finders, ((), (count - 1 - round_length,)), strict=True):
-            finder.find(scans[:count], lost[:count], narrow[:count], matches)
-    without, with_matches = (finder.loops for finder in finders)
-    assert not without.accepted.any()
-    assert with_matches.accepted.sum() >= 3
-    assert errors(with_matches[with_matches.accepted], TWICE)[0].max() < 0.1
-
-
 def test_scans_that_see_nothing_have_no_loops() -> None:
     random = np.random.default_rng(0)
     nothing = [scan_at(outline((100, 0), (101, 0), (101, 1)), pose, random) for pose in TWICE]

@@ -14,7 +14,7 @@ from ngo_estimator.loops.scan_settings import ScanGraphConfig, ScanLoopConfig, W
         (ScanLoopConfig, "every", 0),
         (ScanLoopConfig, "least_agreeing", -1),
         (ScanLoopConfig, "least_response", 1.5),
-        (ScanLoopConfig, "match_m", math.inf),
+        (ScanLoopConfig, "range_m", math.inf),
         (ScanLoopConfig, "search_factor", 0.5),
         (ScanLoopConfig, "most_disagreement", math.nan),
         (ScanLoopConfig, "source_keys", 16),

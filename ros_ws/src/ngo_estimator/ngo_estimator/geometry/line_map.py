@@ -1,15 +1,13 @@
 """Points with normals in a grid of cells: the lines that other scans are registered to."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
+from ngo_estimator.geometry.planar_motion import Array
 
 CELL_M = 0.4
 """Side of a cell, and how far along its line a point may be from the point that it is compared with."""
@@ -28,20 +26,6 @@ class LineMap:
     first: NDArray[np.int64]
     corner: Array
     shape: tuple[int, int]
-
-
-def line_map(scans: Sequence[KeyScan], poses: Sequence[Array]) -> LineMap:
-    """The lines of scans whose base frames have the given poses ``(3,)``, in the frame of these.
-
-    Raises:
-        ValueError: there are no scans, or not one pose a scan.
-    """
-    if not scans or len(scans) != len(poses):
-        raise ValueError(f"{len(scans)} scans and {len(poses)} poses given; expected as many of both, at least one")
-    return line_map_of_points(
-        np.concatenate([transformed(pose, scan.points) for scan, pose in zip(scans, poses, strict=True)]),
-        np.concatenate([rotated(pose[2], scan.normals) for scan, pose in zip(scans, poses, strict=True)]),
-    )
 
 
 def line_map_of_points(points: Array, normals: Array) -> LineMap:

@@ -34,16 +34,13 @@ class GraphProblem:
 
     ``poses`` ``(nodes, 3)`` (m, m, rad) are where to begin; node 0 stays where it is. ``steps`` join each node to the
     next, all nodes in one piece. ``loops`` join any two; they need not know the heading, nor the position well.
-    ``trust`` ``(loops,)``, zero to one, is the belief in each loop before the graph was asked. ``similarity``
-    ``(loops, k)`` is what the sensor says of each loop beside its pose, such as the likeness of two places; a corrector
-    that cannot use it ignores it.
+    ``trust`` ``(loops,)``, zero to one, is the belief in each loop before the graph was asked.
     """
 
     poses: np.ndarray
     steps: RelativePoses
     loops: RelativePoses
     trust: np.ndarray
-    similarity: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if len(self.steps) != len(self.poses) - 1 or len(self.trust) != len(self.loops):
@@ -78,22 +75,17 @@ class CorrectedGraph:
     loop_scale: float = 1.0
     loops_from_nothing: int = 0
 
-    def information(self, steps: RelativePoses | None = None) -> NormalEquations:
-        """The factorised information of all poses, by the edges that are believed and their scales.
+    def covariance(self, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Joint covariance ``(3 n, 3 n)`` of ``n`` nodes' poses in the map, by the edges that are believed.
 
-        With ``steps`` these take the place of the problem's, as where a covariance is published that is wider.
+        Node 0, which stays where it is, has none.
         """
-        steps = self.problem.steps if steps is None else steps
         believed = self.loop_weights > 0.0
         return normal_equations(
             self.poses,
-            (steps, self.step_weights / self.step_scale),
+            (self.problem.steps, self.step_weights / self.step_scale),
             (self.problem.loops[believed], self.loop_weights[believed] / self.loop_scale),
-        )
-
-    def covariance(self, nodes: Sequence[int] | np.ndarray, steps: RelativePoses | None = None) -> np.ndarray:
-        """Joint covariance ``(3 n, 3 n)`` of ``n`` nodes' poses in the map, node 0 excepted; see ``information``."""
-        return self.information(steps).covariance(nodes)
+        ).covariance(nodes)
 
 
 class Corrector(Protocol):

@@ -134,7 +134,7 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
     # A loop that was refused is asked again where it fits, or when all are.
     fits = (scaled.loops.residuals(poses) ** 2).sum(1) <= thresholds(scaled.loops)
     asked = np.flatnonzero(believed | fits | (np.arange(len(believed)) >= old))
-    part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked], similarity=None)
+    part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked])
     poses, _ = believe(part, poses, believed[asked], map_area(poses), told=told)
     return _polished(problem, poses, start.scale, start.loops_from_nothing, least_scale)
 
@@ -142,7 +142,7 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
 def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
     """The problem with the first of these loops alone, as many as do not fill its factor."""
     while True:
-        part = replace(problem, loops=problem.loops[rows], trust=problem.trust[rows], similarity=None)
+        part = replace(problem, loops=problem.loops[rows], trust=problem.trust[rows])
         structure = GraphStructure(np.concatenate((part.steps.nodes, part.loops.nodes)), len(part.poses))
         if np.square(np.diff(structure.blocks.starts)).sum() <= _MOST_FILLED:
             return part

@@ -229,16 +229,13 @@ def _most_similar(
     return values.flatten(1), frames.flatten(1), index.repeat_interleave(chosen.shape[-1]).expand(batch, -1)
 
 
-def each_from_elsewhere(
-    values: Tensor, count: int, apart: int, none: float, places: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def each_from_elsewhere(values: Tensor, count: int, apart: int, none: float) -> tuple[Tensor, Tensor]:
     """The ``count`` best of each row ``(..., n)``, and their indices, both ``(..., count)``.
 
     Neighbours of a candidate would say the same again. Each candidate is more than ``apart`` away from the better
-    ones; where there is none left, the value is ``none``. ``places`` ``(n,)`` are the numbers that say how far
-    candidates are apart, by default their indices.
+    ones; where there is none left, the value is ``none``.
     """
-    places = torch.arange(values.shape[-1], device=values.device) if places is None else places
+    places = torch.arange(values.shape[-1], device=values.device)
     chosen = []
     for _ in range(count):
         top = values.max(dim=-1, keepdim=True)

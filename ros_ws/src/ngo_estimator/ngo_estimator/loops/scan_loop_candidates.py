@@ -54,7 +54,7 @@ def distance_windows(config: WindowConfig, distances: np.ndarray) -> np.ndarray:
 
 
 def loop_candidates(
-    config: ScanLoopConfig, views: KeyScanViews, poses: np.ndarray, windows: np.ndarray, matches: Sequence[int]
+    config: ScanLoopConfig, views: KeyScanViews, poses: np.ndarray, windows: np.ndarray
 ) -> list[LoopCandidate]:
     """Where to look for loops of the last key, best first; see ``ScanLoopFinder.find`` for what is given."""
     key = len(poses) - 1
@@ -65,21 +65,12 @@ def loop_candidates(
     places = [place for place in steps if windows[place, 0] < math.inf]
     if len(places) == 0:
         return []
-    seen = dict.fromkeys(steps[min(round(m / config.place_step), len(steps) - 1)] for m in matches if 0 <= m < last)
-    around = np.array((config.match_m, config.match_m, math.pi))
-    chosen = [LoopCandidate(p, np.zeros(3), around, windows[p]) for p in seen]
     near = nearest_places(
         views.at(poses), poses, windows, places, reach_m=config.reach_m, apart=config.submap_keys,
         most=config.most_per_key,
     )  # fmt: skip
-    taken = [candidate.place for candidate in chosen]
     wider = windows * (config.search_factor, config.search_factor, 1.0)
-    chosen += [
-        LoopCandidate(place, between(poses[place], poses[key]), wider[place], windows[place])
-        for place in near
-        if place not in taken
-    ]
-    return chosen[: config.most_per_key]
+    return [LoopCandidate(place, between(poses[place], poses[key]), wider[place], windows[place]) for place in near]
 
 
 def nearest_places(

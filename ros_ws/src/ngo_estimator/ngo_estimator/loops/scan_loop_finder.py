@@ -36,7 +36,6 @@ class ScanLoopFinder:
         scans: Sequence[KeyScan],
         poses: np.ndarray,
         windows: np.ndarray,
-        matches: Sequence[int] = (),
         segments: np.ndarray | None = None,
     ) -> np.ndarray:
         """Loops of the last key, under the present poses.
@@ -46,8 +45,6 @@ class ScanLoopFinder:
             poses: of all keys in the map ``(keys, 3)``.
             windows: half widths of the search around each key's pose, as seen from the last ``(keys, 3)`` (m, m, rad).
             segments: keys from which on scans do not lie together with those before; None: all do.
-            matches: earlier keys that look like the last one, best first. They go before those near the pose, and are
-                searched in all directions.
 
         Returns:
             Which of ``loops`` ``(n,)`` this call made acceptable, the last key's and earlier ones with which they
@@ -67,7 +64,7 @@ class ScanLoopFinder:
         if segments is not None and count - segments[-1] < config.source_keys:
             return np.zeros(0, np.int64)  # scans of two segments do not lie together
         loops = self.loops
-        for candidate in loop_candidates(config, self.views, poses, windows, matches):
+        for candidate in loop_candidates(config, self.views, poses, windows):
             loop = self._verified(scans, poses, candidate, segments)
             if loop is not None:
                 loops = loops.extended(loop)

@@ -32,8 +32,6 @@ class ScanLoopConfig:
     """How far outside of the window a place may be (m)."""
     search_factor: float = 2.0
     """Positions are searched in the window times this, at least 1, so that a second peak beside it is seen."""
-    match_m: float = 4.0
-    """Half width of the search around a place that a match of places gives (m)."""
     range_m: float = 20.0
     """Distance from the robot up to which points take part in the search (m); it bounds the memory."""
     most_submaps: int = 24
@@ -66,7 +64,7 @@ class ScanLoopConfig:
         _check(self, "most_per_key least_agreeing neighbour_keys", "at least 0", lambda x: x >= 0)
         ratios = "least_response most_second least_on_lines most_seen_through"
         _check(self, ratios, "a ratio from 0 to 1", lambda x: 0.0 <= x <= 1.0)
-        lengths = "least_gap_m reach_m match_m range_m agreement_m agreement_deg agreeing_per_deviation"
+        lengths = "least_gap_m reach_m range_m agreement_m agreement_deg agreeing_per_deviation"
         _check(self, lengths, "a finite number from 0 on", lambda x: 0.0 <= x < math.inf)
         _check(self, "search_factor", "a finite number of at least 1", lambda x: 1.0 <= x < math.inf)
         _check(self, "most_disagreement", "a number from 0 on", lambda x: x >= 0.0)

@@ -14,5 +14,5 @@ M iterations                                           ``neural_graph_optimizer.
 Not in the paper, whose attention has to learn loop closures: ``registered_odometry`` measures the odometry again before
 the first iteration, ``loop_judge`` and ``loop_gates`` say which loops to trust, and each iteration ends with a
 Gauss-Newton step of ``loop_closing`` that closes them. ``warm_start`` goes on from an earlier optimisation,
-``whole_trajectory`` is the optimizer offline, and ``neural_corrector`` the optimizer for pose graphs of any sensor.
+and ``whole_trajectory`` is the optimizer offline.
 """

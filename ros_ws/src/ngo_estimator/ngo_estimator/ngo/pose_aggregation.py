@@ -99,7 +99,7 @@ def block_variances(in_blocks: Tensor, log_std: Tensor) -> Tensor:
     return torch.stack((x, y, heading), dim=-1).sum(-2)
 
 
-def in_block_poses(in_blocks: Tensor, meta_relative: Tensor, share: Tensor | None = None) -> Tensor:
+def in_block_poses(in_blocks: Tensor, meta_relative: Tensor) -> Tensor:
     """Poses within blocks ``(batch, blocks, block, 3)`` under corrected relative meta-poses.
 
     A block's correction is spread evenly over its steps, so that the trajectory stays continuous.
@@ -107,12 +107,10 @@ def in_block_poses(in_blocks: Tensor, meta_relative: Tensor, share: Tensor | Non
     Args:
         in_blocks: uncorrected poses within blocks ``(batch, blocks, block, 3)``.
         meta_relative: corrected relative meta-poses ``(batch, blocks, 3)``.
-        share: of the correction in that of each step ``(blocks, block)``, where it is not spread evenly.
     """
     block = in_blocks.shape[2]
     correction = se2.wrapped(meta_relative - in_blocks[..., -1, :])
-    if share is None:
-        share = torch.arange(1, block + 1, dtype=in_blocks.dtype, device=in_blocks.device) / block
+    share = torch.arange(1, block + 1, dtype=in_blocks.dtype, device=in_blocks.device) / block
     return in_blocks + share[..., None] * correction.unsqueeze(-2)
 
 

@@ -52,8 +52,8 @@ def test_first_frame_gives_nothing_and_each_later_one_a_motion(world: str) -> No
         assert estimate.place_code.shape == (16,) and estimate.place_code.dtype == np.float32
         pose = se2.compose(pose, torch.from_numpy(estimate.relative_xyyaw))
         np.testing.assert_allclose(estimate.odom_xyyaw, pose.numpy(), atol=1e-12)
-    assert odometry.world == world and odometry.image_shape == images[0].shape
-    assert odometry.image_dtype == images.dtype.name and odometry.uses_action and odometry.period_s == 0.1
+    assert odometry.world == world and odometry.image_format.shape == images[0].shape
+    assert odometry.image_format.dtype == images.dtype.name and odometry.uses_action and odometry.period_s == 0.1
 
 
 def test_estimates_are_those_of_the_networks() -> None:

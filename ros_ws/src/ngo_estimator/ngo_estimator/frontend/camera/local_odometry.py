@@ -72,16 +72,6 @@ class LocalOdometry:
         return self._network.config.image
 
     @property
-    def image_shape(self) -> tuple[int, int, int]:
-        """``(height, width, channels)`` of the frames that the networks were trained on."""
-        return self._network.config.image.shape
-
-    @property
-    def image_dtype(self) -> str:
-        """``uint8`` or ``float32``."""
-        return self._network.config.image.dtype
-
-    @property
     def uses_action(self) -> bool:
         """Whether each frame after the first needs the action that led to it."""
         return self._network.config.actions > 0
@@ -114,7 +104,7 @@ class LocalOdometry:
 
         Args:
             stamp_ns: time of the frame.
-            image: ``image_shape`` of ``image_dtype``.
+            image: of ``image_format``.
             action: the action between the last frame and this one; ignored for the first frame.
             twist: ``(3,)`` mean velocity (m/s, m/s, rad/s) between the two, where the networks take it; likewise.
 
