@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.loops import online_loops
+from ngo_estimator.loops import place_loop_finder
 from ngo_estimator.loops.place_ambiguity import FEWEST_PLACES, looks_like_everything, places_by_odometry
 from ngo_estimator.ngo.loop_gates import FARTHEST, without_contradictions
 from ngo_estimator.ngo.meta_poses import MetaSteps
@@ -39,7 +39,7 @@ def test_no_number_of_loops_wins_over_confident_odometry(
 ) -> None:
     """All frames of a straight drive look the same."""
     if not ambiguity:
-        monkeypatch.setattr(online_loops, "looks_like_everything", lambda *_: torch.tensor(False))
+        monkeypatch.setattr(place_loop_finder, "looks_like_everything", lambda *_: torch.tensor(False))
     x, deviation, believed = straight_on("maze2d", value)
     assert believed == 0 and abs(x - STEPS * STEP_M) < 3.0 * max(deviation, 0.02)
 

@@ -10,7 +10,7 @@ import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
-from ngo_estimator.loops.online_loops import OnlineLoops
+from ngo_estimator.loops.place_loop_finder import PlaceLoopFinder
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.slam import odometry_blocks
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
@@ -77,17 +77,16 @@ def test_huge_variances_and_unusual_codes_break_nothing(
     ("owner", "name", "complaint"),
     [
         (odometry_blocks, "registered_steps", "the registration of steps failed, LinAlgError: singular"),
-        (OnlineLoops, "look", "the search for loops failed, LinAlgError: singular"),
-        (OnlineLoops, "measure", "the search for loops failed, LinAlgError: singular"),
-        (OnlineLoops, "find_overlaps", "the search for loops failed, LinAlgError: singular"),
-        (OnlineLoops, "loops", "an optimisation failed, LinAlgError: singular"),
+        (PlaceLoopFinder, "_find_places", "the search for loops failed, LinAlgError: singular"),
+        (PlaceLoopFinder, "_find_overlaps", "the search for loops failed, LinAlgError: singular"),
+        (PlaceLoopFinder, "for_optimizer", "an optimisation failed, LinAlgError: singular"),
         (NeuralGraphOptimizer, "iterate", "an optimisation failed, LinAlgError: singular"),
     ],
 )
 def test_what_fails_once_is_said_once_and_costs_nothing_else(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, complaint: str
 ) -> None:
-    core = request.getfixturevalue("maze3d" if name == "find_overlaps" else "maze2d")
+    core = request.getfixturevalue("maze3d" if name == "_find_overlaps" else "maze2d")
     whole, calls = getattr(owner, name), 0
 
     def fails_once(*arguments: Any, **named: Any) -> Any:

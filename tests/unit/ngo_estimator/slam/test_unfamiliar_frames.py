@@ -103,7 +103,7 @@ def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_lef
     monkeypatch.setattr(core._optimizer, "iterate", remembered)
     for step in blind:
         assert not core.update(step).fault
-        behind.append(graph._nodes.first > 11 and graph._shrunk)
+        behind.append(graph._first > 11 and graph._shrunk)
     assert any(behind) and differences
     assert max(differences) < 1e-4
 

@@ -4,7 +4,7 @@ Poses that leave the window come here. When there are too many, those go whose p
 forms a chain from the origin to the window, so that a correction reaches everything between.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,12 +23,11 @@ _STEPS_APART = 2.0
 class KeyFrame:
     """A pose that leaves the window, and the block of frames behind it.
 
-    ``node`` counts the blocks before it. ``relative`` ``(3,)`` is the next pose as seen from it, with ``variance``
-    ``(3,)`` along its axes. ``embeddings`` ``(block, embedding_size)`` are of the block's frames; ``codes``
-    ``(frames, code_length)`` and ``poses`` ``(frames, 3)``, as seen from it, also of some frames before and behind.
+    ``relative`` ``(3,)`` is the next pose as seen from it, with ``variance`` ``(3,)`` along its axes. ``embeddings``
+    ``(block, embedding_size)`` are of the block's frames; ``codes`` ``(frames, code_length)`` and ``poses``
+    ``(frames, 3)``, as seen from it, also of some frames before and behind.
     """
 
-    node: int
     relative: np.ndarray
     variance: np.ndarray
     embeddings: np.ndarray
@@ -55,11 +54,6 @@ class KeyFrames:
         return len(self._frames) >= self._capacity + SLACK
 
     @property
-    def nodes(self) -> np.ndarray:
-        """How many blocks lie before each ``(n,)``, ascending."""
-        return self._stack("node", (0,), np.int64)
-
-    @property
     def relative(self) -> np.ndarray:
         """The pose after each one, which is the next or where the window begins, as seen from it ``(n, 3)``."""
         return self._stack("relative", (0, 3))
@@ -80,10 +74,6 @@ class KeyFrames:
 
     def add(self, frame: KeyFrame) -> None:
         """Add a pose behind all others."""
-        if self._frames and frame.node <= self._frames[-1].node:
-            raise ValueError(
-                f"key frame of node {frame.node} after that of {self._frames[-1].node}; expected a later one"
-            )
         self._frames.append(frame)
         self._stacked = {}
 
@@ -101,7 +91,7 @@ class KeyFrames:
         relative, variance = _merged(poses, self.variance, index)
         merged = np.diff(np.append(index, len(poses))) > 1
         self._frames = [
-            KeyFrame(f.node, relative[k], variance[k], f.embeddings, f.codes, f.poses) if merged[k] else f
+            replace(f, relative=relative[k], variance=variance[k]) if merged[k] else f
             for k, f in enumerate(self._frames[i] for i in index)
         ]
         self._stacked = {}
@@ -112,7 +102,7 @@ class KeyFrames:
         if not self._frames:
             return {}
         codes, poses = (np.stack([getattr(frame, name) for frame in self._frames]) for name in ("codes", "poses"))
-        own = {name: getattr(self, name) for name in ("nodes", "relative", "variance", "embeddings")}
+        own = {name: getattr(self, name) for name in ("relative", "variance", "embeddings")}
         return {**own, "codes": codes, "poses": poses}
 
     def restore(self, arrays: Arrays) -> None:
@@ -120,21 +110,19 @@ class KeyFrames:
         self._frames, self._stacked = [], {}
         if not arrays:
             return
-        nodes = taken(arrays, "nodes", np.int64, -1)
-        count = len(nodes)
         columns = (
-            taken(arrays, "relative", np.float64, count, 3),
-            taken(arrays, "variance", np.float64, count, 3),
+            relative := taken(arrays, "relative", np.float64, -1, 3),
+            taken(arrays, "variance", np.float64, count := len(relative), 3),
             taken(arrays, "embeddings", np.float32, count, -1, -1),
             codes := taken(arrays, "codes", np.float32, count, -1, -1),
             taken(arrays, "poses", np.float64, count, codes.shape[1], 3),
         )
-        self._frames = [KeyFrame(node, *rows) for node, *rows in zip(nodes.tolist(), *columns, strict=True)]
+        self._frames = [KeyFrame(*rows) for rows in zip(*columns, strict=True)]
 
-    def _stack(self, name: str, empty: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
+    def _stack(self, name: str, empty: tuple[int, ...]) -> np.ndarray:
         if name not in self._stacked:
             rows = [getattr(frame, name) for frame in self._frames]
-            self._stacked[name] = np.array(rows) if rows else np.zeros(empty, dtype)
+            self._stacked[name] = np.array(rows) if rows else np.zeros(empty)
         return self._stacked[name]
 
 

@@ -102,17 +102,6 @@ def measure_pairs(
             torch.cat((a.unsqueeze(0), b)) for a, b in zip(first, (measured, log_scale), strict=True)
         )
         logit = measured.new_zeros(measured.shape[1:-1])
-    return registered(pair_head, views, measured, log_scale, registrations), logit
-
-
-def registered(
-    pair_head: PairHead, views: PairViews, measured: Tensor, log_scale: Tensor, registrations: int
-) -> PairMeasurement:
-    """The second half of ``measure_pairs``, behind the pair head.
-
-    Args:
-        measured, log_scale: what the pair head says of each view ``(views, ..., 3)`` and ``(views, ..., 2)``.
-    """
     if len(views.a) > 1:
         measured = se2.compose(se2.compose(views.from_a, measured), views.to_b)
         fused = fuse_views(measured, log_scale)
@@ -122,7 +111,7 @@ def registered(
     if registrations:
         pose, scale = pair_head.register(views.a[0], views.b[0], fused.measured, fused.log_scale, registrations)
         fused = PairMeasurement(pose, scale, fused.spread)
-    return fused
+    return fused, logit
 
 
 def measure_overlaps(

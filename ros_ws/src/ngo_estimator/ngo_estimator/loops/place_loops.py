@@ -23,7 +23,7 @@ _BELIEVED = 0.1
 
 @dataclass(frozen=True)
 class PlaceLoops(LoopRecord):
-    """Loops that places or shared walls show, between nodes that count the blocks from the beginning of the trajectory.
+    """Loops that places or shared walls show, between nodes of the graph.
 
     ``frame`` ``(n,)`` is the earlier frame, as the number of steps before it. ``log_scale`` ``(n, 2)``, ``spread``
     ``(n, 2)``, ``logit`` ``(n,)`` and ``similarity`` ``(n,)`` are as of ``Loops``. ``most_drift`` ``(n, 3)`` is
@@ -107,24 +107,20 @@ class PlaceLoops(LoopRecord):
         forward = (self.start >= 0) & (self.start < self.end) & (self.frame >= -1)
         require(bool(forward.all()), "a loop does not lead from an earlier node to a later one")
 
-    def for_optimizer(self, keys: np.ndarray, first: int, embeddings: np.ndarray) -> Loops:
-        """The record in float32, numbered as the optimizer counts: key frames, and the nodes of the window behind them.
+    def for_optimizer(self, length: np.ndarray, embeddings: np.ndarray) -> Loops:
+        """The record in float32.
 
         Args:
-            keys: nodes of the key frames ``(k,)``; first: the node where the window begins.
+            length: blocks on each loop ``(n,)``.
             embeddings: of the frames at the ends of the window's blocks ``(blocks, embedding_size)``.
         """
-
-        def index(nodes: np.ndarray) -> np.ndarray:
-            behind = nodes + (len(keys) - first)
-            return np.where(nodes >= first, behind, np.searchsorted(keys, nodes)) if len(keys) else behind
 
         def single(values: np.ndarray) -> Tensor:
             return _batch(values.astype(np.float32))
 
         return Loops(
-            start=_batch(index(self.start)),
-            end=_batch(index(self.end) - 1),
+            start=_batch(self.start),
+            end=_batch(self.end - 1),
             frame=_batch(self.frame),
             measured=single(self.relative),
             log_scale=single(self.log_scale),
@@ -134,36 +130,31 @@ class PlaceLoops(LoopRecord):
             valid=torch.ones(1, len(self), dtype=torch.bool),
             embeddings=_batch(embeddings),
             by_poses=_batch(self.overlap),
-            length=_batch(self.end - self.start),
+            length=_batch(length),
             most_drift=single(self.most_drift),
         )
 
-    def reattached(
-        self, nodes: np.ndarray, stay: np.ndarray, poses: np.ndarray, variance: np.ndarray, block: int
-    ) -> PlaceLoops:
+    def thinned(self, keep: np.ndarray, poses: np.ndarray, variance: np.ndarray, begins: np.ndarray) -> PlaceLoops:
         """The loops after key frames went: each loop of such a key frame now begins or ends at the one before it.
 
         Args:
-            nodes: of all key frames ``(k,)``, with their ``poses`` ``(k, 3)`` and the ``variance`` ``(k, 3)`` of the
-                relative pose from each to the next.
-            stay: which of them stay ``(k,)``.
-            block: steps in a block.
+            keep: which nodes stay ``(nodes,)``.
+            poses: of the key frames, the first nodes ``(k, 3)``, with the ``variance`` ``(k, 3)`` of the relative pose
+                from each to the next.
+            begins: numbers of the steps with which the blocks behind the nodes begin ``(nodes,)``.
         """
-        staying = np.flatnonzero(stay)
-        target = staying[np.searchsorted(staying, np.arange(len(nodes)), side="right") - 1]
+        staying, number = np.flatnonzero(keep), np.cumsum(keep) - 1
         drift = np.concatenate((np.zeros((1, 3)), np.cumsum(variance, axis=0)))
         measured, log_scale = self.relative.copy(), self.log_scale.copy()
         frame, pairs = self.frame.copy(), self.pairs.copy()
         for side, old in enumerate(pairs.T):
-            index = np.searchsorted(nodes, old)
-            gone = np.flatnonzero((index < len(nodes)) & (old <= nodes[-1]))
-            gone = gone[target[index[gone]] != index[gone]]
-            here, there = index[gone], target[index[gone]]
+            gone = np.flatnonzero(~keep[old])
+            here, there = old[gone], staying[number[old[gone]]]
             moved = torch.from_numpy(measured[gone])
             ends_at = [torch.from_numpy(poses[k]) for k in (there, here)]
             if side == 0:
                 moved = se2.compose(se2.between(*ends_at), moved)
-                frame[gone] = nodes[there] * block - 1
+                frame[gone] = begins[there] - 1
             else:
                 moved = se2.compose(moved, se2.between(*reversed(ends_at)))
             more = drift[here] - drift[there]
@@ -172,14 +163,14 @@ class PlaceLoops(LoopRecord):
             scales = np.stack((more[:, :2].mean(1) + more[:, 2] * lever, more[:, 2]), axis=1)
             measured[gone] = moved.numpy()
             log_scale[gone] = 0.5 * np.log(np.exp(2.0 * log_scale[gone]) + scales)
-            old[gone] = nodes[there]
-        moved_loops = replace(self, pairs=pairs, relative=measured, frame=frame, log_scale=log_scale)
+            old[gone] = there
+        moved_loops = replace(self, pairs=number[pairs], relative=measured, frame=frame, log_scale=log_scale)
         start, end = pairs.T
         distinct = start < end
         # Of several loops between the same two key frames the likeliest one says nearly all.
         order = np.lexsort((-self.logit, end, start))
         again = (np.diff(start[order]) == 0) & (np.diff(end[order]) == 0)
-        distinct[order[1:][again & (end[order[1:]] <= nodes[-1])]] = False
+        distinct[order[1:][again & (end[order[1:]] < len(poses))]] = False
         return moved_loops[distinct]
 
 

@@ -160,8 +160,9 @@ class OdometryBlocks:
         variance: np.ndarray = np.exp(2.0 * log_std.astype(np.float64))[~familiar].sum(axis=0) * self._scale
         return variance
 
-    def aggregate(self, block: int) -> None:
+    def aggregate(self) -> None:
         """Features and smoothed odometry of the blocks that the newest one changes, and of itself."""
+        block = self.blocks - 1
         if not self._optimizer.config.network and self._optimizer.config.smoother is None:
             return
         changed = max(0, min(block, self._recalled) - self._context)
@@ -194,7 +195,7 @@ class OdometryBlocks:
             and {len(getattr(self, name)) for name in self._OF_STEPS} == {steps}
             and {len(getattr(self, name)) for name in self._OF_BLOCKS} == {blocks}
             and len(self._frames) == steps + 1
-            and np.array_equal(self._frames.nodes, self._block * np.arange(blocks + 1)),
+            and self._frames.nodes[-1] == self._block * blocks,
             f"{steps} steps and {blocks} meta-poses do not belong together",
         )
         require(self._recalled >= 0, f"frames are recalled from meta-pose {self._recalled} on")

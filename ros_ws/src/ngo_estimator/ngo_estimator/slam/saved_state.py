@@ -17,7 +17,7 @@ from safetensors.numpy import load, save
 from ngo_common.files import PARTIAL, sync_names, write_whole
 from ngo_estimator.data.state_arrays import Arrays, StateError
 
-FORMAT = 9
+FORMAT = 10
 DESCRIPTION = "state.json"
 _KEYS = {"format", "identity", "arrays", "arrays_sha256", "sha256"}
 
