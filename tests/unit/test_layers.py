@@ -189,39 +189,42 @@ def test_no_import_crosses_a_layer() -> None:
     assert list(crossings(imports)) == []
 
 
+# Modules that planted imports reach.
+KNOWN = ("ngo_sim.episodes", "ngo_sim.routes", "training.train_local", "training.data.worlds", "training.report.tables")
+
+
 @pytest.mark.parametrize(
     ("module", "source", "complaint"),
     [
         ("ngo_sim.mazes", "import rclpy", "only nodes know of ROS"),
         ("ngo_sim.mazes", "def late():\n    from nav_msgs.msg import Path", "only nodes know of ROS"),
-        ("ngo_sim.maze3d", "import vizdoom as vzd", "only ngo_sim.doom_engine does"),
         ("training.data", "import vizdoom", "only ngo_sim.doom_engine does"),
         ("ngo_estimator.view.live_view", "import rerun as rr", "only ngo_estimator.view.rerun_view does"),
         ("ngo_sim.nodes.maze2d_node", "from ngo_estimator.geometry import se2", "the packages meet"),
         ("ngo_estimator.data.a", "import importlib\nimportlib.import_module('ngo_sim.mazes')", "the packages meet"),
+        ("ngo_common.settings", "from ngo_recordings import errors", "the packages meet"),
         ("ngo_estimator.geometry.se2", "from training import losses", "not installed with it"),
-        ("ngo_recordings.frames", "from ngo_estimator.geometry import se2", "the packages meet"),
-        ("ngo_recordings.frames", "import rclpy", "only nodes know of ROS"),
         ("training.evaluate", "from ngo_estimator.nodes import ngo_node", "nothing imports a node"),
-        (
-            "ngo_estimator.frontend.rejected_frames",
-            "from ..nodes.local_node import LocalNode",
-            "nothing imports a node",
-        ),
-        ("benchmarks.online", "from ngo_estimator.nodes.ngo_node import NgoNode", "nothing imports a node"),
+        ("ngo_estimator.frontend.camera", "from ..nodes.local_node import LocalNode", "nothing imports a node"),
         ("ngo_sim.mazes", "from .episodes import Episode", "later layer"),
         ("ngo_sim.lidar", "from ngo_sim.routes import RouteMap", "later layer"),
-        ("ngo_common.settings", "import rclpy", "only nodes know of ROS"),
-        ("ngo_common.settings", "from ngo_recordings import errors", "the packages meet"),
-        ("ngo_common.nodes.process", "from ngo_sim import mazes", "the packages meet"),
-        ("ngo_sim.maze2d", "from ngo_common.nodes.process import run_node", "nothing imports a node"),
+        ("training.data.feature_store", "from training import train_local", "a command"),
+        ("training.common.runs", "from training.data import worlds", "later layer"),
+        ("training.scoring.metrics", "from training.report.tables import Table", "later layer"),
+        ("ngo_sim.doom_engine", "import vizdoom", None),
+        ("ngo_sim.nodes.maze2d_node", "import rclpy\nfrom ngo_sim.maze2d import Maze2D\nfrom . import a", None),
+        ("training.data", "from ngo_sim import episodes\nfrom ngo_estimator.geometry import se2", None),
+        ("benchmarks.online", "from ngo_estimator.nodes.path_message import PathWriter", None),
+        ("training.results", "from training import train_local", None),
     ],
 )
-def test_a_planted_crossing_is_caught(module: str, source: str, complaint: str) -> None:
-    imports = {"ngo_sim.episodes": set[str](), "ngo_sim.routes": set[str](), module: imported_names(source, module)}
+def test_a_planted_crossing_is_caught_and_an_allowed_import_is_not(
+    module: str, source: str, complaint: str | None
+) -> None:
+    imports = {**{name: set[str]() for name in KNOWN}, module: imported_names(source, module)}
     found = list(crossings(imports))
-    assert found, f"nothing was found in: {source}"
-    assert all(complaint in line for line in found)
+    assert bool(found) == (complaint is not None)
+    assert all(str(complaint) in line for line in found)
 
 
 def test_a_crossing_through_other_modules_is_caught() -> None:
@@ -233,42 +236,6 @@ def test_a_crossing_through_other_modules_is_caught() -> None:
     assert list(crossings(imports)) == [
         "ngo_estimator.geometry.se2 reaches ngo_estimator.slam.online_trajectory: it is of a later layer"
     ]
-
-
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("ngo_sim.doom_engine", "import vizdoom"),
-        ("ngo_sim.nodes.maze2d_node", "import rclpy\nfrom ngo_sim.maze2d import Maze2D\nfrom . import parameters"),
-        ("training.data", "from ngo_sim import episodes\nfrom ngo_estimator.geometry import se2"),
-        ("benchmarks.online", "from ngo_estimator.nodes.path_message import PathWriter"),
-        ("tests.ros.test_path", "from ngo_estimator.nodes import path_message"),
-        ("ngo_estimator.frontend.camera.local_odometry", "from ngo_estimator.checkpoint import load_checkpoint"),
-        ("ngo_sim.nodes.maze2d_node", "from ngo_recordings.writer import RecordingWriter"),
-        ("ngo_sim.maze2d", "from ngo_common.settings import setting"),
-        ("ngo_sim.nodes.maze2d_node", "from ngo_common.nodes.process import run_node"),
-    ],
-)
-def test_an_allowed_import_is_not_reported(module: str, source: str) -> None:
-    assert list(crossings({module: imported_names(source, module)})) == []
-
-
-@pytest.mark.parametrize(
-    ("module", "source", "complaint"),
-    [
-        ("training.data.feature_store", "from training import train_local", "a command"),
-        ("training.report.tables", "from training.results import main", "a command"),
-        ("training.report.tables", "import importlib\nimportlib.import_module('training.results')", "a command"),
-        ("training.common.runs", "from training.data import worlds", "later layer"),
-        ("training.baselines.pose_graph", "from training.scoring.metrics import trajectory_error", "later layer"),
-        ("training.scoring.metrics", "from training.report.tables import Table", "later layer"),
-    ],
-)
-def test_a_planted_crossing_in_the_training_is_caught(module: str, source: str, complaint: str) -> None:
-    known = ("train_local", "results", "data.worlds", "scoring.metrics", "report.tables")
-    imports = {**{f"training.{name}": set[str]() for name in known}, module: imported_names(source, module)}
-    (found,) = crossings(imports)
-    assert complaint in found
 
 
 def test_every_folder_of_the_training_has_a_layer() -> None:
@@ -283,14 +250,3 @@ def test_demo_benchmarks_and_evaluation_start_without_the_framework_of_trainings
     reached = set(starts).union(*(reached_from(start, imports) for start in starts))
     assert "training.common.records" in reached and len(starts) > 5
     assert [name for name in sorted(reached) if any(is_below(one, "lightning") for one in imports[name])] == []
-
-
-def test_a_command_may_import_a_command() -> None:
-    imports = {"training.results": {"training.prerequisites"}, "training.prerequisites": set[str]()}
-    assert list(crossings(imports)) == []
-
-
-def test_relative_imports_are_resolved() -> None:
-    source = "from . import a\nfrom .b import c\nfrom .. import d"
-    assert imported_names(source, "p.q.r") == {"p.q", "p.q.a", "p.q.b", "p.q.b.c", "p", "p.d"}
-    assert imported_names("from . import a", "p.q", is_package=True) == {"p.q", "p.q.a"}
