@@ -1,6 +1,5 @@
 """What people do with ngo_node: start and stop it, ask and tell it things, and run several of it."""
 
-import os
 import signal
 import time
 from collections.abc import Iterator
@@ -148,15 +147,7 @@ def test_a_trajectory_that_cannot_be_saved_is_said_in_one_line(optimizer: Optimi
     assert not list(tmp_path.iterdir())
 
 
-def test_no_path_ends_the_node_or_leads_out_of_its_folder(optimizer: Optimizer, tmp_path: Path) -> None:
-    optimizer.pose_after(*optimizer.drive().steps(1, 9))
-    os.mkfifo(tmp_path / "pipe.tum")
-    (tmp_path / "out.tum").symlink_to("/tmp/outside.tum")
-    refused = ["~nosuchuser/a.tum", "/a.tum", f"{tmp_path}/../../../a.tum", "a\0.tum", "", "x" * 5000]
-    for path in [*refused, str(tmp_path / "pipe.tum"), str(tmp_path / "out.tum")]:
-        response = optimizer.probe.call(SaveTrajectory, "ngo_node/save_trajectory", SaveTrajectory.Request(path=path))
-        assert not response.success and response.message and "\n" not in response.message, path
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.tum", "pipe.tum"]
+# ---- where the map is
 
 
 def test_two_hundred_calls_at_once_are_all_answered(optimizer: Optimizer, tmp_path: Path) -> None:
@@ -170,9 +161,6 @@ def test_two_hundred_calls_at_once_are_all_answered(optimizer: Optimizer, tmp_pa
     optimizer.probe.node.destroy_client(client)
     assert all(answer.result().success for answer in answers)
     assert len(list(tmp_path.iterdir())) == 7
-
-
-# ---- where the map is
 
 
 def test_an_initial_pose_moves_pose_path_and_transform(optimizer: Optimizer) -> None:

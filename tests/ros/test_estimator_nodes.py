@@ -13,26 +13,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from evo.tools import file_interface
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset, SaveTrajectory
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
-from visualization_msgs.msg import Marker
 
-from ngo_common.nodes.parameters import LiveSettings
-from ngo_common.settings import BadParameter, Settings
 from ngo_estimator.checkpoint import write_untrained
-from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
+from ngo_estimator.frontend.camera.local_odometry import AT_ONCE
 from ngo_estimator.nodes.messages import relative_step, to_ns, to_time
 from ngo_estimator.nodes.path_message import plain_path
-from ngo_estimator.nodes.settings import LocalNodeSettings, NgoNodeSettings
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .estimator_graph import FIRST_RUN_NS, STEP_NS, Graph, image_message, scan
-from .processes import NodeProcess, Probe, own_node, wait_until
+from .processes import NodeProcess, Probe, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -123,43 +118,6 @@ def test_transforms_connect_map_to_base_link(graph: Graph) -> None:
     assert odom_from_base.rotation == graph.out.odometry[-1].pose.pose.orientation
 
 
-def test_loops_are_lines_between_poses(graph: Graph) -> None:
-    graph.finish_run(frames=100)
-    (marker,) = graph.out.loops[-1].markers
-    assert marker.header.frame_id == "map"
-    assert (marker.type, marker.action) in ((Marker.LINE_LIST, Marker.ADD), (0, Marker.DELETE))
-    assert len(marker.points) % 2 == 0
-    assert len(marker.colors) == len(marker.points)
-
-
-def test_a_lost_frame_is_bridged(graph: Graph) -> None:
-    graph.start_run()
-    graph.play(0, 1, 2)
-    graph.action(2)
-    graph.play(4, 5)
-    graph.wait_for_step(5)
-    assert graph.steps() == [(0, 1), (1, 2), (2, 4), (4, 5)]
-    core = LocalOdometry.load(graph.weights)
-    for older, newer in ((0, 0), (0, 1), (1, 2), (2, 4)):
-        estimate = core.update(graph.stamp_ns(newer), scan(newer), older % 3)
-    assert estimate is not None
-    np.testing.assert_allclose(graph.out.relative_poses[2].x, estimate.relative_xyyaw[0], atol=1e-6)
-    assert len(graph.out.trajectories[-1].x) == 5
-
-
-def test_doubled_and_late_frames_change_nothing(graph: Graph) -> None:
-    graph.start_run()
-    graph.play(0, 1, 2, 3)
-    graph.frame(3)
-    graph.frame(1)
-    graph.play(4)
-    graph.wait_for_step(4)
-    assert graph.steps() == [(0, 1), (1, 2), (2, 3), (3, 4)]
-    for estimate, message in zip(graph.expected(0, 1, 2, 3, 4), graph.out.relative_poses, strict=True):
-        np.testing.assert_allclose(message.odom_x, estimate.odom_xyyaw[0], atol=1e-6)
-    graph.local.wait_for_log("dropped image: .*(came twice|older than the last)")
-
-
 def unusable_images() -> list[Image]:
     """Images of the wrong size, encoding or length, or with colours that are not finite."""
     with_nan = scan(2)
@@ -191,21 +149,6 @@ def test_unusable_images_are_dropped_and_counted(graph: Graph) -> None:
     assert graph.local.running
 
 
-def test_a_late_action_delays_its_frame_and_a_lost_one_drops_it(graph: Graph) -> None:
-    graph.start_run()
-    graph.play(0)
-    graph.frame(1)
-    graph.action(0)  # late
-    graph.frame(2)  # action 1 is lost
-    graph.action(2, action=7)  # no action
-    graph.action(2)
-    graph.play(3, 4)
-    graph.wait_for_step(4)
-    assert graph.steps() == [(0, 1), (1, 3), (3, 4)]
-    graph.local.wait_for_log("dropped image without action: the action on 'action' that led to it did not come")
-    graph.local.wait_for_log("dropped action: action is 7; expected one of")
-
-
 def test_a_node_that_fell_behind_takes_several_frames_at_once_in_order(graph: Graph) -> None:
     graph.start_run()
     graph.play(0, 1)
@@ -232,21 +175,6 @@ def test_a_restarted_source_starts_both_anew_with_one_line_each(graph: Graph) ->
     assert graph.out.odometry[0].pose.covariance[0] == pytest.approx(graph.out.relative_poses[0].covariance[0])
     for process, count in before.items():
         wait_until(lambda: process.log.count("restarted, so") == count + 1, f"one line of {process.name}")  # noqa: B023
-
-
-def test_saved_trajectory_is_what_was_published(graph: Graph, tmp_path: Path) -> None:
-    graph.finish_run(frames=9)
-
-    request = SaveTrajectory.Request(path=str(tmp_path / "path.tum"))
-    response = graph.probe.call(SaveTrajectory, "ngo_node/save_trajectory", request)
-    assert response.success, response.message
-    assert response.message == f"wrote 9 poses to {tmp_path / 'path.tum'}"
-    saved, published = (
-        file_interface.read_tum_trajectory_file(str(tmp_path / "path.tum")),
-        graph.out.trajectories[-1],
-    )
-    np.testing.assert_allclose(saved.timestamps, np.array(published.stamps_ns) / 1e9)
-    np.testing.assert_allclose(saved.positions_xyz[:, 0], published.x, atol=1e-8)
 
 
 def test_reset_forgets_the_trajectory(graph: Graph, tmp_path: Path) -> None:
@@ -386,31 +314,6 @@ def assert_refused(process: NodeProcess, pattern: str) -> None:
 def test_a_bad_parameter_ends_the_start_with_one_line_and_code_two() -> None:
     with NodeProcess("ngo_estimator", "local_node", {"wrld": "maze2d"}) as process:
         assert_refused(process, "parameter 'wrld' is 'maze2d', but unknown; did you mean world")
-
-
-@pytest.mark.parametrize(
-    ("settings", "argument", "expected"),
-    [
-        (LocalNodeSettings, "world:=mars", "parameter 'world' is 'mars'; allowed: maze2d, maze3d, doom or scan"),
-        (LocalNodeSettings, "image_topic:='a/'", "parameter 'image_topic' is 'a/'; allowed: a topic name"),
-        (LocalNodeSettings, "image_depth:=5.5", "parameter 'image_depth' is 5.5; allowed: an integer from 1 to 10000"),
-        (LocalNodeSettings, "action_timeout_s:=.nan", "'action_timeout_s' is nan; allowed: a number from 0.001 to 60"),
-        (LocalNodeSettings, "publish_tf:=1", "parameter 'publish_tf' is 1; allowed: true or false"),
-        (NgoNodeSettings, "window_frames:=one", "'window_frames' is 'one'; allowed: an integer from 16 to 100000"),
-        (NgoNodeSettings, "window_frames:=4000", "'relative_pose_depth' is 2000; allowed: at least window_frames"),
-        (
-            NgoNodeSettings,
-            "map_frame:=odom",
-            "'map_frame' is 'odom'; allowed: another name than odom_frame's",
-        ),
-    ],
-)
-def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(
-    settings: type[Settings], argument: str, expected: str
-) -> None:
-    with own_node("estimator", "--ros-args", "-p", argument) as node, pytest.raises(BadParameter) as error:
-        LiveSettings(node, settings)
-    assert expected in str(error.value) and "\n" not in str(error.value)
 
 
 def test_bad_weights_end_the_start_with_one_line_and_code_two(weights: Path, tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 Lost, doubled, late and unusable images are in `test_estimator_nodes.py`; here are those who publish them.
 """
 
-import itertools
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ import torch
 from ngo_msgs.msg import DiscreteAction, RelativePose
 from ngo_msgs.srv import Reset
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from ngo_estimator.checkpoint import write_untrained
@@ -63,25 +60,6 @@ def graph(parameters: dict[str, Any]) -> Iterator[Graph]:
                 assert process.running and "Traceback" not in process.log, process.log
 
 
-def test_a_burst_of_images_is_taken_whole(graph: Graph) -> None:
-    graph.start_run()
-    graph.play(*range(300))
-    graph.wait_for_step(299)
-    assert graph.steps() == [(step, step + 1) for step in range(299)]
-    assert len(graph.out.trajectories[-1].x) == 300
-
-
-def test_images_of_200_hz_are_taken_as_they_come(graph: Graph) -> None:
-    """What a shared machine does not get done in time waits, and none is lost."""
-    graph.start_run()
-    begin = time.monotonic()
-    for step in range(200):
-        graph.probe.spin_until(lambda due=begin + step / 200: time.monotonic() >= due, "the time")
-        graph.play(step)
-    graph.wait_for_step(199)
-    assert graph.steps() == [(step, step + 1) for step in range(199)]
-
-
 def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Graph) -> None:
     """Killed and back half a minute later: the odometry goes on, and says how little it knows of the time between."""
     graph.diagnostics.clear()
@@ -109,18 +87,6 @@ def test_a_camera_that_was_away_leaves_a_gap_with_a_large_covariance(graph: Grap
     assert corrected[5] > 20.0 > corrected[4]
     graph.diagnostics.wait_for_problem("/local_node", "294 frames missing between images")
     graph.diagnostics.wait_for_problem("/ngo_node", "lost: the standard deviation of the position is")
-
-
-def test_gaps_in_a_burst_cost_no_frame(graph: Graph) -> None:
-    """Each frame is far beyond the timeout of the one before, so an action that is read after both seems lost."""
-    graph.start_run()
-    steps = list(range(0, 60_000, 300))
-    for step in steps:
-        if step > 0:
-            graph.action(step - 1)
-        graph.frame(step)
-    graph.wait_for_step(steps[-1])
-    assert graph.steps() == list(itertools.pairwise(steps))
 
 
 def test_reset_of_local_node_is_a_new_origin(graph: Graph) -> None:
@@ -162,19 +128,6 @@ def test_of_two_cameras_on_one_topic_the_first_is_held_and_both_are_named(graph:
     finally:
         second.node.destroy_publisher(images)
         second.close()
-
-
-def test_an_image_publisher_of_another_qos_is_named(graph: Graph) -> None:
-    other = Probe("careless_camera")
-    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-    publisher = other.node.create_publisher(Image, "image", best_effort)
-    try:
-        misfit = "QoS does not fit, best effort publisher and reliable subscription"
-        graph.local.wait_for_log(f"nothing comes from /careless_camera on '/image': {misfit}")
-    finally:
-        other.node.destroy_publisher(publisher)
-        other.close()
-    graph.finish_run(frames=3)
 
 
 def test_an_error_of_the_node_itself_drops_one_frame_and_the_node_lives(

@@ -15,7 +15,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path as PathMessage
 from ngo_msgs.msg import RelativePose
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from ngo_estimator.nodes import messages
@@ -23,7 +23,7 @@ from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .processes import NodeProcess, Probe
-from .relative_poses import Drive, Optimizer, assert_pose_is
+from .relative_poses import Optimizer, assert_pose_is
 
 pytestmark = pytest.mark.processes
 
@@ -86,13 +86,6 @@ def test_while_lost_covariance_and_diagnostics_say_so(optimizer: Optimizer) -> N
     optimizer.wait_for_problem("lost: the standard deviation of the position is ")
 
 
-def test_a_burst_is_taken_whole(optimizer: Optimizer) -> None:
-    drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 500))
-    optimizer.wait_for_stamp(drive.stamp_ns(500))
-    assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 501)]
-
-
 def test_a_stream_that_ends_with_a_meta_pose_leaves_the_whole_path_optimised(optimizer: Optimizer) -> None:
     paths = optimizer.probe.collect(PathMessage, "ngo/path")
     optimizer.meet()
@@ -116,18 +109,6 @@ def test_a_stream_that_ends_with_a_meta_pose_leaves_the_whole_path_optimised(opt
     optimizer.probe.spin_until(ended_so, "the path that is optimised to its end")
 
 
-def test_doubled_late_and_reordered_steps_change_nothing(optimizer: Optimizer) -> None:
-    drive = optimizer.drive()
-    order = [1, 2, 3, 3, 5, 4, 6, 2, 6, 7, 8, 9]
-    optimizer.publish(*(drive.step(step) for step in order))
-    pose = optimizer.wait_for_stamp(drive.stamp_ns(9))
-    assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in (1, 2, 3, 5, 6, 7, 8, 9)]
-    assert_pose_is(pose, optimizer.expected([drive.step(step) for step in (1, 2, 3, 5, 6, 7, 8, 9)]))
-    for kind in ("duplicate", "late"):
-        optimizer.wait_for_value(f"dropped: relative pose ({kind} step)", lambda count: int(count) >= 2)
-    optimizer.process.wait_for_log("dropped relative pose: step to .* came when the trajectory was at")
-
-
 def test_time_that_jumps_back_is_a_clean_reset(optimizer: Optimizer) -> None:
     """A bag that is played in a loop: the same stamps, the same origin."""
     drive = optimizer.drive()
@@ -140,16 +121,6 @@ def test_time_that_jumps_back_is_a_clean_reset(optimizer: Optimizer) -> None:
     assert len(optimizer.poses) == 30
     assert again == once
     optimizer.wait_for_value("restarts", lambda value: int(value) == restarts + 1)
-
-
-def test_a_new_origin_of_later_stamps_begins_anew(optimizer: Optimizer) -> None:
-    """A local node that was killed comes back: what moved meanwhile is unknown, and nothing is made up for it."""
-    drive = optimizer.drive()
-    optimizer.pose_after(*drive.steps(1, 5))
-    returned = Drive(optimizer.core, drive.stamp_ns(20))
-    pose = optimizer.pose_after(*returned.steps(1, 5))
-    assert_pose_is(pose, optimizer.expected(returned.steps(1, 5)))
-    optimizer.process.wait_for_log("the relative poses have a new origin: their source restarted")
 
 
 def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:
@@ -166,15 +137,6 @@ def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:
     drive = optimizer.drive()
     optimizer.publish(*drive.steps(1, 2))
     optimizer.wait_for_stamp(drive.stamp_ns(2))
-
-
-def test_a_subscriber_of_another_qos_is_told(optimizer: Optimizer) -> None:
-    """A latched path is asked for; the parameters qos_overrides can offer one."""
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    optimizer.probe.collect(PathMessage, "ngo/path", latched)
-    optimizer.process.wait_for_log(
-        "New subscription discovered on topic '.*ngo/path', requesting incompatible QoS.*DURABILITY"
-    )
 
 
 def test_of_two_publishers_the_first_is_held_and_both_are_named(optimizer: Optimizer) -> None:

@@ -1,6 +1,5 @@
 """ngo_map as a real process: fed over DDS with relative poses and trajectories, and in the graph of the 2D world."""
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,6 @@ from ngo_msgs.msg import RelativePose, Trajectory
 from ngo_msgs.srv import LoadState, SaveState
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from benchmarks.process_use import cpu_s
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose
@@ -27,7 +25,7 @@ from ngo_sim.maze2d import Maze2D
 from tests.unit.ngo_estimator.mapping.test_map_files import read_by_nav2
 from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan
 
-from .processes import Diagnostics, NodeProcess, Probe
+from .processes import NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -259,44 +257,10 @@ def test_bad_messages_are_dropped_with_a_reason(mapper: Mapper) -> None:
         mapper.wait_for_map(expected(30, moved))
 
 
-def test_a_trajectory_of_another_qos_is_named(mapper: Mapper) -> None:
-    with Probe("careless_optimizer") as other:
-        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        other.node.create_publisher(Trajectory, "ngo/trajectory", best_effort)
-        misfit = "QoS does not fit, best effort publisher and reliable subscription"
-        mapper.process.wait_for_log(f"WARN.*nothing comes from /careless_optimizer on '/ngo/trajectory': {misfit}")
-
-
-def test_a_trajectory_that_begins_anew_begins_a_new_map() -> None:
-    """Nobody takes updates of this node's map: what changes last comes as a whole map, however small it is."""
-    with running("/anew") as mapper:
-        mapper.drive(1, 30, poses(30))
-        mapper.wait_for_map(expected(30, poses(30)))
-        mapper.drive(1, 10, poses(10))
-        mapper.process.wait_for_log("the trajectory began anew, and so does the map")
-        mapper.wait_for_map(expected(10, poses(10)))
-
-
-def test_a_node_that_starts_late_says_what_the_map_lacks() -> None:
-    with running("/late") as mapper:
-        mapper.drive(5, 10, poses(10))
-        mapper.process.wait_for_log("the map lacks what was seen before 50.500000000 s: this node started later")
-
-
 def test_a_bad_start_ends_with_one_line() -> None:
     with NodeProcess("ngo_estimator", "ngo_map", {"world": "scan", "weights": "/nowhere"}) as process:
         assert process.wait() == 2
         assert len(process.lines) == 1 and "weights: there is no folder '/nowhere'" in process.log
-
-
-def test_a_trajectory_that_waits_to_be_read_keeps_the_node_asleep() -> None:
-    with running("/asleep", map_update_interval=3600.0, diagnostics_period_s=0.2) as mapper:
-        diagnostics = Diagnostics(mapper.probe)
-        mapper.drive(1, 30, poses(30))
-        diagnostics.wait_for_value("/asleep/ngo_map", "received", lambda steps: steps == "29")
-        heard, began_s, used_s = len(diagnostics.arrays("/asleep/ngo_map")), time.monotonic(), cpu_s(mapper.process.pid)
-        mapper.probe.spin_until(lambda: len(diagnostics.arrays("/asleep/ngo_map")) >= heard + 20, "more diagnostics")
-        assert cpu_s(mapper.process.pid) - used_s < 0.5 * (time.monotonic() - began_s)
 
 
 def test_the_map_of_a_maze_shows_its_walls() -> None:

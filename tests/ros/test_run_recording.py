@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +28,6 @@ from ngo_estimator.trajectory.report import trajectory_report
 from ngo_recordings.frames import UNUSABLE
 from ngo_recordings.recording import open_recording
 from ngo_recordings.topics import TopicArguments
-from ngo_recordings.writer import RecordingWriter
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.maze3d import Maze3D
@@ -39,7 +37,6 @@ from .processes import NodeProcess, Probe, run_forked
 
 pytestmark = pytest.mark.processes
 
-ROS2 = Path(__file__).parents[2] / "tools" / "ros2"
 START_NS = 1_700_000_000_000_000_000
 WARM_UP_NS = START_NS + 10**15  # later than all that is played: going back begins anew
 SEED = 1000
@@ -371,54 +368,3 @@ def test_a_run_that_fails_leaves_earlier_results_and_no_others(
         run_in_process(arguments, Console(quiet=True))
     assert [path.name for path in out.iterdir()] == ["corrected.tum"]
     assert (out / "corrected.tum").read_text() == "old"
-
-
-def write_wide(path: Path, frames: int) -> None:
-    """A drive in the 2D world beside the pictures of another camera, 2 MB each, that nothing makes smaller."""
-    noise = np.random.default_rng(0).integers(0, 256, (700, 1000, 3), np.uint8)
-    entries = episode_entries("maze2d", drive("maze2d", 40), START_NS, START_NS)
-    with RecordingWriter(path) as writer:
-        for topic, message in {topic: message for topic, _, message in entries}.items():
-            writer.add_topic(topic, message.__msgtype__)
-        writer.add_topic("/other_camera", "sensor_msgs/msg/Image")
-        period_ns = 10**8
-        for k in range(frames):
-            for topic, _, message in entries[:3]:
-                moved = shifted(message, START_NS + k * period_ns)
-                writer.write(topic, make.serialised(moved), START_NS + k * period_ns)
-            picture = make.image(START_NS + k * period_ns, np.roll(noise, k, axis=0))
-            writer.write("/other_camera", make.serialised(picture), START_NS + k * period_ns)
-
-
-MEASURED = """
-import os, subprocess, sys
-process = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
-_, status, usage = os.wait4(process.pid, 0)
-process.returncode = os.waitstatus_to_exitcode(status)
-print(usage.ru_maxrss * 1024)
-sys.exit(process.returncode)
-"""
-
-
-def peak_bytes(*arguments: object) -> int:
-    """Peak of the memory that a run_recording has in use.
-
-    A small process starts it: the peak of a process counts from that of the process which started it.
-    """
-    command = [str(ROS2), "run", "ngo_estimator", "run_recording", *map(str, arguments)]
-    done = subprocess.run([sys.executable, "-S", "-c", MEASURED, *command], capture_output=True, text=True, timeout=170)
-    assert done.returncode == 0, done.stderr
-    return int(done.stdout)
-
-
-@pytest.mark.long
-def test_memory_does_not_grow_with_the_recording(weights: Path, tmp_path: Path) -> None:
-    peaks = []
-    for frames in (10, 70):
-        file = tmp_path / f"{frames}.mcap"
-        write_wide(file, frames)
-        assert file.stat().st_size > frames * 2_000_000
-        topics = ("--image", "/image")
-        peaks.append(peak_bytes(file, "--weights", weights, *topics, "--out", tmp_path / f"out{frames}"))
-        file.unlink()
-    assert peaks[1] < 1e9 and peaks[1] - peaks[0] < 60e6, peaks

@@ -10,26 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, LaserScan
 from tf2_msgs.msg import TFMessage
 
-from ngo_common.nodes.parameters import LiveSettings
-from ngo_common.settings import BadParameter
 from ngo_sim.episodes import Episode, record_episode
-from ngo_sim.maze2d import Maze2D, Maze2DConfig
-from ngo_sim.maze3d import Maze3D, Maze3DConfig
-from ngo_sim.simulator_config import SimulatorConfig
+from ngo_sim.maze2d import Maze2D
+from ngo_sim.maze3d import Maze3D
 
-from .processes import NodeProcess, Probe, own_node, wait_until
+from .processes import NodeProcess, Probe, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -170,18 +165,6 @@ def test_none_is_lost_by_a_slow_subscriber(probe: Probe) -> None:
     assert stamps(images) == [10**9 + 10**8 * frame for frame in range(FRAMES)]
 
 
-def test_goes_on_without_a_consumer_that_never_answers(probe: Probe) -> None:
-    images = probe.collect(Image, "image", QoSProfile(depth=100))
-    answer = probe.node.create_publisher(Odometry, "odom", 10)
-    waiting = {"wait_for_subscribers": 1, "flow_control_topics": ["odom"], "wait_for_flow_control": True}
-    with simulator("maze2d", frames=6, rate=0, max_in_flight=2, stall_timeout_s=0.2, **waiting) as node:
-        probe.spin_until(lambda: len(images) == 6, "all frames")
-        probe.spin_until(lambda: not node.running, "the simulator's end")
-        assert node.wait() == 0
-        assert "no answer on odom for 0.2 s" in node.log
-    probe.node.destroy_publisher(answer)
-
-
 def test_without_a_driver_each_command_is_one_step(probe: Probe) -> None:
     actions = probe.collect(DiscreteAction, "action")
     images = probe.collect(Image, "image")  # last: the simulator waits for this one
@@ -197,23 +180,6 @@ def test_without_a_driver_each_command_is_one_step(probe: Probe) -> None:
         assert node.wait() == 0, node.log
         assert "action_command dropped: action is 9; allowed: 0 (forward)" in node.log
     assert [message.action for message in actions] == wanted
-
-
-def test_commands_take_over_from_the_driver_until_their_timeout(probe: Probe) -> None:
-    actions = probe.collect(DiscreteAction, "action")
-    command = probe.node.create_publisher(DiscreteAction, "action_command", 10)
-    with simulator("maze2d", driver="random", rate=100, action_timeout_s=0.3):
-        probe.spin_until(lambda: command.get_subscription_count() == 1, "the simulator to listen")
-        probe.spin_until(lambda: len({message.action for message in actions}) == 3, "the driver")
-        held = 15  # the driver alone would do that once in 10 million times
-
-        def taken_over() -> bool:
-            """Again and again: a slow machine makes few steps until the timeout."""
-            command.publish(DiscreteAction(action=DiscreteAction.TURN_LEFT))
-            return [m.action for m in actions[-held:]] == [DiscreteAction.TURN_LEFT] * held
-
-        probe.spin_until(taken_over, "commands")
-        probe.spin_until(lambda: len({m.action for m in actions[-9:]}) == 3, "the driver again")
 
 
 def test_parameters_can_be_described_and_changed_only_where_it_makes_sense(probe: Probe) -> None:
@@ -240,71 +206,6 @@ def test_parameters_can_be_described_and_changed_only_where_it_makes_sense(probe
 @pytest.fixture
 def latched() -> QoSProfile:
     return QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def test_two_robots_share_tf_static(probe: Probe, latched: QoSProfile) -> None:
-    """Their frames differ by the prefix, and a subscriber that comes later gets the transforms of both."""
-    robots = ("red", "blue")
-    truth = {name: probe.collect(Odometry, f"/{name}/ground_truth") for name in robots}
-    images = {name: probe.collect(Image, f"/{name}/image") for name in robots}  # last: the simulators wait for these
-    with ExitStack() as stack:
-        for seed, name in enumerate(robots):
-            frames = {"frame_prefix": f"{name}/", "truth_parent_frame": "map"}
-            node = simulator("maze3d", "-r", f"__ns:=/{name}", seed=seed, rate=50.0, wait_for_subscribers=1, **frames)
-            stack.enter_context(node)
-        probe.spin_until(lambda: all((*images.values(), *truth.values())), "frames of both")
-        transforms = probe.collect(TFMessage, "/tf_static", latched)
-        probe.spin_until(lambda: len(transforms) == 2, "the transforms of both")
-        found = {(t.header.frame_id, t.child_frame_id): t for message in transforms for t in message.transforms}
-    expected = {(f"{name}/base_link", f"{name}/camera_optical_frame") for name in robots}
-    assert found.keys() == expected | {(f"{name}/map", f"{name}/maze") for name in robots}
-    for name in robots:
-        assert images[name][0].header.frame_id == f"{name}/camera_optical_frame"
-        start = truth[name][0]
-        assert (start.header.frame_id, start.child_frame_id) == (f"{name}/maze", f"{name}/base_link")
-        placed = found[f"{name}/map", f"{name}/maze"].transform
-        yaw = 2 * math.atan2(placed.rotation.z, placed.rotation.w)
-        x, y, start_yaw = xyyaw(start)
-        turned = complex(math.cos(yaw), math.sin(yaw)) * complex(x, y)
-        at = (placed.translation.x + turned.real, placed.translation.y + turned.imag, yaw + start_yaw)
-        assert at == pytest.approx((0.0, 0.0, 0.0)), "the truth begins at the origin of map"
-
-
-@pytest.mark.parametrize("namespace", ["", "/red"])
-@pytest.mark.parametrize("world", ["maze2d", "maze3d"])
-def test_the_shipped_parameters_hold_in_any_namespace(world: str, namespace: str) -> None:
-    """As rcl itself reads the files; 2000 is not the nodes' default."""
-    remapped = ("-r", f"__ns:={namespace}") if namespace else ()
-    arguments = ["--ros-args", *remapped]
-    for package, name in (("ngo_sim", world), ("ngo_bringup", f"graph_{world}")):
-        file = Path(get_package_share_directory(package), "config", f"{name}.yaml")
-        with own_node(world, *arguments, "--params-file", str(file)) as node:
-            live = LiveSettings(node, SimulatorConfig, beside=(Maze2DConfig, Maze3DConfig))
-            assert live.values.seed == 2000, file
-
-
-@pytest.mark.parametrize(
-    ("argument", "expected"),
-    [
-        ("rows:=many", "parameter 'rows' is 'many'; allowed: an integer from 2 to 100"),
-        ("rows:=1", "parameter 'rows' is 1; allowed: an integer from 2 to 100"),
-        ("rows:=3.0", "parameter 'rows' is 3.0; allowed: an integer from 2 to 100"),
-        ("rate:=-1.0", "parameter 'rate' is -1.0; allowed: a number from 0 to 10000"),
-        ("policy:=fast", "parameter 'driver' is 'fast'; allowed: one of auto, corners, random_goals, distance, "),
-        ("extra_openings:=99", "extra_openings is 99"),
-        ("flow_control_topics:=odom", "parameter 'flow_control_topics' is 'odom'; allowed: a list of topic names"),
-        ("drivver:=corners", "parameter 'drivver' is 'corners', but unknown; did you mean driver?"),
-        ("qqq:=1", "parameter 'qqq' is 1, but unknown; allowed: action_timeout_s, "),
-    ],
-)
-def test_a_bad_parameter_is_named_with_its_value_and_what_is_allowed(argument: str, expected: str) -> None:
-    def declare(node: Node) -> None:
-        LiveSettings(node, SimulatorConfig, beside=(Maze2DConfig,))
-        LiveSettings(node, Maze2DConfig, beside=(SimulatorConfig,))
-
-    with own_node("maze2d", "--ros-args", "-p", argument) as node, pytest.raises(BadParameter) as error:
-        declare(node)
-    assert expected in str(error.value) and "\n" not in str(error.value)
 
 
 def test_bad_parameters_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
@@ -346,16 +247,6 @@ def test_a_start_is_told_in_one_line_and_a_signal_ends_it(probe: Probe) -> None:
         received = stamps(images)
         assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
         node.send(signal.SIGTERM)
-        assert node.wait() == 0, node.log
-        assert "Traceback" not in node.log
-
-
-def test_signals_while_it_starts_end_it_cleanly(probe: Probe) -> None:
-    """The node is in the graph before it makes its world."""
-    with NodeProcess("ngo_sim", "maze3d", fresh=True) as node:
-        probe.spin_until(lambda: "maze3d" in probe.node.get_node_names(), "the node")
-        for number in (signal.SIGINT, signal.SIGTERM):
-            node.send(number)
         assert node.wait() == 0, node.log
         assert "Traceback" not in node.log
 
