@@ -110,12 +110,3 @@ def test_people_are_seen_and_keep_off_the_robot() -> None:
     people = with_people._people.circles(seen.stamps_s, seen.true_poses_xyyaw[:, :2])
     gaps = np.linalg.norm(people[..., :2] - seen.true_poses_xyyaw[:, None, :2], axis=-1)
     assert gaps.min() > 0.22
-
-
-def test_wrong_use_is_named() -> None:
-    with pytest.raises(RuntimeError, match="reset"):
-        Building2d().step()
-    with pytest.raises(ValueError, match="length_m"):
-        Building2d().record(0, 0.0)
-    with pytest.raises(ValueError, match="driver"):
-        BuildingDriverConfig(driver="fast")

@@ -145,12 +145,6 @@ def test_wrong_maps_are_named(tmp_path: Path) -> None:
         Maze3D(Maze3DConfig(wad="my_way.wad", map="map01"))
 
 
-@pytest.mark.parametrize("driver", ["corners", "random_goals"])
-def test_a_driver_that_needs_a_plan_is_refused(home: Maze3D, driver: str) -> None:
-    with pytest.raises(ValueError, match=f"driver is '{driver}', which needs a maze's plan; on a Doom map"):
-        record_episode(home, driver, 5, seed=0)
-
-
 def test_a_file_takes_what_it_lacks_from_the_part_of_freedoom_that_its_map_is_of(tmp_path: Path) -> None:
     write_lumps(tmp_path / "both.wad", map_lumps([("E1M1", TEXT), ("MAP01", TEXT)]))
     assert load_level(str(tmp_path / "both.wad"), "e1m1").game_wad.name == "freedoom1.wad"

@@ -37,19 +37,3 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
     for name in ("observations", "actions", "poses_xyyaw"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
         assert getattr(first, name).tobytes() != getattr(other, name).tobytes()
-
-
-def test_one_frame_has_no_action() -> None:
-    episode = record_episode(Maze2D(), "random", 1, seed=0)
-    assert episode.observations.shape == (1, 241, 4) and episode.actions.shape == (0,)
-
-
-@pytest.mark.parametrize("frames", [0, -5, 2.0, True])
-def test_frames_must_be_a_count(frames: float) -> None:
-    with pytest.raises(ValueError, match=f"frames is {frames!r}; it must be an integer of at least 1"):
-        record_episode(Maze2D(), "random", frames, seed=0)  # type: ignore[arg-type]
-
-
-def test_an_unknown_driver_is_refused() -> None:
-    with pytest.raises(ValueError, match="driver is 'fast'"):
-        record_episode(Maze2D(), "fast", 2, seed=0)

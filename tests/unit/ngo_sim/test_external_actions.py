@@ -1,5 +1,3 @@
-import pytest
-
 from ngo_sim.drivers import Action
 from ngo_sim.external_actions import ExternalActions
 
@@ -40,10 +38,3 @@ def test_without_a_pace_no_command_is_forgotten_while_others_are_slow() -> None:
     assert external.in_charge(100.0, TIMEOUT_S, hold=False)
     assert external.next_action(hold=False) is Action.TURN_LEFT
     assert not external.in_charge(100.0, TIMEOUT_S, hold=False)
-
-
-def test_refuses_what_is_no_action() -> None:
-    external = ExternalActions()
-    with pytest.raises(ValueError, match="action is 3; allowed: 0"):
-        external.command(3, 0.0)
-    assert not external.in_charge(0.0, TIMEOUT_S, hold=True)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ngo_sim.convex_shapes import contains, overlap, rectangle, union_walls
+from ngo_sim.convex_shapes import contains, rectangle, union_walls
 from ngo_sim.corridors import LAYOUTS, Corridor
 from ngo_sim.floor_plans import FloorPlan, FloorPlanConfig, draw_floor_plan
 from ngo_sim.furniture import Placer, box
@@ -33,11 +33,6 @@ def test_a_polygon_inside_another_has_no_walls_and_glass_stays_with_its_edge() -
     walls, glass = union_walls([outer, inner], [(2,), (0,)])
     np.testing.assert_allclose(walls, np.concatenate((outer, np.roll(outer, -1, axis=0)), axis=1), atol=1e-12)
     assert glass.tolist() == [False, False, True, False]
-
-
-def test_overlap_knows_a_margin() -> None:
-    first, second = rectangle((0, 0), 0.0, 2.0, 2.0), rectangle((2.5, 0), 0.0, 2.0, 2.0)
-    assert not overlap(first, second) and not overlap(first, second, 0.49) and overlap(first, second, 0.51)
 
 
 def test_a_bent_corridor_keeps_its_width_at_the_bend() -> None:
@@ -108,13 +103,3 @@ def test_aliased_rooms_repeat_and_others_do_not() -> None:
         return int(counts.max(initial=0))
 
     assert repeated(True) > 3 * repeated(False)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("layout", "square"), ("scale", 0.0), ("glass", 0.9), ("people", 1.5), ("clutter", -1.0)]
-)
-def test_a_bad_config_is_named(field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=field):
-        FloorPlanConfig(**{field: value})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="seed"):
-        draw_floor_plan(-1)

@@ -11,12 +11,6 @@ def publish(flow: FlowControl, *stamps: int) -> None:
         flow.published(stamp)
 
 
-def test_nobody_listens_so_nothing_limits() -> None:
-    flow = FlowControl(max_in_flight=1)
-    publish(flow, *range(100))
-    assert flow.in_flight() == 0
-
-
 def test_stays_max_in_flight_ahead_of_the_newest_stamp() -> None:
     flow = FlowControl(max_in_flight=2)
     flow.set_topics(["odom"])
@@ -85,15 +79,6 @@ def test_giving_up_counts_what_is_in_flight_as_lost() -> None:
     assert flow.in_flight() == 0 and flow.may_publish()
 
 
-def test_refuses_what_makes_no_sense() -> None:
-    with pytest.raises(ValueError, match="max_in_flight is 0"):
-        FlowControl(0)
-    flow = FlowControl(1)
-    flow.published(5)
-    with pytest.raises(ValueError, match="stamp_ns is 5; expected one above 5"):
-        flow.published(5)
-
-
 def test_pace_is_kept_without_drift_and_without_bursts() -> None:
     pacer = Pacer()
     assert pacer.remaining_s(now_s=100.0) == 0.0
@@ -111,8 +96,3 @@ def test_pace_is_kept_without_drift_and_without_bursts() -> None:
 def test_reads_the_stamp_of_a_header(kind: int, order: str) -> None:
     cdr = bytes([0, kind, 0, 0]) + struct.pack(order + "iI", 12, 345) + b"rest"
     assert header_stamp_ns(cdr) == 12_000_000_345
-
-
-def test_refuses_bytes_without_a_header() -> None:
-    with pytest.raises(ValueError, match="cdr has 3 bytes"):
-        header_stamp_ns(b"abc")

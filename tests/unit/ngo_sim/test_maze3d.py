@@ -10,20 +10,15 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ngo_sim.doom_map import (
-    DECORATIONS,
-    FLATS,
     TEXTURE_SETS,
     UNITS_PER_M,
     WALL_HEIGHT_UNITS,
-    WALL_TEXTURES,
-    Decoration,
     MapStyle,
     textmap,
     wall_faces,
@@ -267,33 +262,6 @@ def test_driving_follows_dooms_inertia() -> None:
     env.close()
 
 
-def test_the_reward_is_the_distance_travelled(shared: Maze3D) -> None:
-    _, last = shared.reset(seed=5)
-    for action in (FORWARD, LEFT, FORWARD, FORWARD, RIGHT) * 4:
-        _, reward, _, _, info = shared.step(action)
-        moved = info["pose_xyyaw"][:2] - last["pose_xyyaw"][:2]
-        assert reward == pytest.approx(float(np.hypot(*moved)), abs=1e-12)
-        last = info
-
-
-@pytest.mark.parametrize("heading_deg", [0, 90, 180, 270])
-def test_nothing_in_the_picture_moves_by_itself(heading_deg: int) -> None:
-    """No texture is animated, no light flickers: turning by 0 degrees for 90 tics changes no byte."""
-    walls = itertools.cycle(WALL_TEXTURES)
-    env = Room(Maze3DConfig(turn_deg=0.0), render_mode="rgb_array")
-    env.start = (13.5, 13.5, heading_deg)
-    env.styles = tuple(
-        MapStyle(tuple(itertools.islice(walls, len(FACES))), floor, ceiling)
-        for floor, ceiling in zip(FLATS[0::2], FLATS[1::2], strict=True)
-    )
-    env.preload(range(len(env.styles)))
-    for seed in range(len(env.styles)):
-        pictures, _ = drive(env, seed, [LEFT] * 45)
-        assert pictures[0].mean() > 25
-        assert (pictures == pictures[0]).all(), env.styles[seed]
-    env.close()
-
-
 def test_the_picture_holds_nothing_but_the_maze() -> None:
     """No weapon, bar, number or cross: where all textures differ, no pixel is alike, driving and turning."""
     env = Room(EXACT, render_mode="rgb_array")
@@ -305,23 +273,6 @@ def test_the_picture_holds_nothing_but_the_maze() -> None:
     alike = (drive(env, 0, actions)[0] == drive(env, 1, actions)[0]).all(axis=-1)
     env.close()
     assert alike.mean(axis=(1, 2)).max() < 1e-3
-
-
-def test_the_camera_stays_at_its_height_while_walking() -> None:
-    sight = Sight(EXACT, [FORWARD] * 14, (12.0, 12.0, 90))
-    down, row = np.array(sight.rows).T
-    focal = 2 * EXACT.focal_lengths_px[1]
-    # The engine rounds rows down; where both textures look the same at a face's border, its end is not seen.
-    assert len(row) > 40
-    assert np.quantile(np.abs(row + 0.5 - 60 - focal * down), 0.99) < 0.6
-
-
-def test_textures_vary_from_face_to_face(shared: Maze3D) -> None:
-    texts = [shared._build_world(seed, seed).text for seed in range(3)]
-    for text in texts:
-        used = set(re.findall(r'texturemiddle="([^"]+)"', text))
-        assert len(used) > 0.7 * len(WALL_TEXTURES)
-    assert len(set(texts)) == 3
 
 
 def test_worlds_without_choices_are_what_they_have_always_been() -> None:
@@ -353,42 +304,6 @@ def world_config(decorations: int) -> Maze3DConfig:
     return Maze3DConfig(actuation_noise=0.0, decorations=decorations)
 
 
-class Decorated(Room):
-    """The room with one decoration in the way, the one of the seed; none for seed 0."""
-
-    def _build_world(self, seed: int, maze_seed: int) -> DoomWorld:
-        style = MapStyle(("MARBGRAY",) * len(FACES), "FLAT8", "FLAT5")
-        things = [Decoration(DECORATIONS[seed - 1], 12.0, 15.0)] if seed else []
-        return DoomWorld(ROOM, textmap(ROOM, style, (12.0, 12.5), 90, things))
-
-
-def test_every_decoration_is_seen_stays_as_it_is_and_is_in_nobodys_way() -> None:
-    walker = Decorated(EXACT, render_mode="rgb_array")
-    watcher = Decorated(Maze3DConfig(turn_deg=0.0), render_mode="rgb_array")
-    for env in (walker, watcher):
-        env.preload(range(len(DECORATIONS) + 1))
-    bare, free = drive(walker, 0, [FORWARD] * 40)
-    assert free[-1, 1] > 18.0  # past where they are
-    for seed, kind in enumerate(DECORATIONS, start=1):
-        pictures, poses = drive(walker, seed, [FORWARD] * 40)
-        np.testing.assert_array_equal(poses, free)
-        assert (pictures[0] != bare[0]).any(axis=-1).sum() > 40, kind
-        np.testing.assert_array_equal(pictures[-1], bare[-1])  # it was not carried along
-        pictures, _ = drive(watcher, seed, [LEFT] * 45)
-        assert (pictures == pictures[0]).all(), kind
-    for env in (walker, watcher):
-        env.close()
-
-
-def test_a_decorated_maze_is_driven_as_the_bare_one() -> None:
-    bare, decorated = (Maze3D(world_config(count), render_mode="rgb_array") for count in (0, 60))
-    actions = [*itertools.islice(itertools.cycle((FORWARD, FORWARD, LEFT, FORWARD, FORWARD, RIGHT)), 150)]
-    (pictures, poses), (others, same) = drive(bare, 2, actions), drive(decorated, 2, actions)
-    np.testing.assert_array_equal(poses, same)
-    assert (pictures != others).any(axis=(1, 2, 3)).mean() > 0.5
-    bare.close(), decorated.close()
-
-
 def test_same_seed_same_bytes(shared: Maze3D) -> None:
     """Preloaded or not, first or after other episodes, alone or beside another environment."""
     expected = digest(shared, 6)
@@ -403,33 +318,6 @@ def test_same_seed_same_bytes(shared: Maze3D) -> None:
     assert digest(with_other_maps, 6) == expected
     with_other_maps.close()
     alone.close()
-
-
-def test_two_environments_side_by_side_do_not_disturb_each_other() -> None:
-    first, second = Maze3D(), Maze3D()
-    observations: dict[str, list[bytes]] = {"mixed": [], "alone": []}
-    first.reset(seed=1), second.reset(seed=2)
-    for _ in range(10):
-        second.step(LEFT)
-        observations["mixed"].append(first.step(FORWARD)[0].tobytes())
-    second.close()
-    first.reset(seed=1)
-    for _ in range(10):
-        observations["alone"].append(first.step(FORWARD)[0].tobytes())
-    first.close()
-    assert observations["mixed"] == observations["alone"]
-
-
-def test_processes_at_the_same_time_give_the_same_bytes(shared: Maze3D) -> None:
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "import test_maze3d as t\n"
-        "env = t.Maze3D(); print(t.digest(env, 6)); env.close()\n"
-    )
-    command = [sys.executable, "-c", code, str(Path(__file__).parent)]
-    children = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    outputs = {child.communicate(timeout=120)[0].strip() for child in children}
-    assert outputs == {digest(shared, 6)}
 
 
 def test_noise_is_of_the_seed_and_of_its_size(shared: Maze3D) -> None:
@@ -447,16 +335,6 @@ def test_noise_is_of_the_seed_and_of_its_size(shared: Maze3D) -> None:
     assert pushes.mean() == pytest.approx(2.2, abs=0.06)
     assert pushes.std() == pytest.approx(0.22, rel=0.3)
     assert np.degrees(np.remainder(np.diff(turned), math.tau))[-50:].std() < 0.01
-
-
-def test_a_seed_drawn_by_the_generator_follows_the_last_given_one() -> None:
-    env = Maze3D()
-    env.reset(seed=3)
-    first, _ = env.reset()
-    env.reset(seed=3)
-    again, _ = env.reset()
-    env.close()
-    np.testing.assert_array_equal(first, again)
 
 
 @pytest.mark.parametrize("preloaded", [False, True])
@@ -529,16 +407,6 @@ def test_an_interpreter_that_ends_without_close_takes_the_engine_along(temporary
     assert [path.name for path in temporary.parent.iterdir()] == ["temporary"]
 
 
-def test_signal_handlers_stay_those_of_the_program(temporary: Path) -> None:
-    program = (
-        "import os, signal, sys\nfrom ngo_sim.maze3d import Maze3D\n"
-        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
-        "env = Maze3D()\nenv.reset(seed=0)\nos.kill(os.getpid(), signal.SIGTERM)\nenv.step(0)\n"
-    )
-    assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 7
-    wait_until_gone(temporary)
-
-
 def test_an_engine_that_dies_is_told_and_started_again(temporary: Path) -> None:
     env = Maze3D()
     expected, _ = env.reset(seed=0)
@@ -550,59 +418,6 @@ def test_an_engine_that_dies_is_told_and_started_again(temporary: Path) -> None:
     np.testing.assert_array_equal(observation, expected)
     env.close()
     wait_until_gone(temporary)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "allowed"),
-    [("rows", 1, "from 2 to 100"), ("rows", 101, "from 2 to 100"), ("cols", 2.0, "an integer"),
-     ("extra_openings", 17, "from 0 to 16"), ("extra_openings", -1, "from 0 to 16"),
-     ("block_m", 1.0, "from 2 to 5"), ("block_m", math.nan, "from 2 to 5"),
-     ("actuation_noise", -0.1, "from 0 to 1"), ("actuation_noise", True, "from 0 to 1"),
-     ("width", 81, "one of 80 x 60"), ("height", 80, "one of 80 x 60"),
-     ("field_of_view_deg", 108.5, "an integer from 30 to 150"), ("field_of_view_deg", 180, "from 30 to 150"),
-     ("frame_skip", 0, "from 1 to 35"), ("thrust", 51, "from 1 to 50"), ("turn_deg", 91.0, "from 0 to 90"),
-     ("turn_decay", 1.0, "from 0 to 0.99"), ("light_level", 256, "from 0 to 255"),
-     ("textures", "wool", "one of all, stone, brick, tech, industrial"), ("decorations", -1, "from 0 to 1000"),
-     ("decorations", 1001, "from 0 to 1000"), ("decorations", 2.0, "an integer from 0 to 1000")],
-)  # fmt: skip
-def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(field: str, value: Any, allowed: str) -> None:
-    with pytest.raises(ValueError, match=field) as caught:
-        Maze3DConfig(**{field: value})
-    assert str(value) in str(caught.value) and allowed in str(caught.value)
-
-
-def test_textures_of_the_mazes_are_refused_on_a_map() -> None:
-    with pytest.raises(ValueError, match="'textures' is 'brick'; allowed: 'all' together with wad"):
-        Maze3DConfig(wad="my_way_home.wad", map="map01", textures="brick")
-
-
-def test_bad_calls_are_told(shared: Maze3D) -> None:
-    shared.reset(seed=0)
-    for action in (3, -1):
-        with pytest.raises(ValueError, match=f"action is {action}; it must be 0"):
-            shared.step(action)
-    with pytest.raises(ValueError, match=r"options has \['maze'\]"):
-        shared.reset(seed=0, options={"maze": None})
-    with pytest.raises(ValueError, match="render_mode is 'human'"):
-        Maze3D(render_mode="human")
-    with pytest.raises(ValueError, match="seeds is empty"):
-        shared.preload([])
-    with pytest.raises(ValueError, match="maze_seeds has 1 seeds; it must have 2"):
-        shared.preload([1, 2], [3])
-    with pytest.raises(RuntimeError, match="before reset"):
-        Maze3D().step(FORWARD)
-
-
-def test_larger_pictures_show_the_same_scene(shared: Maze3D) -> None:
-    width, height = 320, 240
-    small, info = shared.reset(seed=9)
-    env = Maze3D(Maze3DConfig(width=width, height=height))
-    large, large_info = env.reset(seed=9)
-    env.close()
-    np.testing.assert_array_equal(info["pose_xyyaw"], large_info["pose_xyyaw"])
-    assert large.shape == (height, width, 3)
-    reduced = large.reshape(60, height // 60, 80, width // 80, 3).mean(axis=(1, 3))
-    assert np.abs(reduced - small).mean() < 12
 
 
 def test_gymnasium_finds_nothing_to_complain_about() -> None:

@@ -1,6 +1,3 @@
-import os
-import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable
 
@@ -8,7 +5,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from ngo_sim.mazes import Maze, check_aliased, draw_maze, kruskal_maze, prim_maze, repeated_maze
+from ngo_sim.mazes import Maze, draw_maze, kruskal_maze, prim_maze, repeated_maze
 
 ALGORITHMS = [prim_maze, kruskal_maze]
 MakeMaze = Callable[..., Maze]
@@ -43,27 +40,6 @@ def test_each_extra_opening_adds_exactly_one_cycle(make: MakeMaze, extra_opening
         assert len(nx.cycle_basis(maze.graph)) == extra_openings
 
 
-@pytest.mark.parametrize("make", ALGORITHMS)
-def test_all_walls_between_cells_can_be_opened(make: MakeMaze) -> None:
-    maze = make(3, 4, np.random.default_rng(0), extra_openings=6)
-    assert maze.walls[1:-1, 1:-1].sum() == 2 * 3, "only the inner pillars stand"
-
-
-@pytest.mark.parametrize("make", ALGORITHMS)
-def test_a_maze_is_a_function_of_the_seed(make: MakeMaze) -> None:
-    mazes = [make(7, 7, np.random.default_rng(seed), 3).walls.tobytes() for seed in (0, 0, *range(1, 20))]
-    assert mazes[0] == mazes[1]
-    assert len(set(mazes)) == 20
-
-
-def test_prim_has_more_dead_ends_than_kruskal() -> None:
-    def dead_ends(make: MakeMaze) -> int:
-        graphs = [make(7, 7, np.random.default_rng(seed)).graph for seed in range(30)]
-        return sum(degree == 1 for graph in graphs for _, degree in graph.degree)
-
-    assert dead_ends(prim_maze) > 1.05 * dead_ends(kruskal_maze)
-
-
 def test_blocks_and_metres_agree() -> None:
     maze = prim_maze(2, 4, np.random.default_rng(0), block_m=3.0)
     assert maze.size_m == (27.0, 15.0)
@@ -80,12 +56,6 @@ def test_blocks_and_metres_agree() -> None:
 def test_corners_are_the_four_outermost_cells() -> None:
     maze = prim_maze(2, 4, np.random.default_rng(0))
     assert {tuple(corner) for corner in maze.corners()} == {(1, 1), (1, 7), (3, 1), (3, 7)}
-
-
-def test_the_only_path_of_a_hook() -> None:
-    expected = [(3, 1), (3, 2), (3, 3), (3, 4), (3, 5), (2, 5), (1, 5), (1, 4)]
-    assert maze_of(*HOOK).shortest_path((3, 1), (1, 4)).tolist() == [list(block) for block in expected]
-    assert maze_of(*HOOK).shortest_path((1, 1), (1, 1)).tolist() == [[1, 1]]
 
 
 def breadth_first_distance(walls: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> int:
@@ -140,52 +110,6 @@ def test_wall_segments_of_a_hook() -> None:
     assert len(segments) == len(expected)
 
 
-def test_wall_segments_have_every_face_once() -> None:
-    for seed in range(5):
-        maze = prim_maze(5, 7, np.random.default_rng(seed), extra_openings=4)
-        faces = sum(
-            bool(maze.walls[row + down, col + right])
-            for row, col in maze.free_blocks()
-            for down, right in ((1, 0), (-1, 0), (0, 1), (0, -1))
-        )
-        lengths = np.linalg.norm(np.diff(maze.wall_segments(), axis=1)[:, 0], axis=1)
-        assert lengths.sum() == faces
-
-
-def test_a_maze_cannot_be_changed() -> None:
-    maze = maze_of(*HOOK)
-    with pytest.raises(ValueError, match="read-only"):
-        maze.walls[1, 1] = True
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((1, 7), "rows is 1; it must be an integer from 2 to 100"),
-        ((7, 2.5), "cols is 2.5; it must be an integer from 2 to 100"),
-        ((7, True), "cols is True; "),
-        ((3, 4, 7), "extra_openings is 7; it must be an integer from 0 to 6 in a maze of 3 x 4 cells"),
-        ((3, 4, -1), "extra_openings is -1; "),
-        ((3, 4, 0, 0.0), "block_m is 0.0; it must be a finite number above 0"),
-    ],
-)
-@pytest.mark.parametrize("make", ALGORITHMS)
-def test_impossible_mazes_are_refused(make: MakeMaze, arguments: tuple[float, ...], message: str) -> None:
-    rows, cols, *rest = arguments
-    with pytest.raises(ValueError) as error:
-        make(rows, cols, np.random.default_rng(0), *rest)
-    assert message in str(error.value)
-
-
-def test_walls_must_be_closed_and_odd() -> None:
-    with pytest.raises(ValueError, match=r"walls has shape \(4, 5\); it must be 2-D with odd sizes"):
-        Maze(np.ones((4, 5), dtype=bool))
-    walls = np.ones((5, 5), dtype=bool)
-    walls[0, 1] = False
-    with pytest.raises(ValueError, match="open at its border"):
-        Maze(walls)
-
-
 def test_the_picture_is_one_image_with_y_up() -> None:
     from matplotlib.figure import Figure
 
@@ -206,12 +130,6 @@ def test_the_picture_is_one_image_with_y_up() -> None:
         draw_maze(axes, maze, np.zeros(3))
 
 
-def test_mazes_do_not_load_matplotlib() -> None:
-    code = "import sys, ngo_sim.mazes; sys.exit('matplotlib' in sys.modules)"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
-
-
 def test_a_repeated_maze_is_connected_and_looks_the_same_from_module_to_module() -> None:
     for seed in range(20):
         maze = repeated_maze(6, 8, np.random.default_rng(seed))
@@ -220,10 +138,3 @@ def test_a_repeated_maze_is_connected_and_looks_the_same_from_module_to_module()
         modules = maze.walls[:-1, :-1].reshape(3, 4, 4, 4).swapaxes(1, 2)
         inner = modules[1:, 1:]
         assert (inner == inner[0, 0]).all()
-
-
-@pytest.mark.parametrize("size", [(5, 6, 0), (6, 7, 0), (6, 6, 1)])
-def test_an_aliased_maze_of_another_size_is_refused(size: tuple[int, int, int]) -> None:
-    with pytest.raises(ValueError, match="an aliased maze has multiples of 2, 2 and no extra openings"):
-        check_aliased(True, *size)
-    check_aliased(False, *size)

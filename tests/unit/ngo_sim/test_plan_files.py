@@ -72,9 +72,3 @@ def test_a_robot_drives_through_both_rooms_and_sees_exact_ranges(tmp_path: Path)
 def test_what_is_no_map_is_said(tmp_path: Path, changes: dict[str, str], complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         read_floor_plan(write_plan(tmp_path, **changes), 0)
-
-
-def test_a_map_without_room_is_said(tmp_path: Path) -> None:
-    Image.fromarray(np.zeros((9, 9), np.uint8)).save(tmp_path / "black.png")
-    with pytest.raises(ValueError, match="free"):
-        read_floor_plan(write_plan(tmp_path, image="black.png"), 0)

@@ -6,7 +6,6 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from ngo_common.settings import BadParameter
 from ngo_sim.episodes import record_episode
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.rooms_level import rooms_textmap
@@ -67,9 +66,3 @@ def test_an_explorer_gets_somewhere_and_the_frames_follow_from_the_seed() -> Non
     assert drives[0].maze is None and np.ptp(drives[0].poses_xyyaw[:, :2], axis=0).max() > 4.0
     np.testing.assert_array_equal(drives[0].poses_xyyaw, drives[1].poses_xyyaw)
     np.testing.assert_array_equal(drives[0].observations, drives[1].observations)
-
-
-@pytest.mark.parametrize("changes", [{"rows": 6}, {"textures": "stone"}, {"wad": "my_way_home.wad", "map": "MAP01"}])
-def test_what_shapes_mazes_or_a_map_has_no_place_beside_rooms(changes: dict[str, object]) -> None:
-    with pytest.raises(BadParameter, match="allowed"):
-        Maze3DConfig(level="rooms", **changes)  # type: ignore[arg-type]

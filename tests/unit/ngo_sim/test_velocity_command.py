@@ -36,11 +36,6 @@ def test_a_silent_command_brakes_after_the_timeout() -> None:
     np.testing.assert_allclose(speeds, [1.0, 1.0, 1.0, 0.95, 0.9, 0.85])
 
 
-def test_a_command_that_is_not_finite_is_refused() -> None:
-    with pytest.raises(ValueError, match="finite"):
-        VelocityCommand(LIMITS, 0.5).set(math.nan, 0.0)
-
-
 def building() -> Building2d:
     config = BuildingDriverConfig(driver="cmd_vel", speed_mps=1.0)
     found = Building2d(FloorPlanConfig(scale=0.3, layout="ring"), ScannerConfig(rays=36), driver=config)
@@ -103,17 +98,3 @@ def test_a_commanded_robot_in_a_maze_drives_to_the_wall_and_stops() -> None:
     run.velocity.set(0.0, 1.0)
     turned, _ = run.drive()
     assert turned.pose_xyyaw[2] != after.pose_xyyaw[2]
-
-
-def test_only_the_2d_world_takes_velocities() -> None:
-    with pytest.raises(ValueError, match="maze2d alone"):
-        Simulation(_NotMaze2d(), seed=3, driver="cmd_vel")  # type: ignore[arg-type]
-
-
-class _NotMaze2d:
-    period_s = 0.1
-    maze = None
-    default_driver = "corners"
-
-    def reset(self, **_: object) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return np.zeros(1), {"pose_xyyaw": np.zeros(3)}

@@ -70,9 +70,3 @@ def test_one_by_one_equals_all_at_once() -> None:
     single = WheelOdometry(config, PERIOD_S, np.random.default_rng(5))
     np.testing.assert_array_equal(np.concatenate([single.advance(motion[None]) for motion in motions]), together)
     np.testing.assert_array_equal(single.pose_xyyaw, together[-1])
-
-
-@pytest.mark.parametrize(("field", "value"), [("track_m", 0.0), ("lag_s", 0.5), ("left_bias", True)])
-def test_bad_wheels_are_named(field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=field):
-        WheelsConfig(**{field: value})  # type: ignore[arg-type]
