@@ -41,14 +41,6 @@ def images(*shape: int) -> torch.Tensor:
     return torch.zeros(*shape, 60, 80, 3, dtype=torch.uint8)
 
 
-def test_the_check_fails_where_devices_meet(weights: Path) -> None:
-    module = train_local.LocalTraining(train_local.Arguments("maze3d"), load_local(weights)[0])
-    batch = {"earlier": images(2), "later": images(2), "action": torch.zeros(2).long(), "relative": torch.zeros(2, 3)}
-    module.to("meta")
-    with pytest.raises(RuntimeError, match="device"):
-        module.training_step({name: x if name == "relative" else x.to("meta") for name, x in batch.items()}, 0)
-
-
 def test_the_local_networks_loss_stays_on_its_device(weights: Path) -> None:
     module = train_local.LocalTraining(train_local.Arguments("maze3d"), load_local(weights)[0].requires_grad_())
     batch = {

@@ -11,7 +11,6 @@ import torch
 from ngo_estimator.checkpoint import load_local, load_place, write_untrained
 from ngo_estimator.geometry import se2
 from training import featurise
-from training.data import feature_store
 from training.data.batches import mirrored as mirrored_batch
 from training.data.batches import relative_poses
 from training.data.data_source import MIRRORED_STORE, OTHER_TRAIN_STORE, TRAIN_STORE
@@ -44,16 +43,6 @@ def test_features_of_other_networks_are_refused(store: Path) -> None:
         check_networks(store, first, first)
 
 
-def test_arrays_are_made_once_and_their_size_is_checked(tmp_path: Path) -> None:
-    path = tmp_path / "relative.npy"
-    feature_store.stored_array(path, (3, 4), np.dtype(np.float32))[1] = 7.0
-    again = feature_store.stored_array(path, (3, 4), np.dtype(np.float32))
-    assert again[1].tolist() == [7.0] * 4 and not again[0].any()
-    with pytest.raises(ValueError, match="expected"):
-        feature_store.stored_array(path, (4, 4), np.dtype(np.float32))
-    assert [entry.name for entry in tmp_path.iterdir()] == ["relative.npy"]
-
-
 def test_a_store_begun_with_another_number_of_trajectories_is_refused_before_any_is_made(tmp_path: Path) -> None:
     write_untrained(tmp_path / "weights" / "maze3d", "maze3d")
     features = tmp_path / "maze3d" / "features"
@@ -63,12 +52,6 @@ def test_a_store_begun_with_another_number_of_trajectories_is_refused_before_any
     with pytest.raises(ValueError, match=r"train_policy was begun with 3 trajectories, 2 are asked for; expected"):
         featurise.main(arguments)
     assert [entry.name for entry in features.iterdir()] == ["train_policy"]
-
-
-@pytest.mark.parametrize("parts", [1, 2, 3, 7])
-def test_parts_share_the_groups_without_overlap(parts: int) -> None:
-    groups = [first for part in range(parts) for first in feature_store.groups_of(45, part, parts)]
-    assert sorted(groups) == list(range(0, 45, 8))
 
 
 def test_a_group_of_a_store_is_driven_as_its_seeds_say() -> None:

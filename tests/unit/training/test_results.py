@@ -9,7 +9,6 @@ from training.data.worlds import world_named
 from training.report import tables
 from training.report.maze_views import in_maze, maze_and_start
 from training.report.results_page import page
-from training.results import Arguments
 from training.scoring.scores import METRICS
 from training.scoring.table import Measured
 
@@ -59,13 +58,6 @@ def test_a_constant_turn_is_found_as_heading_bias() -> None:
     assert 0.0099 < bias["ci95"][0] < bias["ci95"][1] < 0.0301
 
 
-def test_the_path_after_some_steps() -> None:
-    truth = np.zeros((2, 4, 3))
-    truth[0, :, 0] = [1.0, 2.0, 3.0, 4.0]
-    truth[1, :, 1] = [2.0, 4.0, 6.0, 8.0]
-    assert tables.path_json(truth, (1, 4)) == {"1": pytest.approx(1.5), "4": pytest.approx(6.0)}
-
-
 def result() -> dict[str, object]:
     return {
         "command": "python -m training.results --world maze2d",
@@ -100,16 +92,6 @@ def test_the_page_has_what_the_json_has() -> None:
     assert "with 1 worker process(es): local 4,321; peak memory 0.500 GiB." in text
 
 
-def test_every_line_of_a_table_has_as_many_cells() -> None:
-    block: list[str] = []
-    for line in [*page(result(), {}, WORLD).splitlines(), ""]:
-        if line.startswith("|"):
-            block.append(line)
-        elif block:
-            assert len({row.replace(" | ", "|").count("|") for row in block}) == 1, block
-            block = []
-
-
 @pytest.mark.parametrize("index", [1, GROUP + 1])
 def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
     seeds = WORLD.table_seeds("cycles", "validation")
@@ -121,9 +103,3 @@ def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
     np.testing.assert_allclose(start, episode.poses_xyyaw[0])
     placed = in_maze(start, seen_from_first(episode.poses_xyyaw)[1:])
     np.testing.assert_allclose(placed[:, :2], episode.poses_xyyaw[:, :2], atol=1e-9)
-
-
-@pytest.mark.parametrize("change", [{"trajectories": 1}, {"seeds": 0}, {"prefixes": (0, 8)}])
-def test_settings_that_give_no_table_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        Arguments(world="maze2d", **change)  # type: ignore[arg-type]

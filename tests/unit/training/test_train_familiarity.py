@@ -2,12 +2,8 @@
 
 import torch
 
-from ngo_estimator.checkpoint import PlaceNetworks
-from ngo_estimator.networks.familiarity import Familiarity, FamiliarityConfig, look_size
-from ngo_estimator.networks.local_pose_network import LocalPoseNetwork
-from tests.unit.ngo_estimator.samples import local_config, place_config
-from training.data.features import Networks
-from training.train_familiarity import Seen, dishonest, fit, fit_disagreement
+from ngo_estimator.networks.familiarity import FamiliarityConfig
+from training.train_familiarity import Seen, dishonest, fit
 
 
 def _drive(config: FamiliarityConfig, steps: int = 400) -> Seen:
@@ -31,12 +27,6 @@ def test_an_unknown_step_is_a_step_of_the_robot_and_limits_of_few_drives_have_a_
     assert 0.02 < fitted.told_std[0] < 0.04 and 0.04 < fitted.told_std[2] < 0.06
     wider = fit(config, seen, held_out, margin=1.25).config
     assert [round(b / a, 6) for a, b in zip(fitted.limits, wider.limits, strict=True) if a < 1e8] == [1.25, 1.25, 1.25]
-
-
-def test_without_a_drive_that_is_long_enough_the_factor_stays_as_it_is() -> None:
-    networks = Networks(LocalPoseNetwork(local_config("maze2d", actions=3)), PlaceNetworks(place_config("maze2d")))
-    config = FamiliarityConfig(look_size(networks.place.encoder), networks.local.config.feature_size, 3, twist=False)
-    assert fit_disagreement(networks, Familiarity(config), "maze2d", []) == (config.disagreement, {})
 
 
 def test_faults_that_stay_outside_of_their_deviations_are_named() -> None:

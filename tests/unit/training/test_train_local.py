@@ -12,7 +12,7 @@ from torch import Tensor
 from ngo_estimator.checkpoint import LOCAL, save_checkpoint
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
-from training.common.step_losses import HEADING_WEIGHT, step_losses, step_metrics, windows_within
+from training.common.step_losses import HEADING_WEIGHT, step_losses, step_metrics
 from training.data.batches import Batch
 from training.data.worlds import WORLDS
 from training.recordings.recording_source import RecordedArguments
@@ -53,11 +53,6 @@ def test_metrics_on_paper() -> None:
     assert metrics["bias_deg"] == pytest.approx(1.0)
     # Errors in deviations: 1, 2, 0, 1, 0, 2.
     assert metrics["normalized_error"] == pytest.approx(np.sqrt((1 + 4 + 0 + 1 + 0 + 4) / 6))
-
-
-def test_heading_errors_are_wrapped() -> None:
-    metrics = step_metrics(torch.tensor([[0.0, 0.0, 3.1]]), torch.zeros(1, 3), torch.tensor([[0.0, 0.0, -3.1]]))
-    assert metrics["rmse_deg"] == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-4)
 
 
 def heading_loss(errors: list[float], windows: tuple[int, ...]) -> float:
@@ -114,11 +109,6 @@ def test_what_earlier_actions_tell_leaves_alone_what_is_seen() -> None:
     assert not torch.equal(of_steps["fusion.4.weight"], of_windows["fusion.4.weight"])
 
 
-def test_windows_that_do_not_fit_are_left_out() -> None:
-    world = dataclasses.replace(WORLDS["maze3d"], error_windows=(1, 4, 16))
-    assert windows_within(40, world.error_windows) == (1, 4, 16) and windows_within(15, world.error_windows) == (1, 4)
-
-
 def test_calibration_removes_bias_and_scale(network: LocalPoseNetwork) -> None:
     scale, bias = torch.tensor([1.3, 0.8, 0.5]), torch.tensor([0.1, -0.02, 0.01])
     pairs = pairs_with_truth(network, scale, bias)
@@ -144,15 +134,6 @@ def test_calibration_of_a_symmetric_network_removes_what_is_to_one_side(network:
     assert metrics["rmse_m"] < 1e-4 and metrics["rmse_deg"] < 1e-2
 
 
-def test_calibration_of_a_calibrated_network_changes_nothing(network: LocalPoseNetwork) -> None:
-    config = dataclasses.replace(network.config, relative_mean=(0.2, 0.0, 0.1), relative_std=(0.5, 0.2, 0.3))
-    other = LocalPoseNetwork(config).eval()
-    other.load_state_dict(network.state_dict())
-    again = calibrated(other, pairs_with_truth(other, torch.ones(3), torch.zeros(3)))
-    assert again.relative_mean == pytest.approx(config.relative_mean, abs=1e-5)
-    assert again.relative_std == pytest.approx(config.relative_std, rel=1e-4)
-
-
 def test_a_component_that_was_not_learned_keeps_a_positive_deviation(network: LocalPoseNetwork) -> None:
     pairs = pairs_with_truth(network, torch.tensor([-1.0, 1.0, 1.0]), torch.tensor([0.4, 0.0, 0.0]))
     config = calibrated(network, pairs)
@@ -174,22 +155,6 @@ def test_rpe_adds_up_errors_that_last_and_not_those_that_cancel(network: LocalPo
     assert measure(network, lasting, 300)["rpe_300_deg"] == pytest.approx(np.degrees(2.0), rel=1e-4)
     cancelling = [off(torch.tensor([1.0, -1.0]).repeat(100)[:, None])]
     assert measure(network, cancelling, 50)["rpe_50_deg"] == pytest.approx(0.0, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"world": "maze3d", "error_windows": (1, 0)}, r"error_windows is \(1, 0\); expected numbers of steps"),
-        ({"world": "maze3d", "error_windows": ()}, r"error_windows is \(\)"),
-        (
-            {"recordings": RecordedArguments(data=(Path("a.mcap"),), name="robot"), "error_windows": (1, 4)},
-            "with recordings; expected",
-        ),
-    ],
-)
-def test_windows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Arguments(**arguments)
 
 
 def begun_with(folder: Path, **changes: Any) -> LocalPoseNetwork:
@@ -225,17 +190,6 @@ def test_weights_that_know_other_things_are_refused(changes: dict[str, Any], mes
     save_checkpoint(tmp_path / f"{LOCAL}.safetensors", LocalPoseNetwork(config), LOCAL, "maze2d", {})
     with pytest.raises(RecordingError, match=message):
         begun_with(tmp_path, **changes)
-
-
-@pytest.mark.parametrize("count", [0, 13])
-def test_a_history_that_no_batch_tells_is_refused(count: int) -> None:
-    with pytest.raises(ValueError, match=f"action_history is {count}; expected 1 to 12"):
-        Arguments(world="maze3d", action_history=count)
-
-
-def test_a_history_of_actions_that_are_not_told_is_refused() -> None:
-    with pytest.raises(ValueError, match="action_history is 4 with without_action; expected one of the two"):
-        Arguments(world="maze3d", action_history=4, without_action=True)
 
 
 def test_deviations_of_many_steps_hold_errors_that_last(network: LocalPoseNetwork) -> None:

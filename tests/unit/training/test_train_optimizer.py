@@ -30,21 +30,6 @@ def chosen(given: Arguments, world: str) -> tuple[bool | None, int | None, int |
     return arguments.smoothing, arguments.loops_per_pose, arguments.max_loops, arguments.epochs
 
 
-def test_a_world_says_what_suits_it() -> None:
-    assert chosen(Arguments(world="maze3d"), "maze3d") == (True, 4, 128, 20)
-    assert chosen(Arguments(world="maze2d"), "maze2d") == (False, 4, 512, 6)
-
-
-def test_what_is_given_counts() -> None:
-    given = Arguments(world="maze3d", smoothing=False, loops_per_pose=3, max_loops=7, epochs=1)
-    assert chosen(given, "maze3d") == (False, 3, 7, 1)
-
-
-def test_the_papers_form_does_not_smooth_by_itself() -> None:
-    for form, smooths in (("loops", True), ("gauss_newton", True), ("paper", False)):
-        assert chosen(Arguments(world="maze3d", form=form), "maze3d")[0] == smooths  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_shipped_optimizers_are_made_as_their_world_says(world: str) -> None:
     shipped = load_optimizer(WEIGHTS / world, world)[0].config

@@ -13,7 +13,6 @@ import torch
 
 from ngo_estimator.checkpoint import SMOOTHER, load_local, save_checkpoint
 from ngo_estimator.geometry import se2
-from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from tests.unit.ngo_estimator.samples import small_pair_head
 from training.baselines.graph_settings import fit_calibration, load_settings
@@ -45,28 +44,6 @@ def test_the_search_ends_at_the_best_of_the_grid() -> None:
     assert least == 1.0
 
 
-def test_nothing_is_tried_twice_and_the_search_stops_when_nothing_gets_better() -> None:
-    tried: list[PoseGraphSettings] = []
-
-    def counted(settings: PoseGraphSettings) -> float:
-        tried.append(settings)
-        return valley(settings)
-
-    tune(counted, START, (*SCALES, KERNELS), passes=1000)
-    assert len(tried) == len(set(tried)) < 50
-
-
-def test_what_is_no_gain_changes_nothing() -> None:
-    best, least = tune(lambda settings: 1.0 - 1e-4 * settings.loop_position_scale, START, SCALES, passes=3)
-    assert best == START and least == 1.0 - 1e-4
-
-
-def test_every_value_of_the_grids_makes_settings() -> None:
-    for group in GRID:
-        candidates = [replace(PoseGraphSettings(), **change) for change in group]
-        assert len(set(candidates)) == len(group) > 1
-
-
 def drive(trajectories: int = 2, steps: int = 160) -> dict[str, np.ndarray]:
     """Truth of robots in circles, and an odometry that is a tenth too short and turns too far."""
     rng = np.random.default_rng(0)
@@ -76,13 +53,6 @@ def drive(trajectories: int = 2, steps: int = 160) -> dict[str, np.ndarray]:
     codes = rng.normal(0.0, 1.0, (trajectories, steps, 12)).astype(np.float16)
     log_std = np.full_like(relative, -4.0)
     return {"relative": relative, "log_std": log_std, "codes": codes, "origin_code": codes[:, :1], "truth": truth}
-
-
-def test_the_calibration_undoes_gain_and_bias() -> None:
-    arrays = drive()
-    settings = replace(START, **fit_calibration(arrays["relative"], arrays["truth"]))
-    assert settings.odometry_gain == pytest.approx((1.0 / 0.9, settings.odometry_gain[1], 1.0), abs=1e-4)
-    assert settings.odometry_bias == pytest.approx((0.0, 0.0, -0.01), abs=1e-4)
 
 
 def test_the_objective_is_the_mean_error_of_the_pose_graph() -> None:
@@ -138,13 +108,6 @@ def test_the_script_tunes_every_form_on_all_tables(tmp_path: Path, monkeypatch: 
     assert is_tuned(sources, "loops") and is_tuned(sources, "smoothed")
     save_checkpoint(weights / f"{SMOOTHER}.safetensors", OdometrySmoother(smoother.config), SMOOTHER, "maze2d", of)
     assert is_tuned(sources, "loops") and not is_tuned(sources, "smoothed")
-
-
-def test_settings_survive_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "maze2d.gtsam.json"
-    settings = replace(START, odometry_bias=(0.1, 0.0, -0.2), search=LoopSearch(per_pose=3, most=7))
-    path.write_text(json.dumps({"settings": dataclasses.asdict(settings), "validation": {}}))
-    assert load_settings(path) == settings
 
 
 @pytest.mark.parametrize(

@@ -42,15 +42,6 @@ def test_a_trajectory_in_chunks_is_the_whole_one(network: DeepVO) -> None:
         torch.testing.assert_close(trajectory_steps(network, images, chunk), whole[0], atol=1e-6, rtol=1e-4)
 
 
-def test_a_step_depends_on_what_was_seen_before_and_on_nothing_after(network: DeepVO) -> None:
-    images = pictures(21)
-    before, after = images.clone(), images.clone()
-    before[:5], after[15:] = pictures(5, 1), pictures(6, 1)
-    steps = trajectory_steps(network, images)
-    torch.testing.assert_close(trajectory_steps(network, after)[:14], steps[:14])
-    assert not torch.equal(trajectory_steps(network, before)[10], steps[10])
-
-
 def test_the_mirror_image_of_a_trajectory_gives_its_mirror_image(network: DeepVO) -> None:
     images = pictures(9)
     flipped = trajectory_steps(network, images.flip(-2)) * torch.tensor([1.0, -1.0, -1.0])
@@ -89,14 +80,3 @@ def test_a_calibrated_network_has_no_constant_error(network: DeepVO, monkeypatch
         for episode in simulate(world, seeds, 120)
     ]
     np.testing.assert_allclose(torch.cat(errors).mean(dim=0), 0.0, atol=1e-5)
-
-
-@pytest.mark.parametrize(("change", "message"), [({"width": 0.0}, "width is 0.0"), ({"width": 3.0}, "at most 2")])
-def test_a_bad_width_is_refused(change: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(CONFIG, **change)  # type: ignore[arg-type]
-
-
-def test_stretches_longer_than_an_episode_are_refused() -> None:
-    with pytest.raises(ValueError, match="steps is 401; expected 1 to 400"):
-        StretchStream(world_named("maze3d"), TRAIN_SEEDS, 0, 640, 4, 401)

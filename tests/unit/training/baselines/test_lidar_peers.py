@@ -61,20 +61,8 @@ def test_a_wrong_loop_does_little(solve: object) -> None:
     assert np.abs(poses[-1, :2] - truth[-1, :2]).max() < np.abs(start[-1, :2] - truth[-1, :2]).max() + 0.05
 
 
-def test_without_loops_nothing_moves() -> None:
-    steps, loops, start, _ = graph()
-    none = RelativePoses(loops.nodes[:0], loops.relative[:0], loops.root[:0])
-    np.testing.assert_allclose(solve_lm(steps, none, start, GraphPeerConfig())[:, :2], start[:, :2], atol=1e-6)
-    np.testing.assert_array_equal(solve_gnc(steps, none, start, GraphPeerConfig()), start)
-
-
 def test_points_of_a_scanner_that_hangs_upside_down_to_the_left() -> None:
     ranges = np.array((1.0, np.inf, 2.0, 0.01), np.float32)
     scan = LidarScan(0, 0.0, math.pi / 2, ranges, 0.05, 10.0, 0.0, "laser")
     points = scan_points(scan, Mounting(np.array((0.5, 0.0, math.pi / 2)), upside_down=True))
     np.testing.assert_allclose(points, ((0.5, 1.0), (0.5, -2.0)), atol=1e-12)
-
-
-def test_settings_are_checked() -> None:
-    with pytest.raises(ValueError, match="cauchy"):
-        GraphPeerConfig(cauchy=0.0)

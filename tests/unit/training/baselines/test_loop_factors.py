@@ -13,9 +13,7 @@ from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_pair_head, with_origin
 from training.baselines.loop_factors import (
-    EXACT_SCALE,
     Seen,
-    exact_revisits,
     found_loops,
     measured_revisits,
     overlaps_of,
@@ -30,12 +28,6 @@ def circles(steps: int = 800) -> np.ndarray:
     turn = 2.0 * np.pi * np.arange(1, steps + 1) / 200.0
     radius = 1.0 + 0.05 * turn / (2.0 * np.pi)
     return np.column_stack((radius * np.cos(turn), radius * np.sin(turn), turn + np.pi / 2.0))
-
-
-def there_and_back() -> np.ndarray:
-    """Truth of a corridor of 16 m, driven to its end and back."""
-    there = np.column_stack((0.1 * np.arange(1, 161), np.zeros(160), np.zeros(160)))
-    return np.concatenate((there, there[::-1] + [0.0, 0.1, np.pi]))
 
 
 def drives(trajectories: int, steps: int = 160) -> Seen:
@@ -71,42 +63,6 @@ def test_true_revisits_are_near_and_separated_and_as_many_as_are_looked_for() ->
     assert not (ends < 6).any()
     best = {end: distance[ends == end].min() for end in range(30, 100)}
     assert max(best.values()) < 0.06
-
-
-def test_a_place_is_the_same_in_any_heading() -> None:
-    truth = there_and_back()
-    frames, ends = true_revisits(truth, LoopSearch(per_pose=1, most=1000, min_separation=6))
-    assert set(range(23, 40)) <= set(ends.tolist()) and ends.min() > 20
-    turned = truth[8 * ends + 7, 2] - truth[frames, 2]
-    np.testing.assert_allclose(turned, np.pi)
-
-
-def test_fewer_revisits_are_an_even_selection() -> None:
-    truth = circles()
-    frames, ends = true_revisits(truth, SEARCH)
-    few_frames, few_ends = true_revisits(truth, LoopSearch(per_pose=3, most=20))
-    assert len(few_ends) == 20
-    assert set(zip(few_frames.tolist(), few_ends.tolist(), strict=True)) <= set(
-        zip(frames.tolist(), ends.tolist(), strict=True)
-    )
-    share = np.searchsorted(ends, few_ends) / len(ends)
-    np.testing.assert_allclose(share, np.linspace(0.0, 1.0, 20), atol=0.05)
-
-
-def test_a_road_that_is_never_met_again_has_no_revisits() -> None:
-    straight = np.column_stack((0.1 * np.arange(1, 161), np.zeros((160, 2))))
-    assert [len(part) for part in true_revisits(straight, SEARCH)] == [0, 0]
-    assert len(exact_revisits(straight, SEARCH).start) == 0
-
-
-def test_exact_revisits_lead_from_start_to_end() -> None:
-    truth = circles()
-    loops = exact_revisits(truth, SEARCH)
-    poses = torch.from_numpy(np.concatenate((np.zeros((1, 3)), truth[7::8])))
-    reached = se2.compose(poses[loops.start], torch.from_numpy(loops.measured))
-    np.testing.assert_allclose(reached[:, :2], poses[loops.end + 1, :2], atol=1e-9)
-    np.testing.assert_allclose(se2.wrap(reached[:, 2] - poses[loops.end + 1, 2]), 0.0, atol=1e-9)
-    np.testing.assert_allclose(np.exp(loops.log_scale), np.tile(EXACT_SCALE, (len(loops.end), 1)))
 
 
 def test_measured_revisits_are_true_places_with_what_the_pair_head_says() -> None:

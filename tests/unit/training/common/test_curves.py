@@ -12,7 +12,6 @@ import torch
 
 from training.common import curves
 from training.common.curves import Curves, memory_mb
-from training.common.records import write_at_once
 
 
 def trainer(epoch: int, **metrics: float) -> Any:
@@ -85,17 +84,3 @@ def test_memory_counts_what_child_processes_hold() -> None:
         assert memory_mb() > before + 180.0
         child.communicate("")
     assert memory_mb() < before + 100.0
-
-
-def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "new" / "file"
-    write_at_once(path, "first")
-
-    def fail(*_: object) -> None:
-        raise OSError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(curves.os, "replace", fail)
-        with pytest.raises(OSError):
-            write_at_once(path, "second")
-    assert path.read_text() == "first"

@@ -8,7 +8,7 @@ import torch
 
 from tests.unit.training.common.test_runs import Arguments
 from training.common import precision, records, runs
-from training.common.precision import cpu_gain, resolved
+from training.common.precision import resolved
 
 
 @pytest.mark.parametrize(("gain", "expected"), [(0.6, "32-true"), (1.2, "32-true"), (1.3, "bf16-mixed")])
@@ -24,19 +24,6 @@ def test_a_gpu_says_what_it_can(supported: bool, expected: str, monkeypatch: pyt
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: supported)
     assert resolved("auto", "auto", 1)[0] == resolved("gpu", "2", 1)[0] == expected
-
-
-def test_nothing_is_measured_for_several_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(precision, "cpu_gain")
-    assert resolved("cpu", "2", 1)[0] == resolved("cpu", "1", 2)[0] == "32-true"
-
-
-def test_the_measurement_leaves_the_random_numbers_alone() -> None:
-    torch.manual_seed(3)
-    expected = torch.rand(4)
-    torch.manual_seed(3)
-    assert 0.0 < cpu_gain() < 100.0
-    assert torch.equal(torch.rand(4), expected)
 
 
 def test_a_run_says_its_precision_once_and_keeps_it(

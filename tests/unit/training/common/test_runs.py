@@ -90,24 +90,6 @@ def test_a_run_does_not_go_on_with_other_arguments(tmp_path: Path) -> None:
         begin(tmp_path, batch_size=4)
 
 
-def test_a_run_does_not_go_on_with_other_settings_of_its_world(tmp_path: Path) -> None:
-    def begin(**settings: object) -> runs.Run:
-        return runs.Run(
-            tmp_path,
-            "train_local",
-            Arguments("maze2d", accelerator="cpu", precision="32-true"),
-            2,
-            settings=settings,
-        )
-
-    begin(drivers=["corners"], loss_scale=0.1).finish({})
-    (tmp_path / "last.ckpt").touch()
-    run = begin(drivers=["corners"], loss_scale=0.1)
-    assert run.finish({})["settings"] == {"drivers": ["corners"], "loss_scale": 0.1}
-    with pytest.raises(ValueError, match=r"given loss_scale 0.3; expected loss_scale 0.1 to go on with it"):
-        begin(drivers=["corners"], loss_scale=0.3)
-
-
 @pytest.mark.parametrize("nodes", [0, 2])
 def test_a_training_on_machines_that_nothing_started_together_is_refused(nodes: int, tmp_path: Path) -> None:
     with pytest.raises(records.RunError, match=f"--num-nodes is {nodes}, and this process was started alone"):

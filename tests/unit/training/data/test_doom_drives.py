@@ -8,7 +8,7 @@ import pytest
 from ngo_sim.doom_engine import SHIPPED
 from ngo_sim.doom_wad import find_wad, read_wad
 from training.data import doom_drives
-from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, doom_episodes, map_drive
+from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, doom_episodes
 from training.data.worlds import TRAIN_SEEDS, VALIDATION_SEEDS
 
 
@@ -37,10 +37,3 @@ def test_other_seeds_have_a_drive_each_on_maps_in_rooms_and_in_mazes() -> None:
     assert [drive.maze is not None for drive in drives] == [False] * 3 + [True] * 2
     (again,) = doom_episodes(VALIDATION_SEEDS[5:6], 3)
     np.testing.assert_array_equal(again.poses_xyyaw, drives[2].poses_xyyaw)
-
-
-def test_a_drawn_start_differs_from_the_maps_own() -> None:
-    of = VALIDATION_MAPS[0]
-    own, drawn = map_drive(of, 20_000, 2), map_drive(of, 20_000, 2, drawn_start=True)
-    starts = [tuple(drive.poses_xyyaw[0, :2].round(1)) for drive in (own, drawn)]
-    assert len(set(starts)) == 2

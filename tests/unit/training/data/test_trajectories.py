@@ -83,11 +83,6 @@ def test_batches_are_a_function_of_seed_epoch_and_process(store: Path) -> None:
         assert not all(a["motion"].equal(b["motion"]) for a, b in zip(first, other, strict=True))
 
 
-def test_more_trajectories_than_there_are_cannot_be_drawn(store: Path) -> None:
-    with pytest.raises(ValueError, match="batch_size is 11; expected at most 10"):
-        RandomStretches(stored(store, None), 1, 11, 0, 0)
-
-
 def test_where_overlaps_are_looked_for_a_stretch_has_its_ranges(tmp_path: Path) -> None:
     relative, log_std, codes, truth = (value.numpy() for value in drive_with_a_camera(48))
     arrays = {"relative": relative, "log_std": log_std, "codes": codes.astype(np.float16), "truth": truth}

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +16,8 @@ from training.data.worlds import (
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
     WORLDS,
-    MazeSize,
     Table,
     World,
-    world_named,
 )
 from training.train_local import Arguments
 
@@ -39,41 +36,6 @@ def test_the_two_trainings_on_pairs_share_no_maze() -> None:
     local = PairStream(world, TRAIN_SEEDS, 99, 200_000, 256)
     place = PlaceStream(world, TRAIN_SEEDS[len(TRAIN_SEEDS) // 2 :], 0, 256, 24)
     assert max(map(max, local.groups)) < min(map(min, place.groups))
-
-
-def test_world_named_knows_both_and_names_them() -> None:
-    assert world_named("maze2d").name == "maze2d" and world_named("maze3d").name == "maze3d"
-    with pytest.raises(ValueError, match=r"maze4d.*maze2d, maze3d"):
-        world_named("maze4d")
-
-
-def test_2d_environments_are_those_that_the_networks_take() -> None:
-    world = WORLDS["maze2d"]
-    (episode,) = simulate(world, [5], 3)
-    assert episode.observations.reshape(3, *world.image.shape).dtype == np.dtype(world.image.dtype)
-    assert episode.period_s == world.period_s
-    assert episode.maze.block_m == world.block_m
-    world.image.check(episode.observations[0].reshape(world.image.shape))
-
-
-def test_training_mazes_vary_within_their_ranges() -> None:
-    world = WORLDS["maze2d"]
-    sizes = set()
-    for seed in range(30):
-        env = world.make_random(np.random.default_rng(seed))
-        config = env.unwrapped.config  # type: ignore[attr-defined]
-        assert world.rows[0] <= config.rows == config.cols <= world.rows[1]
-        assert world.extra_openings[0] <= config.extra_openings <= world.extra_openings[1]
-        sizes.add((config.rows, config.extra_openings))
-        env.close()
-    assert {rows for rows, _ in sizes} == set(range(world.rows[0], world.rows[1] + 1))
-
-
-def test_make_without_a_size_is_the_simulators_own() -> None:
-    from ngo_sim.maze2d import Maze2DConfig
-
-    assert WORLDS["maze2d"].make().unwrapped.config == Maze2DConfig()  # type: ignore[attr-defined]
-    assert WORLDS["maze2d"].make(4, 1).unwrapped.config == Maze2DConfig(rows=4, cols=4, extra_openings=1)  # type: ignore[attr-defined]
 
 
 SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
@@ -129,21 +91,3 @@ def test_a_table_of_another_driver_has_the_same_mazes_and_starts() -> None:
     np.testing.assert_array_equal(ours.maze.walls, by_chance.maze.walls)
     np.testing.assert_array_equal(ours.poses_xyyaw[0], by_chance.poses_xyyaw[0])
     assert not np.array_equal(ours.actions, by_chance.actions)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [({"stretch": 2}, "stretch is 2; expected 0 to 1"), ({"size": MazeSize(4), "seen": True}, "as they were drawn")],
-)
-def test_a_table_that_cannot_be_is_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Table(**change)
-
-
-def test_tables_say_what_their_mazes_are() -> None:
-    world = WORLDS["maze2d"]
-    for table, openings in (("perfect", 0), ("cycles", 8)):
-        env = world.make_random(np.random.default_rng(0), world.tables[table].size)
-        config = env.unwrapped.config  # type: ignore[attr-defined]
-        assert (config.rows, config.cols, config.extra_openings) == (7, 7, openings)
-        env.close()

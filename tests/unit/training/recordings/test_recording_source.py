@@ -76,13 +76,6 @@ def test_no_frame_is_in_two_parts_and_borders_have_a_gap(files: list[Path], tmp_
         assert len(used) == 5 * FRAMES
 
 
-def test_the_holdout_is_the_one_that_is_named(files: list[Path], tmp_path: Path) -> None:
-    data = open_recorded(RecordedArguments(data=tuple(files[:3]), holdout=(files[0],)), tmp_path)
-    assert {track.recording for track in data.tracks("test")} == {0}
-    with pytest.raises(ValueError, match=r"holdout is other\.mcap"):
-        RecordedArguments(data=tuple(files[:3]), holdout=(Path("other.mcap"),))
-
-
 def test_a_track_ends_where_frames_or_true_poses_are_missing(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     drives.write(path, FRAMES, seed=0, without_frames=range(100, 110), without_poses=range(300, 320))
@@ -151,17 +144,6 @@ def test_a_scanner_that_looks_to_one_side_keeps_all_its_rays() -> None:
     image = format_of(left_half, None, turned)
     assert image.field_of_view_deg == pytest.approx(180.0) and image.width == 181
     np.testing.assert_allclose(observation(image, left_half.image, left_half.scan, turned), ranges, atol=1e-6)
-
-
-def test_a_true_trajectory_that_changes_is_read_anew(files: list[Path], tmp_path: Path) -> None:
-    def truth(x: float) -> float:
-        file.write_text("".join(f"{1.0 + 0.1 * k:.9f} {x + k} 0 0 0 0 0 1\n" for k in range(FRAMES)))
-        given = TopicArguments(ground_truth=str(file))
-        _, (stored,), _ = make_store(tmp_path / "store", (files[0],), given, None, None)
-        return float(stored.poses_xyyaw[0, 0])
-
-    file = tmp_path / "truth.tum"
-    assert (truth(0.0), truth(10.0)) == (0.0, 10.0)
 
 
 def test_actions_that_no_network_knows_are_refused(tmp_path: Path) -> None:

@@ -10,13 +10,10 @@ from ngo_estimator.geometry import se2
 from ngo_recordings.errors import RecordingError
 from tests.unit.training import drives
 from training.data.batches import Share, mirrored
-from training.data.data_source import Domain
 from training.recordings.recording_source import RecordedArguments, RecordedData, open_recorded
 from training.recordings.recording_streams import (
     RecordedPairs,
     RecordedPlaces,
-    known_side_information,
-    pairs_at,
     revisited,
     windows,
 )
@@ -106,13 +103,3 @@ def test_stretches_are_equally_long_whole_blocks_and_mirrored(data: RecordedData
     assert sum(mirror for _, mirror in found.cuts) == len(found.cuts) / 2
     with pytest.raises(RecordingError, match="expected 5000 or more"):
         windows(data.domain, data.tracks("train"), 9000, 5000, 8)
-
-
-def test_networks_are_told_only_what_their_domain_has(data: RecordedData) -> None:
-    track = dataclasses.replace(
-        data.tracks("train")[0], twists=np.ones((len(data.tracks("train")[0]) - 1, 3), np.float32)
-    )
-    batch = pairs_at(track, np.arange(3))
-    assert "twist" in batch and "twist" not in known_side_information(data.domain, batch)
-    told: Domain = dataclasses.replace(data.domain, twist=True)
-    np.testing.assert_array_equal(mirrored(known_side_information(told, batch))["twist"], [[1.0, -1.0, -1.0]] * 3)

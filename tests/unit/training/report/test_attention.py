@@ -25,14 +25,6 @@ def pairs(count: int, *which: tuple[int, int]) -> np.ndarray:
     return result
 
 
-def test_uniform_attention_has_full_entropy_and_no_preference() -> None:
-    uniform = attention(np.full((2, 10, 10), 0.1), pairs(10, (0, 7), (0, 8), (1, 9)))
-    np.testing.assert_allclose(uniform.relative_entropy, 1.0)
-    # Five meta-poses come back: one to two others, four to one other.
-    np.testing.assert_allclose(uniform.revisit_mass, (0.2 + 4 * 0.1) / 5)
-    np.testing.assert_allclose(uniform.revisit_mass, uniform.uniform_share)
-
-
 def test_attention_on_one_pose_has_no_entropy() -> None:
     weights = np.zeros((1, 10, 10))
     weights[0, :, 7] = 1.0
@@ -79,8 +71,3 @@ def test_it_is_the_attention_that_the_optimizer_computes(form: str, monkeypatch:
     np.testing.assert_allclose(found.weights, torch.cat(computed[:iterations]).numpy(), atol=1e-6)
     np.testing.assert_allclose(found.weights.sum(axis=-1), 1.0, atol=1e-5)
     assert len(list(attention_of(optimizer, pair_head, arrays(), WORLD))) == 2
-
-
-def test_an_optimizer_without_attention_is_refused() -> None:
-    with pytest.raises(ValueError, match="no attention"):
-        next(attention_of(small_optimizer("gauss_newton"), small_pair_head(), arrays(), WORLD))

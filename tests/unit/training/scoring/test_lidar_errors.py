@@ -27,17 +27,6 @@ def test_the_best_alignment_takes_a_rigid_motion_out() -> None:
     assert absolute_error_m(turned(SQUARE, 3.0, -7.0, 2.5), SQUARE) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_what_no_rigid_motion_takes_out_is_left() -> None:
-    # Corners of a square half as large again: each is off by half the shorter diagonal's half.
-    wide = SQUARE * (1.5, 1.5, 1.0)
-    assert absolute_error_m(turned(wide, 1.0, 1.0, -1.0), SQUARE) == pytest.approx(0.5 * math.sqrt(2.0))
-
-
-def test_a_mirrored_path_is_not_aligned_by_a_mirror() -> None:
-    line = np.array(((0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (4.0, 1.0, 0.0)))
-    assert absolute_error_m(line * (1.0, -1.0, 1.0), line) > 0.3
-
-
 def test_truth_gives_three_errors_and_a_mapper_one() -> None:
     estimate = turned(SQUARE, 5.0, 5.0, 1.0)
     found = lidar_errors(TruePoses(STAMPS, SQUARE), STAMPS, estimate)
@@ -48,14 +37,6 @@ def test_truth_gives_three_errors_and_a_mapper_one() -> None:
     assert lidar_errors(ReferencePoses(STAMPS, SQUARE), STAMPS, estimate).keys() == {"ate_m"}
 
 
-def test_one_pose_in_four_that_is_off() -> None:
-    estimate = SQUARE.copy()
-    estimate[3, 0] += 1.0
-    found = lidar_errors(TruePoses(STAMPS, SQUARE), STAMPS, estimate)
-    assert found["position_rmse_m"] == pytest.approx([0.5])
-    assert found["heading_rmse_deg"] == pytest.approx([0.0], abs=1e-9)
-
-
 def test_relations_give_an_error_each() -> None:
     wanted = Relations(
         np.array(((10.0, 11.0), (11.0, 12.0))), np.array(((2.0, 0.0, math.pi / 2), (1.0, 0.0, math.pi / 2)))
@@ -63,11 +44,6 @@ def test_relations_give_an_error_each() -> None:
     found = lidar_errors(wanted, STAMPS, SQUARE)
     assert found["translation_m"] == pytest.approx([0.0, 1.0])
     assert found["far_m"].shape == (0,)
-
-
-def test_without_a_reference_there_is_no_error() -> None:
-    with pytest.raises(ValueError, match="expected a reference"):
-        lidar_errors(None, STAMPS, SQUARE)
 
 
 def test_the_truth_is_within_three_deviations_of_a_published_pose_or_not() -> None:

@@ -20,12 +20,6 @@ def drive() -> LidarDrive:
     return LidarDrive("straight", "straight", scans, wheels, Mounting(np.zeros(3)), TruePoses(STAMPS, POSES))
 
 
-def test_wheels_come_before_the_scan_of_the_same_stamp() -> None:
-    kinds = [type(record).__name__ for record in drive().records()]
-    assert kinds == ["WheelPose", "LidarScan"] * 5
-    assert [type(record).__name__ for record in drive().records(with_wheels=False)] == ["LidarScan"] * 5
-
-
 def test_errors_and_what_is_drawn_of_an_estimate(tmp_path: Path) -> None:
     def estimate(_: DriveRuns) -> Estimate:
         return Estimate(STAMPS, POSES + (0.0, 0.5, 0.0), facts={"loops": 3})
@@ -34,11 +28,6 @@ def test_errors_and_what_is_drawn_of_an_estimate(tmp_path: Path) -> None:
     assert measured.errors["ate_m"] == pytest.approx([0.0], abs=1e-9)
     assert measured.errors["loops"] == pytest.approx([3.0])
     assert measured.drawn["path"].shape == measured.drawn["truth"].shape == (5, 3)
-
-
-def test_wheels_alone_are_as_wrong_as_they_are(tmp_path: Path) -> None:
-    measured = scored(DriveRuns(drive(), tmp_path), ROWS["wheels"])
-    assert measured.errors["position_rmse_m"] == pytest.approx([np.sqrt(np.mean((0.5 * np.arange(5)) ** 2))])
 
 
 def test_a_row_that_needs_wheels_says_that_there_are_none(tmp_path: Path) -> None:

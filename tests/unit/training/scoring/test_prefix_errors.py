@@ -1,7 +1,6 @@
 """Errors on prefixes: each from its own frames alone."""
 
 import numpy as np
-import pytest
 
 from training.data.worlds import world_named
 from training.scoring.prefix_errors import prefix_errors, stacked
@@ -33,8 +32,3 @@ def test_every_prefix_is_estimated_from_its_own_frames() -> None:
         for name, values in expected.items():
             np.testing.assert_allclose(stacked([measured, measured], length, name), [values, values])
     np.testing.assert_allclose(measured.drawn["poses"], TRUTH + [2.0, 0.0, 0.0], atol=1e-5)
-
-
-def test_prefixes_beyond_the_trajectory_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected 1 to 20"):
-        prefix_errors(Estimator(Counted(), "one"), ARRAYS, (21,), WORLD)

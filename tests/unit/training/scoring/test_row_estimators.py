@@ -25,7 +25,6 @@ from training.data.worlds import WORLDS, world_named
 from training.scoring.row_estimators import (
     Arrays,
     Prepared,
-    calibrated,
     estimators,
     local,
     optimized_by,
@@ -33,7 +32,7 @@ from training.scoring.row_estimators import (
     prefix,
     registered,
 )
-from training.scoring.table_rows import ROWS, Sources, rows_of, trainings_of
+from training.scoring.table_rows import ROWS, Sources, rows_of
 
 STEPS = 101  # twelve blocks of 8, and a tail
 
@@ -80,47 +79,12 @@ def test_the_classical_rows_keep_the_odometry_behind_the_last_whole_block(pair_h
         np.testing.assert_allclose(np.linalg.norm(steps, axis=2), np.linalg.norm(expected, axis=2), atol=1e-6)
 
 
-def test_odometry_is_the_composition_of_its_steps() -> None:
-    relative = np.array([[[1.0, 0.0, np.pi / 2], [2.0, 0.0, np.pi / 2], [0.0, 3.0, 0.0]]], dtype=np.float32)
-    expected = [[1.0, 0.0, np.pi / 2], [1.0, 2.0, np.pi], [1.0, -1.0, np.pi]]
-    np.testing.assert_allclose(local({"relative": relative})[0], expected, atol=1e-6)
-
-
-def test_a_calibration_is_a_gain_and_a_bias() -> None:
-    some = calibrated(
-        {"relative": np.ones((1, 2, 3))}, {"odometry_gain": (2.0, 1.0, 1.0), "odometry_bias": (0.0, 0.0, 0.5)}
-    )
-    np.testing.assert_array_equal(some["relative"], [[[2.0, 1.0, 1.5]] * 2])
-
-
 def test_a_prefix_has_its_first_frame_and_nothing_that_follows() -> None:
     some = {"relative": np.arange(1, 101)[None], "origin_code": np.zeros((1, 1, 12))}
     for steps in (4, 30, 50, 100):
         seen = prefix(some, steps)
         assert seen["relative"].tolist() == [list(range(1, steps + 1))]
         assert seen["origin_code"].shape == (1, 1, 12)
-
-
-def test_less_than_a_meta_pose_is_refused(pair_head: PairHead) -> None:
-    with pytest.raises(ValueError, match="7 steps make no meta-pose; expected at least 8"):
-        optimized_by(small_optimizer("loops"), pair_head)(prefix(arrays(), 7))
-
-
-def test_an_unknown_row_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="row is 'ngo_9'; expected one of local, "):
-        estimators("ngo_9", 1, Sources(world_named("maze2d"), tmp_path, tmp_path, tmp_path))
-
-
-def test_every_world_has_the_rows_that_are_no_worlds_own() -> None:
-    for world in WORLDS.values():
-        everywhere = {name for name, row in ROWS.items() if not (row.worlds or row.registered or row.smoothed)}
-        assert everywhere <= set(rows_of(world))
-
-
-def test_only_a_world_of_scans_has_rows_that_are_registered() -> None:
-    for name in ("registered", "gtsam_registered"):
-        assert ROWS[name].registered
-        assert name in rows_of(world_named("maze2d")) and name not in rows_of(world_named("maze3d"))
 
 
 def test_worlds_have_the_rows_that_are_theirs() -> None:
@@ -152,11 +116,6 @@ def test_what_is_smoothed_is_what_our_optimizer_takes(tmp_path: Path) -> None:
     (graph,) = estimators("gtsam_smoothed", 1, sources)
     np.testing.assert_allclose(graph.poses(some)[:, 7::8], expected, atol=1e-4)
     assert smoothed.identity != graph.identity
-
-
-def test_only_what_is_trained_has_trainings() -> None:
-    rows = ("local", "gtsam", "ngo_5", "end_to_end", "deepvo", "local_no_action")
-    assert [trainings_of(row, 3) for row in rows] == [0, 0, 3, 1, 1, 1]
 
 
 def test_what_is_registered_is_what_our_optimizer_takes() -> None:

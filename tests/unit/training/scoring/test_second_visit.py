@@ -33,9 +33,3 @@ def test_a_second_visit_lies_where_it_was_put(motion: tuple[float, float, float]
     assert found.degrees == pytest.approx(math.degrees(motion[2]), abs=0.2)
     assert found.share > 0.9
     assert found.share_before > 0.9 if not any(motion) else found.share_before < 0.5
-
-
-def test_a_short_way_has_no_second_visit() -> None:
-    poses = ring()[:100]
-    with pytest.raises(ValueError, match="more than 120 m"):
-        second_visit(seen(poses), poses)

@@ -6,7 +6,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from training.scoring import metrics, relations, table
+from training.scoring import metrics, relations
 from training.scoring.statistics import RESAMPLES
 from training.scoring.table import (
     Drive,
@@ -16,7 +16,6 @@ from training.scoring.table import (
     folder_digest,
     interval_of,
     intervals,
-    kept,
     means_over_samples,
     measure,
     pairs,
@@ -63,11 +62,6 @@ def test_the_interval_is_that_of_a_binomial(tmp_path: Path) -> None:
     assert interval_of(values)["mean"] == 0.5
     assert [low, high] == pytest.approx([0.5 - 1.96 * deviation, 0.5 + 1.96 * deviation], abs=0.012)
     assert RESAMPLES >= 10_000
-
-
-def test_a_single_number_has_no_interval_and_nothing_no_mean() -> None:
-    assert interval_of(np.array([2.0])) == {"mean": 2.0, "ci95": None}
-    assert interval_of(np.zeros(0)) == {"mean": None, "ci95": None}
 
 
 def test_what_is_known_is_read_and_no_drive_is_made(tmp_path: Path) -> None:
@@ -139,20 +133,6 @@ def test_with_known_rows_alone_nothing_is_measured(tmp_path: Path) -> None:
     found = measure(plan, tmp_path, known_only=True)
     assert {drive: list(rows) for drive, rows in found.items()} == {"a": ["one"], "b": []}
     assert other.asked == []
-
-
-def test_why_there_is_nothing_is_kept(tmp_path: Path) -> None:
-    for _ in range(2):
-        found = measure([(drives()[0], {"one": Row(lambda _: Measured(failed="no scan fits"))})], tmp_path)
-        assert found["a"]["one"].failed == "no scan fits" and found["a"]["one"].errors == {}
-
-
-def test_arrays_are_kept_as_measurements_are(tmp_path: Path) -> None:
-    path = tmp_path / "arrays.npz"
-    assert kept(path, "one", lambda: {"a": np.arange(3)})["a"].tolist() == [0, 1, 2]
-    assert kept(path, "one", dict)["a"].tolist() == [0, 1, 2]
-    assert kept(path, "two", dict) == {}
-    assert table.read(path, "one") is None
 
 
 def test_rows_are_paired_on_the_drives_where_both_have_a_number() -> None:
