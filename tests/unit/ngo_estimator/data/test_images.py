@@ -9,22 +9,6 @@ from ngo_estimator.data.images import ImageFormat, reduced, to_network
 from ngo_estimator.data.observations import observation
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        (0, 80, 3, "uint8"),
-        (60, 7, 3, "uint8"),
-        (60, 80, 4, "uint8"),
-        (60, 80, 3, "float32"),
-        (1, 9, 1, "u1"),
-        (1, 9, 2, "uint8"),
-    ],
-)
-def test_impossible_image_formats_are_refused(arguments: tuple[int, int, int, str]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        ImageFormat(*arguments)
-
-
 def test_check_names_what_is_wrong() -> None:
     image = WORLD_IMAGES["maze2d"]
     good = np.ones((1, 241, 4), np.float32)
@@ -65,14 +49,6 @@ def test_grey_and_depth_images_enter_like_colour_and_like_scans() -> None:
     depth = ImageFormat(2, 9, 1, "float32", depth_gain_m=2.0, depth_softening_m=1.0)
     values = to_network(torch.tensor([1.0, torch.inf]).reshape(1, 1, 2, 1), depth)
     assert values.flatten().tolist() == [1.0, 0.0]
-
-
-def test_colour_with_a_depth_that_did_not_return_is_as_far_as_can_be() -> None:
-    image = WORLD_IMAGES["maze2d"]
-    scan = np.full((1, 241, 4), 0.5, np.float32)
-    scan[0, 0, 3] = np.inf
-    image.check(scan)
-    assert to_network(torch.from_numpy(scan), image)[:, 0, 0].tolist() == [0.0, 0.0, 0.0, -0.5]
 
 
 def test_larger_pictures_are_averaged_and_their_depths_taken_from_the_middle() -> None:

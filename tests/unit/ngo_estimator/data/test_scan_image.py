@@ -2,7 +2,6 @@
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,17 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ngo_estimator.checkpoint import WORLD_IMAGES
 from ngo_estimator.data.images import ImageFormat, scan_image, to_network
 from tests.unit.ngo_estimator.samples import SCAN
 
 EIGHT = ImageFormat(1, 9, 1, "float32", field_of_view_deg=360.0)  # a ray every 45 degrees, from back over left
-
-
-def test_rays_are_evenly_spread_from_left_to_right() -> None:
-    angles = np.degrees(SCAN.ray_angles_rad)
-    assert angles[0] == 180.0 and angles[-1] == -180.0 and angles[144] == 0.0
-    np.testing.assert_allclose(np.diff(angles), -1.25, atol=1e-9)
 
 
 def test_a_scan_of_the_formats_own_rays_is_taken_as_it_is() -> None:
@@ -67,20 +59,6 @@ def test_what_the_scanner_does_not_look_at_has_no_return(begin_deg: int, end_deg
     for turn in (-360, 0, 360):
         inside |= (degrees + turn >= begin_deg - 0.5) & (degrees + turn < end_deg + 0.5)
     np.testing.assert_array_equal(np.isfinite(seen), inside)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 0.0, -1.0, 0.05, 30.5])
-def test_what_is_no_measurement_has_no_return(value: float) -> None:
-    ranges = np.full(9, 2.0)
-    ranges[4] = value
-    seen = scan_image(EIGHT, ranges, math.pi, -math.pi / 4, 0.1, 30.0).ravel()
-    assert np.isinf(seen[4]) and seen[4] > 0 and (np.delete(seen, 4) == 2.0).all()
-
-
-@pytest.mark.parametrize("range_max_m", [0.0, -1.0, math.nan])
-def test_a_greatest_range_that_the_driver_leaves_open_is_none(range_max_m: float) -> None:
-    seen = scan_image(EIGHT, np.full(9, 50.0), math.pi, -math.pi / 4, 0.1, range_max_m)
-    assert (seen == 50.0).all()
 
 
 def test_a_fine_scanner_may_lose_rays_that_others_stand_for() -> None:
@@ -162,19 +140,6 @@ def test_a_scan_enters_the_network_with_no_return_as_zero() -> None:
     assert values.count_nonzero() == 2
 
 
-def test_a_scan_is_checked() -> None:
-    good = np.full(SCAN.shape, np.inf, np.float32)
-    good[0, 3, 0] = 1.0
-    SCAN.check(good)
-    for wrong, words in ((np.nan, "1 values that are not finite"), (-np.inf, "not finite"), (-0.1, "1 negative")):
-        bad = good.copy()
-        bad[0, 5, 0] = wrong
-        with pytest.raises(ValueError, match=words):
-            SCAN.check(bad)
-    with pytest.raises(ValueError, match="no return in 289 depths"):
-        SCAN.check(np.full(SCAN.shape, np.inf, np.float32))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -188,23 +153,3 @@ def test_a_geometry_that_no_scanner_has_is_refused(change: dict[str, object], wo
     scan = {"angle_min_rad": -1.0, "angle_increment_rad": 0.1, "range_min_m": 0.0, "range_max_m": 9.0}
     with pytest.raises(ValueError, match=words):
         scan_image(SCAN, **{"ranges": np.ones(20), **scan, **change})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"height": 2}, "a scan is"),
-        ({"channels": 4}, "a scan is"),
-        ({"field_of_view_deg": 0.0}, "field_of_view_deg is 0.0"),
-        ({"field_of_view_deg": 361.0}, "at most 360"),
-        ({"depth_gain_m": 0.0}, "positive distances"),
-    ],
-)
-def test_impossible_scan_formats_are_refused(change: dict[str, object], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        replace(SCAN, **change)  # type: ignore[arg-type]
-
-
-def test_a_picture_has_no_rays() -> None:
-    with pytest.raises(ValueError, match="no ray angles"):
-        _ = WORLD_IMAGES["maze3d"].ray_angles_rad

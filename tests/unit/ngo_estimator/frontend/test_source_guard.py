@@ -40,15 +40,3 @@ def test_another_takes_over_when_the_first_is_silent() -> None:
     assert not guard.admits(2, "second", 1, S - 1)
     assert guard.admits(2, "second", 2, S)
     assert not guard.admits(2, "first", 10, S + 1)
-
-
-def test_reset_holds_on_to_nobody() -> None:
-    guard = SourceGuard(1.0)
-    assert guard.admits(2, "first", 1, 0)
-    guard.reset()
-    assert guard.admits(2, "second", 1, 0)
-
-
-def test_a_timeout_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"timeout_s is 0\.0; expected more than 0"):
-        SourceGuard(0.0)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ngo_estimator.geometry.planar_motion import Array, between, compose, transformed
+from ngo_estimator.geometry.planar_motion import Array, compose, transformed
 from ngo_estimator.geometry.scan_points import Mounting, Sweep, key_scan, range_noise
 from tests.unit.ngo_estimator.ray_casting import MAX_RANGE, ROOM, cast, fan, scan_at
 
@@ -75,11 +75,6 @@ def test_rays_without_return_are_free_space_and_holes_are_unknown() -> None:
     assert off_walls(transformed(BASE, scan.points)).max() < 0.03
 
 
-def test_an_empty_scan_has_no_points() -> None:
-    scan = key_scan(0, fan(90), np.full(90, math.inf), LIMITS, AHEAD)
-    assert scan.points.shape == scan.normals.shape == (0, 2)
-
-
 def test_points_of_a_surface_are_spaced() -> None:
     scan = scan_at(ROOM, BASE, angles=fan(3000, 180.0))
     gaps = np.hypot(*np.diff(scan.points, axis=0).T)
@@ -102,11 +97,6 @@ def test_noise_is_estimated_and_does_not_cost_the_normals(rays: int, noise_m: fl
         estimates.append(range_noise(angles, np.where(np.arange(rays) % 30 < 10, 0.7 * ranges, ranges)))
     assert np.mean(estimates) == pytest.approx(noise_m, rel=0.35, abs=1e-3)
     assert np.mean(shares) > 0.85 and np.mean(errors_deg) < 15.0
-
-
-def test_noise_of_scans_that_do_not_tell_it() -> None:
-    assert range_noise(fan(15, 90.0), np.ones(15)) == 0.0
-    assert range_noise(np.linspace(-3.0, 3.0, 40), np.ones(40)) == 0.0  # neighbours see different walls
 
 
 def test_no_line_joins_two_surfaces() -> None:
@@ -133,22 +123,3 @@ def test_the_sweep_is_removed() -> None:
     assert np.quantile(off_walls(transformed(BASE, smeared.points)), 0.9) > 0.05
     assert np.quantile(off_walls(transformed(BASE, scan.points)), 0.9) < 0.002
     assert (np.diff(scan.angles) >= 0.0).all()
-
-
-def test_a_pose_between_others() -> None:
-    a, b = np.array((1.0, 2.0, 3.0)), np.array((-1.0, 0.5, -3.0))
-    assert compose(a, between(a, b)) == pytest.approx(b)
-
-
-@pytest.mark.parametrize(
-    ("angles", "ranges", "limits", "words"),
-    [
-        (fan(10), np.ones(9), LIMITS, "shapes"),
-        (np.full(9, math.nan), np.ones(9), LIMITS, "finite"),
-        (fan(9), np.ones(9), (2.0, 1.0), "range_limits"),
-        (fan(9), np.ones(9), (0.0, math.inf), "range_limits"),
-    ],
-)
-def test_bad_scans_are_refused(angles: Array, ranges: Array, limits: tuple[float, float], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        key_scan(0, angles, ranges, limits, AHEAD)

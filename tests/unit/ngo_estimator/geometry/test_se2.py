@@ -52,14 +52,6 @@ def test_wrap_keeps_pi_and_turns_minus_pi_into_it(dtype: torch.dtype) -> None:
     assert se2.wrap(pi).dtype == dtype
 
 
-@given(angles)
-def test_wrap_is_the_same_direction_within_half_a_turn(angle: float) -> None:
-    wrapped = se2.wrap(torch.tensor(angle, dtype=torch.float64)).item()
-    assert -math.pi - 1e-13 <= wrapped <= math.pi + 1e-13
-    assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-12)
-    assert math.isclose(math.sin(wrapped), math.sin(angle), abs_tol=1e-12)
-
-
 def test_wrap_has_gradient_one_at_the_seam_too() -> None:
     angle = torch.tensor([-math.pi, 0.0, math.pi, 9.0], dtype=torch.float64, requires_grad=True)
     se2.wrap(angle).sum().backward()
@@ -91,12 +83,6 @@ def test_group_laws(a: Tensor, b: Tensor, c: Tensor) -> None:
     assert_same(se2.between(a, b), se2.compose(se2.inverse(a), b))
 
 
-def test_shapes_broadcast() -> None:
-    a, b = random_poses(4, 1), random_poses(5)
-    assert se2.compose(a, b).shape == se2.between(a, b).shape == (4, 5, 3)
-    assert_same(se2.compose(a, b)[2, 3], se2.compose(a[2, 0], b[3]))
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_r2g_is_repeated_composition(dtype: torch.dtype) -> None:
     steps = random_poses(2, 30, dtype=dtype)
@@ -105,18 +91,6 @@ def test_r2g_is_repeated_composition(dtype: torch.dtype) -> None:
     for k in range(30):
         pose = se2.compose(pose, steps[:, k])
         assert_same(result[:, k], pose, 10 * TOLERANCE[dtype])
-
-
-def test_r2g_keeps_the_heading_continuous_over_many_turns() -> None:
-    steps = torch.tensor([0.0, 0.0, 1.0]).expand(20, 3)
-    assert torch.allclose(se2.r2g(steps)[:, 2], torch.arange(1.0, 21.0))
-
-
-@pytest.mark.parametrize("shape", [(1,), (7,), (3, 40), (2, 3, 5)])
-def test_g2r_undoes_r2g(shape: tuple[int, ...]) -> None:
-    steps = random_poses(*shape)
-    assert_same(se2.g2r(se2.r2g(steps)), steps)
-    assert_same(se2.r2g(se2.g2r(se2.r2g(steps))), se2.r2g(steps))
 
 
 @pytest.mark.parametrize(
@@ -136,11 +110,6 @@ def test_gradients_are_those_of_finite_differences(function) -> None:  # noqa: A
     assert torch.autograd.gradcheck(function, (a.requires_grad_(), b.requires_grad_()))
 
 
-def test_r2g_of_a_long_trajectory_in_float32_stays_within_a_millimetre() -> None:
-    steps = random_poses(2000) * torch.tensor([0.05, 0.01, 0.05])
-    assert (se2.r2g(steps.float()).double() - se2.r2g(steps))[:, :2].norm(dim=-1).max() < 1e-3
-
-
 @pytest.mark.parametrize("name", ["compose", "between"])
 @pytest.mark.parametrize(("of_a", "of_b"), [((3,), (3,)), ((20, 3), (20, 3)), ((3,), (20, 3)), ((5, 1, 3), (4, 3))])
 def test_arrays_give_what_tensors_give(name: str, of_a: tuple[int, ...], of_b: tuple[int, ...]) -> None:
@@ -156,8 +125,3 @@ def test_arrays_are_accumulated_and_undone_as_tensors(name: str) -> None:
     poses = random_poses(4, 20)
     function = getattr(se2, name)
     np.testing.assert_allclose(function(poses.numpy()), function(poses).numpy(), atol=1e-12)
-
-
-def test_half_a_turn_of_arrays_is_positive() -> None:
-    angles = np.array([-np.pi, np.pi, 0.0, 3.0 * np.pi])
-    np.testing.assert_allclose(se2.wrap(angles), [np.pi, np.pi, 0.0, np.pi], atol=1e-15)

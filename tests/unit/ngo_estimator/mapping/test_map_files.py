@@ -56,18 +56,6 @@ def test_trinary(tmp_path: Path, image_format: str) -> None:
     }
 
 
-@pytest.mark.parametrize(("free", "occupied"), [(0.1, 0.9), (0.25, 0.65), (0.196, 0.65), (0.5, 0.55), (0.0, 1.0)])
-def test_unknown_cells_stay_unknown_with_any_thresholds(tmp_path: Path, free: float, occupied: float) -> None:
-    write_map(tmp_path / "hall", MAP, "pgm", "trinary", free, occupied)
-    cells, _ = read_by_nav2(tmp_path / "hall.yaml")
-    expected = MAP.trinary(free, occupied).values
-    if free == 0.0:  # nothing is below it
-        expected = np.where(expected == 0, -1, expected)
-    if occupied == 1.0:
-        expected = np.where(expected == 100, -1, expected)
-    assert cells.tolist() == expected.tolist()
-
-
 def test_raw_keeps_every_percentage(tmp_path: Path) -> None:
     write_map(tmp_path / "hall", MAP, "pgm", "raw")
     assert read_by_nav2(tmp_path / "hall.yaml")[0].tolist() == VALUES.tolist()
@@ -110,10 +98,3 @@ def test_mistakes_are_named_and_nothing_is_written(
     with pytest.raises(ValueError, match=complaint):
         write_map(**{"name": Path("hall"), "found": MAP, **change})
     assert list(tmp_path.iterdir()) == []
-
-
-def test_both_files_are_written_or_none(tmp_path: Path) -> None:
-    (tmp_path / "hall.yaml").mkdir()
-    with pytest.raises(OSError):
-        write_map(tmp_path / "hall", MAP)
-    assert [path.name for path in tmp_path.iterdir()] == ["hall.yaml"]

@@ -31,27 +31,11 @@ def random_scans(count: int, seed: int) -> tuple[list[RangeScan], np.ndarray]:
     return scans, np.column_stack((rng.uniform(-8.0, 8.0, (count, 2)), rng.uniform(-4.0, 4.0, count)))
 
 
-def test_a_ray_frees_the_cells_before_its_end() -> None:
-    grid = OccupancyGrid(1.0)
-    grid.add([rays((0.0, 3.0))], ORIGIN)
-    found = grid.cells(SURE).cropped()
-    assert drawn(found) == ["...#"]
-    assert found.origin_xy.tolist() == [-0.5, -0.5], "the frame's origin is the middle of a cell"
-
-
 def test_a_slanted_ray_passes_the_cells_that_it_crosses() -> None:
     """From (0, 0) to (2, 1): the line crosses x = 0.5 at y = 0.25, y = 0.5 at x = 1, and x = 1.5 at y = 0.75."""
     grid = OccupancyGrid(1.0)
     grid.add([rays((math.atan2(1.0, 2.0), math.hypot(1.0, 2.0)))], ORIGIN)
     assert drawn(grid.cells(SURE).cropped()) == ["?.#", "..?"]
-
-
-def test_cells_are_counted_from_the_origin_of_the_frame() -> None:
-    grid = OccupancyGrid(0.5)
-    grid.add([rays((math.pi, 1.0))], np.array([[0.0, -0.5, 0.0]]))
-    found = grid.cells(SURE).cropped()
-    assert drawn(found) == ["#.."]
-    assert found.origin_xy.tolist() == [-1.25, -0.75]
 
 
 def test_probabilities_are_sums_of_log_odds() -> None:
@@ -87,14 +71,6 @@ def test_ranges_that_say_nothing_are_not_entered() -> None:
     grid = OccupancyGrid(1.0)
     grid.add([rays((0.0, math.nan), (0.1, math.inf), (0.2, 0.0), (0.3, -1.0))], ORIGIN)
     assert grid.cells(SURE).cropped().values.size == 0
-
-
-def test_the_mounting_of_the_sensor_counts() -> None:
-    grid = OccupancyGrid(1.0)
-    scan = range_scan(np.zeros(1), np.array([2.0]), np.array([1.0, 0.0, math.pi / 2]), 100.0)
-    grid.add([scan], np.array([[0.0, 0.0, math.pi / 2]]))
-    assert drawn(grid.cells(SURE).cropped()) == ["#.."], "the sensor is at (0, 1) and looks to -x"
-    assert grid.cells(SURE).cropped().origin_xy.tolist() == [-2.5, 0.5]
 
 
 def test_what_is_taken_out_leaves_no_trace() -> None:
@@ -138,23 +114,3 @@ def test_walls_of_a_corridor_fill_a_row_of_cells_each() -> None:
     grid.add([scan] * len(poses), poses)
     found = grid.cells(OccupancyConfig()).trinary(0.25, 0.65).cropped()
     assert (found.values[:, 20:60] == 100).sum(axis=1).tolist() == [40] + 19 * [0] + [40]
-
-
-def test_values_become_free_occupied_and_unknown() -> None:
-    found = OccupancyMap(np.array([[-1, 0, 25, 26, 64, 65, 100]], np.int8), 0.05, np.zeros(2))
-    assert found.trinary(0.25, 0.65).values.tolist() == [[-1, 0, 0, -1, -1, 100, 100]]
-
-
-@pytest.mark.parametrize(
-    ("make", "complaint"),
-    [
-        (lambda: OccupancyGrid(0.0), "resolution_m is 0.0; expected a positive length"),
-        (lambda: OccupancyConfig(hit=-1.0), "hit, passed are -1.0, 0.7; expected positive log odds"),
-        (lambda: OccupancyConfig(free=0.7), "free, occupied are 0.7, 0.65; expected 0 <= free < occupied <= 1"),
-        (lambda: range_scan(np.zeros(2), np.zeros(3), np.zeros(3), 1.0), r"shapes \(2,\), \(3,\), \(3,\)"),
-        (lambda: range_scan(np.zeros(2), np.zeros(2), np.zeros(3), 0.0), "max_range_m is 0.0; expected"),
-    ],
-)
-def test_wrong_settings_are_named(make: object, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
-        make()  # type: ignore[operator]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.data.state_arrays import StateError
 from ngo_estimator.mapping.occupancy_grid import OccupancyGrid
 from ngo_estimator.mapping.range_scan import RangeScan, range_scan
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
@@ -99,19 +98,6 @@ def test_small_motions_leave_the_map_alone() -> None:
     assert not scan_map.update(stamps(), turned).changed, "a whole turn is none"
 
 
-def test_a_robot_that_stands_adds_nothing() -> None:
-    scan_map = ScanMap()
-    take(scan_map, range(FRAMES), np.zeros((FRAMES, 3)))
-    assert scan_map.update(stamps(), np.zeros((FRAMES, 3))).entered == 1
-
-
-def test_turning_on_the_spot_adds_scans() -> None:
-    turning = np.column_stack((np.zeros((FRAMES, 2)), np.radians(2.4) * np.arange(FRAMES)))
-    scan_map = ScanMap()
-    take(scan_map, range(FRAMES), turning)
-    assert scan_map.update(stamps(), turning).entered == FRAMES // 5, "every 12 degrees, the first from 10 on"
-
-
 def test_a_place_keeps_its_newest_scans() -> None:
     config = replace(EVERY, most_at_a_place=8)
     scan_map = ScanMap(config)
@@ -130,12 +116,6 @@ def test_a_scan_waits_for_its_pose() -> None:
     assert scan_map.update(stamps(10), path()[:10]).entered == 10
     assert scan_map.waiting == 20
     assert scan_map.update(stamps(30), path()[:30]).entered == 20
-
-
-def test_scans_that_no_trajectory_has_are_given_up() -> None:
-    scan_map = ScanMap(replace(EVERY, most_waiting=10))
-    take(scan_map, range(15))
-    assert (scan_map.waiting, scan_map.lost) == (10, 5)
 
 
 @pytest.mark.parametrize("origin_ns", [1, 2], ids=["same origin", "new origin"])
@@ -215,21 +195,3 @@ def test_a_restored_map_of_another_trajectory_is_left_out() -> None:
     take(again, range(20, 24), origin_ns=2)
     again.update(stamps(4, first=20), path(0.0, 24)[20:])
     assert (len(again), again.waiting) == (4, 0)
-
-
-def test_arrays_that_no_map_gave_are_refused() -> None:
-    with pytest.raises(StateError, match="the map is empty"):
-        ScanMap(EVERY).state()
-    scan_map = ScanMap(EVERY)
-    take(scan_map, range(10))
-    scan_map.update(stamps(10), path(0.0, 10))
-    good = scan_map.state()
-    for name, array in good.items():
-        for wrong in ({}, {name: array[..., None]}, {name: np.concatenate((array, array[-1:]))}):
-            with pytest.raises(StateError):
-                ScanMap(EVERY).restore({**{key: value for key, value in good.items() if key != name}, **wrong})
-
-
-def test_wrong_settings_are_named() -> None:
-    with pytest.raises(ValueError, match="most_at_a_place, most_waiting are"):
-        ScanMapConfig(most_at_a_place=0)

@@ -18,17 +18,6 @@ def test_local_network_gives_poses_deviations_and_features(world: str) -> None:
     assert all(value.isfinite().all() and value.dtype == torch.float32 for value in (mean, log_std, feature))
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_batch_is_as_many_singles(world: str) -> None:
-    network = LocalPoseNetwork(local_config(world)).eval()
-    images, actions = observations(world, 6), torch.tensor([0, 1, 2, 0, 1])
-    together = network(images[:5], images[1:], actions)
-    for k in range(5):
-        alone = network(images[k : k + 1], images[k + 1 : k + 2], actions[k : k + 1])
-        for a, b in zip(together, alone, strict=True):
-            assert torch.allclose(a[k], b[0], atol=1e-5, rtol=1e-4)
-
-
 def test_normalisation_turns_the_output_into_metres_and_radians() -> None:
     torch.manual_seed(0)
     plain = LocalPoseNetwork(local_config("maze2d")).eval()
@@ -75,12 +64,6 @@ def test_a_network_is_told_as_many_of_the_latest_actions_as_it_was_made_for() ->
             network(images[:1], images[3:], wrong)
 
 
-def test_of_one_action_the_history_is_that_action() -> None:
-    images, network = observations("maze2d", 3), LocalPoseNetwork(local_config("maze2d")).eval()
-    alone, latest = torch.tensor([1, 2]), torch.tensor([[0, 0, 1], [1, NO_ACTION, 2]])
-    assert torch.equal(network(images[:2], images[1:], alone)[0], network(images[:2], images[1:], latest)[0])
-
-
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_symmetric_network_sees_the_mirror_image_as_the_mirrored_motion(world: str) -> None:
     torch.manual_seed(0)
@@ -99,29 +82,6 @@ def test_a_symmetric_network_sees_the_mirror_image_as_the_mirrored_motion(world:
     trained = network.train()(images[:3], images[1:], actions)
     assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(trained, once, strict=True))
     assert torch.allclose(feature, once[2], atol=1e-6) and not torch.allclose(mean, once[0], atol=1e-4)
-
-
-def test_the_scale_of_deviations_is_a_factor() -> None:
-    torch.manual_seed(0)
-    plain = LocalPoseNetwork(local_config("maze2d")).eval()
-    scaled = LocalPoseNetwork(dataclasses.replace(plain.config, deviation_scale=(2.0, 3.0, 0.5))).eval()
-    scaled.load_state_dict(plain.state_dict())
-    images, actions = observations("maze2d", 4), torch.tensor([0, 1, 2])
-    mean, log_std, _ = plain(images[:3], images[1:], actions)
-    scaled_mean, scaled_log_std, _ = scaled(images[:3], images[1:], actions)
-    assert torch.equal(mean, scaled_mean)
-    assert torch.allclose(scaled_log_std.exp(), log_std.exp() * torch.tensor([2.0, 3.0, 0.5]), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"width": 0.0}, {"width": 2.1}, {"actions": -1}, {"feature_size": 0}, {"hidden_size": 0}, {"period_s": 0.0}]
-    + [{"action_history": 0}, {"period_s": float("nan")}, {"relative_std": (1.0, 0.0, 1.0)}]
-    + [{"deviation_scale": (1.0, 1.0, 0.0)}, {"symmetric": True}, {"symmetric": True, "mirrored_actions": (0, 1, 1)}],
-)
-def test_impossible_local_configurations_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        local_config("maze2d", **change)
 
 
 def test_the_velocity_matters_and_must_be_given_exactly_when_it_was_in_training() -> None:

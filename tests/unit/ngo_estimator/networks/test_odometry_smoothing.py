@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
-from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizerConfig
-from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig, poses_in_blocks
 from tests.unit.ngo_estimator.samples import small_optimizer, trajectory_inputs
 
 STD = (0.1, 0.02, 0.05)
@@ -91,15 +89,6 @@ def test_a_step_over_lost_frames_is_corrected_no_more_than_others_and_does_not_d
     assert torch.equal(again[:, others], smoothed[:, others])
 
 
-def test_meta_poses_are_those_of_the_smoothed_steps() -> None:
-    optimizer, (relative, log_std, motion, _) = small_optimizer("smoothed", trained=True), trajectory_inputs(2, 80)
-    smoothed, deviations = optimizer.smoother(relative, log_std, motion)
-    steps = optimizer.aggregate(relative, log_std, motion)
-    assert torch.equal(steps.relative, poses_in_blocks(smoothed, 8)[..., -1, :])
-    assert (steps.relative - poses_in_blocks(relative, 8)[..., -1, :]).abs().max() > 1e-3
-    assert torch.equal(steps.std, small_optimizer().aggregate(smoothed, deviations, motion).std)
-
-
 def test_an_optimizer_keeps_all_but_its_smoother() -> None:
     smoothed, plain = small_optimizer("smoothed", trained=True), small_optimizer("loops", trained=True)
     without = smoothed.with_smoother(None)
@@ -111,24 +100,3 @@ def test_an_optimizer_keeps_all_but_its_smoother() -> None:
         assert all(torch.equal(changed.state_dict()[name], value) for name, value in kept.items())
     copied, original = of_another.smoother.state_dict(), smoothed.smoother.state_dict()
     assert copied.keys() == original.keys() and all(torch.equal(copied[name], original[name]) for name in copied)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"dilations": ()}, r"dilations are 6, 64, \(\); expected at least 1, and a positive number"),
-        ({"dilations": (1, 0)}, r"\(1, 0\)"),
-        ({"width": 0}, "6, 0,"),
-        ({"deviation_scale": (1.0, 0.0, 1.0)}, r"deviation_scale is \(1.0, 0.0, 1.0\); expected three positive"),
-        ({"relative_std": (0.1, 0.0, 0.1)}, r"relative_std is \(0.1, 0.0, 0.1\); expected three positive numbers"),
-    ],
-)
-def test_impossible_smoothers_are_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SmootherConfig(**{"motion_feature_size": 6, "relative_std": STD, **changes})  # type: ignore[arg-type]
-
-
-def test_a_smoother_of_other_features_is_refused() -> None:
-    aggregation = PoseAggregationConfig(motion_feature_size=5)
-    with pytest.raises(ValueError, match="the smoother takes 6 motion features; expected 5, as the aggregation"):
-        NeuralGraphOptimizerConfig(aggregation, smoother=CONFIG)

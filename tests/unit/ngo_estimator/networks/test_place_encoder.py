@@ -23,15 +23,6 @@ def test_place_codes_and_pairs_have_their_shapes_and_units(world: str) -> None:
     assert measured[..., 2].abs().max() <= torch.pi
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_batch_is_as_many_singles(world: str) -> None:
-    encoder = PlaceEncoder(place_config(world)).eval()
-    images = observations(world, 4)
-    codes = encoder(images)
-    for k in range(4):
-        assert torch.allclose(codes[k], encoder(images[k : k + 1])[0], atol=1e-5, rtol=1e-4)
-
-
 def test_a_code_of_a_picture_ends_with_the_ranges_that_are_seen_in_it() -> None:
     registration = RegistrationConfig(9, 90.0, 0.01, odometry=False)
     config = place_config("maze3d", code_size=12, registration=registration)
@@ -68,19 +59,3 @@ def test_networks_do_without_the_ranges_that_they_see() -> None:
     plain, images = networks.without_ranges().eval(), observations("maze3d", 2)
     assert plain.config.registration is None
     assert torch.equal(plain.encoder(images), networks.encoder(images)[:, :12])
-
-
-def test_offsets_scale_with_the_worlds_unit() -> None:
-    small, large = (PairHead(place_config("maze2d", offset_scale_m=scale)) for scale in (0.5, 2.0))
-    large.load_state_dict(small.state_dict())
-    a, b = torch.randn(2, 4, 128).unbind(0)
-    (m1, s1, l1), (m2, s2, l2) = small(a, b), large(a, b)
-    assert torch.allclose(4.0 * m1[:, :2], m2[:, :2]) and torch.equal(m1[:, 2], m2[:, 2])
-    assert torch.allclose(4.0 * s1[:, 0].exp(), s2[:, 0].exp()) and torch.equal(s1[:, 1], s2[:, 1])
-    assert torch.equal(l1, l2)
-
-
-@pytest.mark.parametrize("change", [{"width": 0.0}, {"offset_scale_m": 0.0}, {"code_size": 0}, {"embedding_size": 0}])
-def test_impossible_place_configurations_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError):
-        place_config("maze2d", **change)

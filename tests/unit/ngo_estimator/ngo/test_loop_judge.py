@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.loops.loop_closure import Loops, LoopSearch
+from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.ngo.loop_judge import EVIDENCE, WITHIN, LoopJudge, evidence_of
 from ngo_estimator.ngo.meta_poses import MetaSteps
 from tests.unit.ngo_estimator.samples import make_loops, meta_steps, with_origin
@@ -62,8 +61,3 @@ def test_loops_that_were_found_by_poses_are_not_judged() -> None:
     found = asking_for_neighbours().judged(replace(loops, by_poses=torch.ones(1, 1, dtype=torch.bool)), STEPS, 0.8)
     assert found.valid.all() and torch.equal(found.logit, loops.logit)
     assert torch.equal(found.log_scale, loops.log_scale)
-
-
-def test_a_search_takes_no_belief_that_nothing_has() -> None:
-    with pytest.raises(ValueError, match=r"least_belief is 1.0; expected 0"):
-        LoopSearch(least_belief=1.0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ngo_estimator.data.images import ImageFormat
-from ngo_estimator.data.relative_step import RejectedStep, RelativeStep
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.networks.place_encoder import PairHead, PlaceConfig, PlaceEncoder
@@ -16,7 +16,7 @@ from ngo_estimator.ngo.registered_odometry import registered_steps
 from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.rooms import CONFIG, drive_in_the_room, registering_pair_head
-from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
+from tests.unit.ngo_estimator.samples import small_optimizer
 
 STEPS = 96
 SEARCH = LoopSearch(2, 8, 2, 0, 3, registrations=4)
@@ -41,14 +41,6 @@ def test_registered_steps_drift_less(known: bool) -> None:
     error = torch.cat(((meta - true)[:, :2], se2.wrap((meta - true)[:, 2:])), dim=1)
     std = block_variances(poses_in_blocks(steps, 8), deviations)[0, 1:].sqrt()
     assert (error / std).square().mean() < 9.0 and std.max() < 0.2 * 0.003 * 8**0.5
-
-
-def test_none_asked_for_is_none_done() -> None:
-    relative, log_std, codes, origin, _ = drive_in_the_room(16)
-    steps, deviations = registered_steps(
-        registering_pair_head(), relative[None], log_std[None], codes[None], 8, 0, origin
-    )
-    assert torch.equal(steps[0], relative) and torch.equal(deviations[0], log_std)
 
 
 def relative_steps(steps: int, first_code: bool = True) -> list[RelativeStep]:
@@ -103,21 +95,6 @@ def test_beyond_the_window_scans_are_registered_with_key_frames() -> None:
     assert errors.max() < 0.3 * position_errors(relative, truth).max()
 
 
-def test_the_first_frames_code_is_checked_like_the_others() -> None:
-    core = OnlineTrajectory(small_optimizer(search=SEARCH), registering_pair_head(), 64)
-    (step,) = relative_steps(1)
-    with pytest.raises(RejectedStep, match=r"from_place_code is of shape \(3,\); expected \(253,\)"):
-        core.update(dataclasses.replace(step, from_place_code=np.zeros(3, np.float32)))
-    assert core.trajectory() is None
-
-
-def test_codes_without_scans_cannot_be_registered() -> None:
-    with pytest.raises(ValueError, match="expected a registration"):
-        small_pair_head().register(torch.zeros(12), torch.zeros(12), torch.zeros(3), torch.zeros(2), 3)
-    with pytest.raises(ValueError, match="registers ranges needs a pair head whose codes hold them"):
-        OnlineTrajectory(small_optimizer(search=SEARCH), small_pair_head())
-
-
 def test_a_code_ends_with_the_ranges_of_its_frame() -> None:
     image = ImageFormat(1, 241, 4, "float32")
     config = PlaceConfig(image, 0.1, 0.5, code_size=12, registration=CONFIG)
@@ -130,18 +107,6 @@ def test_a_code_ends_with_the_ranges_of_its_frame() -> None:
     assert torch.equal(codes[:, 12:], ranges)
     plain = PlaceEncoder(dataclasses.replace(config, registration=None))
     assert plain.config.code_length == plain(frames).shape[1] == 12
-
-
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (ImageFormat(1, 80, 3, "uint8"), r"images \(1, 80, 3\); expected a picture, or depth"),
-        (ImageFormat(1, 100, 4, "float32"), "241 rays; expected 100"),
-    ],
-)
-def test_rows_without_as_many_ranges_cannot_be_registered(image: ImageFormat, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        PlaceConfig(image, 0.1, 0.5, registration=CONFIG)
 
 
 def test_ranges_for_loops_alone_leave_the_odometry_as_it_is() -> None:
@@ -178,10 +143,3 @@ def test_smoothed_online_is_offline_with_loops_that_are_registered() -> None:
     trajectory = core.trajectory()
     assert trajectory is not None and offline.loop_weights is not None and offline.loop_weights.max() > 0.1
     np.testing.assert_allclose(trajectory.poses_xyyaw[1:, :2], offline.poses[0, :, :2], atol=2e-4)
-
-
-def test_a_smoother_beside_odometry_that_is_registered_is_refused() -> None:
-    with pytest.raises(
-        ValueError, match="learned from steps that are not registered; expected a registration of loops"
-    ):
-        OnlineTrajectory(small_optimizer("smoothed", search=SEARCH), registering_pair_head())

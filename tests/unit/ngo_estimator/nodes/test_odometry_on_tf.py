@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.data.relative_step import RelativeStep, check_step
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.nodes.odometry_on_tf import OdometryOnTf
 from ngo_recordings.poses import make_pose
 from ngo_recordings.transform_buffer import TransformBuffer
@@ -69,9 +69,3 @@ def test_odometry_that_ends_is_said_and_steps_go_on_without() -> None:
     assert all(each.tf_odom_known for each in found[1:19]), "the first one came before the odometry"
     assert not any(each.tf_odom_known for each in found[20:])
     assert len(found) == 80 and "older" in on_tf.problem()
-
-
-def test_a_step_without_the_robots_odometry_is_taken_and_gives_no_transform() -> None:
-    found = play(0.0, 1.7e9, count=40)[0][-1]
-    check_step(found, 0, None)
-    assert not found.tf_odom_known and np.isfinite(found.tf_odom_xyyaw).all()

@@ -2,7 +2,6 @@
 
 import io
 import math
-import sys
 from typing import Any
 
 import numpy as np
@@ -66,31 +65,6 @@ def test_images_are_read_whatever_the_length_of_their_rows(padding: int) -> None
         read = sensor_array(over_the_wire(image(pixels, encoding, padding)), image_format, "image")
         np.testing.assert_array_equal(read, expected)
         image_format.check(read)
-
-
-def test_images_of_the_other_byte_order_are_read() -> None:
-    message = image(row().byteswap(), "32FC4")
-    message.is_bigendian = int(sys.byteorder == "little")
-    np.testing.assert_array_equal(sensor_array(message, ROW, "image"), row())
-
-
-def test_depth_that_is_no_distance_has_no_return() -> None:
-    depth = np.full(DEPTH.shape, 2.0, np.float32)
-    depth[0, :3, 0] = np.nan, 0.0, np.inf
-    read = sensor_array(over_the_wire(image(depth, "32FC1")), DEPTH, "image")
-    DEPTH.check(read)
-    assert np.isposinf(read[0, :3, 0]).all() and np.isposinf(read).sum() == 3
-
-
-@pytest.mark.parametrize("image_format", [COLOUR, GREY], ids=["colour", "grey"])
-def test_compressed_images_are_read(image_format: ImageFormat) -> None:
-    pixels = picture(image_format)
-    flat = pixels if image_format.channels == 3 else pixels[..., 0]
-    read = sensor_array(over_the_wire(compressed(flat, "png")), image_format, "image/compressed")
-    np.testing.assert_array_equal(read, pixels)
-    even = np.full_like(flat, 130)
-    read = sensor_array(over_the_wire(compressed(even, "jpeg", quality=95)), image_format, "image/compressed")
-    assert read.shape == image_format.shape and abs(read.astype(int) - 130).max() <= 2
 
 
 def test_a_compressed_image_larger_than_the_weights_take_is_not_decoded() -> None:

@@ -105,15 +105,3 @@ def test_a_scanner_that_looks_elsewhere_than_its_mounting_says_is_told(
     assert run.facts["mounting_yaw_deg"] == pytest.approx(math.degrees(yaw), abs=0.6)
     (remark,) = run.remarks()
     assert f"{abs(run.facts['mounting_yaw_deg']):.1f} deg further to the {side}" in remark
-
-
-def test_faults_inside_are_told() -> None:
-    run = LidarRun(MixtureLidar(), ScanTrajectory(), MOUNTING)
-    run.faults += ["an optimisation failed, RuntimeError: x", "another"]
-    assert run.facts["faults"] == 2 and "2 faults" in run.remarks()[0] and "RuntimeError" in run.remarks()[0]
-
-
-def test_an_empty_recording_gives_nothing() -> None:
-    for records in ([], recorded(1), recorded(5)[::2]):
-        run, steps, runs = run_over(records)
-        assert steps == [] and runs == [] and run.faults == []

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from ngo_estimator.checkpoint import PlaceNetworks
@@ -14,7 +13,7 @@ from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.offline.recording_run import RecordingRun
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
-from ngo_recordings.frames import Frame, ScanGeometry
+from ngo_recordings.frames import Frame
 from tests.unit.ngo_estimator.samples import local_config, observations, place_config, small_optimizer, small_pair_head
 
 STEP_NS = 100_000_000
@@ -120,15 +119,6 @@ def test_what_cannot_be_used_is_left_out_and_counted() -> None:
     assert core.gaps == 2
 
 
-def test_a_frame_without_its_action_is_left_out() -> None:
-    frames = recorded(12)
-    lost = [replace(frame, action=None) if k in (6, 11) else frame for k, frame in enumerate(frames)]
-    core, steps, (found,) = run(lost)
-    used = [frame for k, frame in enumerate(frames) if k not in (6, 11)]
-    check(steps, found, used, [None, 0, 1, 2, 0, 1, 0, 1, 2, 0])
-    assert core.rejected == {"no action or velocity led to it": 2} and core.frames == 12
-
-
 def test_a_jump_back_in_time_begins_a_new_trajectory() -> None:
     first, second = recorded(20), recorded(15, START_NS - 3600 * 10**9)
     core, steps, found = run([*first, *second])
@@ -136,22 +126,6 @@ def test_a_jump_back_in_time_begins_a_new_trajectory() -> None:
     for part, part_steps, frames in zip(found, (steps[:19], steps[19:]), (first, second), strict=True):
         check(part_steps, part, frames, [frame.action for frame in frames])
         assert part.truth is not None and part.truth.stamps_ns.tolist() == [frame.stamp_ns for frame in frames]
-
-
-def test_no_truth_and_no_steps() -> None:
-    frames = [replace(frame, pose_xyyaw=None, pose_residual=None) for frame in recorded(4)]
-    assert run(frames)[2][0].truth is None
-    for few in (frames[:1], []):
-        core, steps, found = run(few)
-        assert (core.frames, steps, found) == (len(few), [], [])
-
-
-def test_a_second_run_begins_anew() -> None:
-    core, frames = RecordingRun(*cores()), recorded(5)
-    runs = [list(core.run(frames))[-1] for _ in range(2)]
-    for one in runs:
-        assert isinstance(one, RecordedRun) and len(one.trajectory.stamps_ns) == 5
-    np.testing.assert_array_equal(runs[0].trajectory.poses_xyyaw, runs[1].trajectory.poses_xyyaw)  # type: ignore[union-attr]
 
 
 def test_velocities_lead_to_frames() -> None:
@@ -167,17 +141,3 @@ def test_velocities_lead_to_frames() -> None:
     for step, estimate in zip(steps, expected, strict=True):
         assert estimate is not None
         np.testing.assert_allclose(step.local.relative_xyyaw, estimate.relative_xyyaw, atol=ROUNDING)
-
-
-def test_pictures_are_no_scans() -> None:
-    frames = recorded(3)
-    scan = replace(frames[2], scan=ScanGeometry(-1.0, 0.1, 0.0, 10.0))
-    core, steps, _ = run([*frames[:2], scan])
-    assert len(steps) == 1 and "is a laser scan" in core.examples["not usable"]
-
-
-@pytest.mark.parametrize("lost", [3, 8])
-def test_the_last_frames_without_action_are_counted(lost: int) -> None:
-    frames = [replace(frame, action=None) if k >= 12 - lost else frame for k, frame in enumerate(recorded(12))]
-    core, steps, _ = run(frames)
-    assert len(steps) == 11 - lost and core.rejected == {"no action or velocity led to it": lost}

@@ -1,7 +1,5 @@
 """What nodes compile before the first frame comes."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +24,6 @@ def test_registration_and_the_search_for_loops_are_compiled() -> None:
     without_wheels = velocity_filter._predicted, velocity_filter._corrected
     for function in (*points, scan_matching._icp, *search, motion_mixture._calibrated, *without_wheels):
         assert function.signatures, function
-
-
-def test_the_odometry_of_networks_does_without_the_compiler() -> None:
-    program = "import sys; from ngo_estimator.frontend.camera import local_odometry; assert 'numba' not in sys.modules"
-    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @pytest.mark.parametrize("world", ["maze2d", "maze3d"])

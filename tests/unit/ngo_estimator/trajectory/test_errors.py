@@ -200,24 +200,3 @@ def test_a_path_too_short_for_all_segments_is_said() -> None:
         segment_errors(truth, truth, (100.0, 200.0))
     with pytest.raises(ValueError, match="expected some above 0 m"):
         segment_errors(truth, truth, ())
-
-
-def test_what_cannot_be_measured_is_an_error() -> None:
-    line = planar(np.column_stack((np.arange(5.0), np.zeros((5, 2)))))
-    with pytest.raises(ValueError, match="lie on one line"):
-        aligned(line, line, "best")
-    with pytest.raises(ValueError, match=r"5 poses over 4\.0 m; expected some that are 9 frames apart"):
-        relative_errors(line, line, RelativeDelta(9))
-    for size, unit in ((0.5, "frames"), (0.0, "metres")):
-        with pytest.raises(ValueError, match="delta is"):
-            RelativeDelta(size, unit)  # type: ignore[arg-type]
-
-
-def test_the_best_alignment_undoes_a_motion() -> None:
-    truth = in_space(planar(drive(100, 0, 0.0)[0]), 2)
-    turn = Rotation.from_rotvec([0.5, 1.0, -0.7])
-    positions = turn.apply(truth.positions_xyz) + [1.0, 2.0, 3.0]
-    moved = SpatialPoses(truth.stamps_ns, positions, (turn * Rotation.from_quat(truth.quaternions_xyzw)).as_quat())
-    for how in ("best", "first"):
-        errors = absolute_errors(aligned(moved, truth, how), truth)  # type: ignore[arg-type]
-        assert errors.translation_m.max() < 1e-9 and errors.rotation_deg.max() < 1e-5

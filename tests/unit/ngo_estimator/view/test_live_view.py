@@ -57,14 +57,6 @@ def test_trajectories_are_drawn_in_the_frame_of_the_map_with_their_errors(notes:
     assert "**6 frames**" in notes.last["text"][0] and "odometry: position RMSE **0.303 m**" in notes.last["text"][0]
 
 
-def test_without_a_truth_there_are_paths_and_no_errors(notes: Notes) -> None:
-    view = LiveView(notes)
-    view.show_trajectory(np.array([S]), np.zeros((1, 3)))
-    view.show_trajectory(np.array([], np.int64), np.zeros((0, 3)))
-    assert notes.counts["path corrected"] == 1 and "path truth" not in notes.last
-    assert not any(key.startswith("error") for key in notes.last)
-
-
 def test_the_view_moves_when_the_path_leaves_it_and_not_before(notes: Notes) -> None:
     view = LiveView(notes)
     for frames in range(2, 40):
@@ -102,15 +94,3 @@ def test_a_scan_is_drawn_at_the_corrected_pose(notes: Notes) -> None:
     message = SimpleNamespace(header=header, ranges=[4.0, np.inf, np.inf], **limits, **angles)
     view.show_scan(message, "scan", TransformBuffer(), "base_link")
     np.testing.assert_allclose(notes.last["scan"][0], [[-3.0, 2.0]], atol=1e-9)
-
-
-def test_the_loops_are_counted(notes: Notes) -> None:
-    view = LiveView(notes)
-    view.show_loops(np.zeros((3, 2, 2)), np.ones((3, 4)))
-    drive(view, 3)
-    assert "3 loops" in notes.last["text"][0]
-
-
-def test_what_is_no_picture_is_refused(notes: Notes) -> None:
-    with pytest.raises(ValueError, match="yuv"):
-        LiveView(notes).show_picture(SimpleNamespace(encoding="yuv"), "sensor_msgs/msg/Image", "image")

@@ -92,12 +92,3 @@ def test_a_stretch_ends_where_scans_or_wheels_are_not_sure() -> None:
         else:
             estimator.observe(ahead, np.array((0.1, 0.003, 0.0)), 0.2)
     assert estimator.yaw_rad == pytest.approx(0.03, abs=0.001)
-
-
-def test_memory_is_bounded_and_a_new_mounting_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mounting_yaw, "_KEPT", 120)
-    estimator, poses = MountingYaw(), driven(1500)
-    for yaw in (0.05, -0.05):
-        observe(estimator, seen_by_scans(poses, yaw), poses)
-        assert len(estimator._found) <= 120
-    assert estimator.yaw_rad == pytest.approx(-0.05, abs=0.003)
