@@ -116,12 +116,6 @@ def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, di
     assert before[0] != before[1]
 
 
-def test_too_few_trajectories_in_a_store_are_said(made: tuple[Path, dict[str, Any]]) -> None:
-    folder, _ = made
-    with pytest.raises(ValueError, match="holds 3 trajectories; expected 4"):
-        results.main(dataclasses.replace(arguments(folder), trajectories=4), toy.scripts("maze2d", folder))
-
-
 def test_weights_that_were_trained_on_other_networks_are_refused(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
     path = folder / "runs" / "maze2d" / "rows" / "ngo_1-seed0" / "neural_graph_optimizer.json"

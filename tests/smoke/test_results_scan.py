@@ -78,18 +78,6 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1
 
 
-def test_a_row_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ValueError, match="gtsam_lm"):
-        results_scan.Arguments(rows=("gtsam",))
-
-
-@pytest.mark.parametrize("first", [-1, 9481])
-def test_buildings_that_are_not_for_tests_are_refused(first: int) -> None:
-    with pytest.raises(ValueError, match=f"first_building is {first}"):
-        results_scan.Arguments(first_building=first)
-    results_scan.Arguments(first_building=9480)
-
-
 @pytest.mark.parametrize("world", [("--world", "scan"), ("--world=scan",)])
 def test_the_command_of_results_takes_the_lidar(
     world: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

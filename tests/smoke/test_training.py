@@ -44,7 +44,7 @@ from training import (
 )
 from training.baselines.deepvo import DEEPVO
 from training.common import records
-from training.data import feature_store, worlds
+from training.data import worlds
 
 ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
@@ -124,23 +124,6 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     assert config.action_history == {"maze2d": 3, "maze3d": 12}[world]
     # Steps alone of what is seen and in validation; the world's windows where earlier actions correct it.
     assert set(windows) == {"maze2d": {(1,)}, "maze3d": {(1,), (1, 4, 16)}}[world]
-
-
-def test_a_smoother_of_another_local_network_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy.shrink(monkeypatch, 161, 400)
-    prepare(tmp_path)
-    before = Path(shutil.copytree(tmp_path / "weights" / "maze2d", tmp_path / "before"))
-    train_smoother.main(toy.smoother("maze2d", tmp_path))
-    path = tmp_path / "weights" / "maze2d" / f"{SMOOTHER}.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "local_pose_network_sha256": "another"}))
-    asked = dataclasses.replace(toy.optimizer("maze2d", tmp_path, form="paper"), smoothing=True)
-    with pytest.raises(CheckpointError, match="was trained on another local network than the one beside it"):
-        train_optimizer.main(asked)
-    # Nor does a run on the features of one network go on with those of another.
-    monkeypatch.setattr(train_smoother, "load_local", lambda folder, _: (load_local(before)[0], {"sha256": "another"}))
-    monkeypatch.setattr(feature_store, "check_networks", lambda *_: None)
-    with pytest.raises(records.RunError, match="given local_pose_network_sha256 another"):
-        train_smoother.main(toy.smoother("maze2d", tmp_path))
 
 
 def prepare(folder: Path) -> None:

@@ -60,51 +60,26 @@ def refuse(monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType], *othe
         monkeypatch.setattr(name, fail)
 
 
+def _of_networks(world: Any, folder: Path, epochs: int) -> dict[str, Any]:
+    """What trainings of networks on mazes have in common."""
+    folders = {"out": folder / "weights", "runs": folder / "runs"}
+    return {"world": world, "width": 0.03, "epochs": epochs, "workers": 0, "precision": PRECISION, **folders}
+
+
 def local(world: str, folder: Path, epochs: int = 1, **changes: Any) -> train_local.Arguments:
-    return train_local.Arguments(
-        world=world,
-        width=0.03,
-        epochs=epochs,
-        datapoints=1,
-        batch_size=32,
-        validation_mazes=1,
-        workers=0,
-        out=folder / "weights",
-        runs=folder / "runs",
-        **{"precision": PRECISION, **changes},
-    )
+    common = {**_of_networks(world, folder, epochs), **changes}
+    return train_local.Arguments(datapoints=1, batch_size=32, validation_mazes=1, **common)
 
 
 def deepvo(world: Any, folder: Path, epochs: int = 1) -> train_deepvo.Arguments:
-    return train_deepvo.Arguments(
-        world=world,
-        width=0.03,
-        epochs=epochs,
-        datapoints=1,
-        steps=16,
-        batch_size=4,
-        validation_mazes=1,
-        calibration_mazes=2,
-        workers=0,
-        out=folder / "weights",
-        runs=folder / "runs",
-        precision=PRECISION,
-    )
+    common = _of_networks(world, folder, epochs)
+    few = {"validation_mazes": 1, "calibration_mazes": 2}
+    return train_deepvo.Arguments(datapoints=1, steps=16, batch_size=4, **few, **common)
 
 
 def place(world: str, folder: Path, epochs: int = 1) -> train_place.Arguments:
-    return train_place.Arguments(
-        world=world,
-        width=0.03,
-        epochs=epochs,
-        batches=1,
-        pairs_a_maze=4,
-        validation_batches=1,
-        workers=0,
-        out=folder / "weights",
-        runs=folder / "runs",
-        precision=PRECISION,
-    )
+    common = _of_networks(world, folder, epochs)
+    return train_place.Arguments(batches=1, pairs_a_maze=4, validation_batches=1, **common)
 
 
 def features(world: str, folder: Path) -> featurise.Arguments:
@@ -126,11 +101,7 @@ def _of_features(folder: Path) -> dict[str, Any]:
 
 
 def smoother(world: Any, folder: Path, epochs: int = 1) -> train_smoother.Arguments:
-    return train_smoother.Arguments(
-        world=world,
-        epochs=epochs,
-        **_of_features(folder),
-    )
+    return train_smoother.Arguments(world=world, epochs=epochs, **_of_features(folder))
 
 
 def optimizer(world: str, folder: Path, epochs: int = 1, form: str = "loops") -> train_optimizer.Arguments:

@@ -44,16 +44,6 @@ def test_a_drive_is_the_same_in_any_parts(cache: Path, drive: Drive, monkeypatch
     assert np.array_equal(again.truth, drive.truth)
 
 
-def test_a_drive_is_made_once(cache: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("the drive is made a second time")
-
-    monkeypatch.setattr(drives, "episodes", never)
-    again = drive_of("maze2d", 2000, 40, cache)
-    assert all(np.array_equal(getattr(again, name), value) for name, value in vars(drive).items())
-    assert not list(cache.glob("unfinished_*"))
-
-
 def test_the_core_takes_the_steps(drive: Drive) -> None:
     core = OnlineTrajectory.load(WEIGHTS / "maze2d", 2000, "maze2d")
     for step in drive.steps():

@@ -67,8 +67,3 @@ def test_a_kernel_keeps_wrong_loops_out(truth: np.ndarray) -> None:
     assert len(right.nodes) == len(problem.nodes) - 2
     poses, expected = (xyyaw(LevenbergMarquardt(each).solve()) for each in (problem, right))
     assert error_m(poses, expected) < 0.05
-
-
-def test_a_meta_pose_that_is_left_out_is_an_error(truth: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="has 60 meta-poses; expected 1"):
-        Incremental().prepare(problem_of(truth))

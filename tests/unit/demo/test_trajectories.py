@@ -63,16 +63,6 @@ def test_poses_are_matched_by_stamp_and_odometry_starts_at_the_identity() -> Non
     assert poses.frames_published == 4
 
 
-def test_a_pose_without_a_partner_is_an_error() -> None:
-    poses = {stamp: np.zeros(3) for stamp in (10, 20)}
-    with pytest.raises(ValueError, match="1 of the corrected path's 2 poses have no ground truth"):
-        match({10: np.zeros(3)}, poses, poses)
-    with pytest.raises(ValueError, match="have no odometry"):
-        match(poses, {}, poses)
-    with pytest.raises(ValueError, match="no poses"):
-        match(poses, poses, {})
-
-
 def test_summary_counts_wins_and_takes_medians() -> None:
     def result(seed: int, before: float, after: float) -> dict:
         errors = (
