@@ -23,7 +23,7 @@ from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.data.episodes import simulate
 from training.data.faults import SensedDrive, faulted
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
@@ -60,8 +60,7 @@ class Arguments(Folders):
     worlds: tuple[Literal["maze2d", "maze3d", "doom"], ...] = ("maze2d", "maze3d", "doom")  # Worlds to measure.
 
     def __post_init__(self) -> None:
-        if self.mazes < 2 or self.frames < 100:
-            raise ValueError(f"mazes, frames are {self.mazes}, {self.frames}; expected at least 2 and at least 100")
+        check_at_least(self, mazes=2, frames=100)
 
 
 @dataclass(frozen=True)

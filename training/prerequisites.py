@@ -85,12 +85,18 @@ def prepare(sources: Sources, wanted: Wanted, scripts: Scripts) -> None:
             torch.set_num_threads(threads)
 
 
+def _for(sources: Sources, arguments: Any, **changes: Any) -> Any:
+    """The arguments of a script for what is made."""
+    return replace(arguments, world=sources.world.name, runs=sources.runs, **changes)
+
+
 def _networks(sources: Sources, scripts: Scripts) -> Iterator[Step]:
-    common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-    local = replace(scripts.local, out=sources.weights, **common)
-    place = replace(scripts.place, out=sources.weights, **common)
-    yield Step("the local network", _exists(sources, LOCAL), lambda: train_local.main(local))
-    yield Step("the place encoder", _exists(sources, PLACE), lambda: train_place.main(place))
+    for what, kind, script, arguments in (
+        ("the local network", LOCAL, train_local, scripts.local),
+        ("the place encoder", PLACE, train_place, scripts.place),
+    ):
+        make = partial(script.main, _for(sources, arguments, out=sources.weights))
+        yield Step(what, _exists(sources, kind), make)
 
 
 _VALIDATION = "validation"
@@ -109,28 +115,21 @@ def _features(sources: Sources, wanted: Wanted, scripts: Scripts, splits: tuple[
         arguments = replace(scripts.features, weights=sources.weights, out=sources.runs, **changes)
         tables = [f"{split}_{table}" for table in sources.world.tables]
         for store in sources.world.optimizer_stores if split == TRAIN_STORE else tables:
-            yield Step(f"the feature store {store}", _whole(sources, store), _call(featurise.main, arguments))
+            yield Step(f"the feature store {store}", _whole(sources, store), partial(featurise.main, arguments))
 
 
 def _smoother(sources: Sources, scripts: Scripts) -> Iterator[Step]:
     if sources.world.smoothing:
-        common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-        arguments = replace(scripts.smoother, weights=sources.weights, out=sources.weights, **common)
-        yield Step("the odometry smoother", _exists(sources, SMOOTHER), lambda: train_smoother.main(arguments))
+        arguments = _for(sources, scripts.smoother, weights=sources.weights, out=sources.weights)
+        yield Step("the odometry smoother", _exists(sources, SMOOTHER), partial(train_smoother.main, arguments))
 
 
 def _settings(sources: Sources, scripts: Scripts) -> Iterator[Step]:
-    common: dict[str, Any] = {"world": sources.world.name, "runs": sources.runs}
-    needed = {
-        "loops": True,
-        "registered": sources.world.registers_odometry,
-        "smoothed": sources.world.smoothing,
-    }
+    needed = {"loops": True, "registered": sources.world.registers_odometry, "smoothed": sources.world.smoothing}
     for form in (form for form in tune_pose_graph.FORMS if needed[form]):
-        changes = {**common, "form": form}
-        arguments = replace(scripts.pose_graph, weights=sources.weights, out=sources.results, **changes)
+        arguments = _for(sources, scripts.pose_graph, form=form, weights=sources.weights, out=sources.results)
         what = "tuning of the pose graph" + ("" if form == "loops" else f", {form}")
-        yield Step(what, partial(is_tuned, sources, form), _call(tune_pose_graph.main, arguments))
+        yield Step(what, partial(is_tuned, sources, form), partial(tune_pose_graph.main, arguments))
 
 
 def is_tuned(sources: Sources, form: str) -> bool:
@@ -151,60 +150,46 @@ def _optimizers(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[
         row = ROWS[name]
         for seed in range(wanted.seeds if row.form is not None else 0):
             folder = sources.row_folder(name, seed)
-            changes: dict[str, Any] = {"world": sources.world.name, "form": row.form}
-            arguments = replace(
-                scripts.optimizer,
-                iterations=row.iterations,
-                seed=seed,
-                weights=sources.weights,
-                out=folder,
-                runs=sources.runs,
-                **changes,
-            )
-            yield Step(f"{name} of seed {seed}", (folder / f"{OPTIMIZER}.safetensors").exists, _optimizer(arguments))
+            of_row = {"form": row.form, "iterations": row.iterations, "seed": seed}
+            arguments = _for(sources, scripts.optimizer, **of_row, weights=sources.weights, out=folder)
+            make = partial(_make_optimizer, arguments)
+            yield Step(f"{name} of seed {seed}", (folder / f"{OPTIMIZER}.safetensors").exists, make)
 
 
-def _optimizer(arguments: train_optimizer.Arguments) -> Callable[[], None]:
-    def make() -> None:
-        train_optimizer.main(arguments)
-        # The scripts write WORLD/NAME, for folders that hold several worlds; a row has a folder for each world.
-        written = arguments.out / str(arguments.world)
-        for path in sorted(written.iterdir()):  # the description first: what is complete has both
-            path.replace(arguments.out / path.name)
-        written.rmdir()
-
-    return make
+def _make_optimizer(arguments: train_optimizer.Arguments) -> None:
+    train_optimizer.main(arguments)
+    # The scripts write WORLD/NAME, for folders that hold several worlds; a row has a folder for each world.
+    written = arguments.out / str(arguments.world)
+    for path in sorted(written.iterdir()):  # the description first: what is complete has both
+        path.replace(arguments.out / path.name)
+    written.rmdir()
 
 
 def _end_to_end(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:
     for row in (name for name in rows_of(sources.world) if ROWS[name].own_networks):
         own = sources.of_row(row, 0)
-        stages = own.weights / "stages"
-        changes: dict[str, Any] = {"world": sources.world.name, "seed": 0, "runs": sources.runs}
-        arguments = replace(scripts.end_to_end, weights=stages, out=own.weights, **changes)
-
-        def make(sources: Sources = sources, arguments: train_end_to_end.Arguments = arguments) -> None:
-            folder = arguments.weights / str(arguments.world)
-            folder.mkdir(parents=True, exist_ok=True)
-            trained = sources.row_folder("ngo_5", 0)
-            for kind, source in ((LOCAL, sources.networks), (PLACE, sources.networks), (OPTIMIZER, trained)):
-                for suffix in (".json", ".safetensors"):
-                    shutil.copy(source / f"{kind}{suffix}", folder)
-            train_end_to_end.main(arguments)
-
-        yield Step(row, _exists(own, OPTIMIZER), make)
+        arguments = _for(sources, scripts.end_to_end, seed=0, weights=own.weights / "stages", out=own.weights)
+        yield Step(row, _exists(own, OPTIMIZER), partial(_make_end_to_end, sources, arguments))
         yield from _features(own, wanted, scripts, (wanted.split,))
+
+
+def _make_end_to_end(sources: Sources, arguments: train_end_to_end.Arguments) -> None:
+    folder, trained = arguments.weights / str(arguments.world), sources.row_folder("ngo_5", 0)
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, source in ((LOCAL, sources.networks), (PLACE, sources.networks), (OPTIMIZER, trained)):
+        for suffix in (".json", ".safetensors"):
+            shutil.copy(source / f"{kind}{suffix}", folder)
+    train_end_to_end.main(arguments)
 
 
 def _own_odometry(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterator[Step]:
     for row in (name for name in rows_of(sources.world) if ROWS[name].odometry is not None):
         own, kind = sources.of_row(row, 0), str(ROWS[row].odometry)
-        changes: dict[str, Any] = {"world": sources.world.name, "out": own.weights, "runs": sources.runs}
         if kind == DEEPVO:
-            yield Step(row, _exists(own, kind), _call(train_deepvo.main, replace(scripts.deepvo, **changes)))
+            train = partial(train_deepvo.main, _for(sources, scripts.deepvo, out=own.weights))
         else:
-            arguments = replace(scripts.local, without_action=True, **changes)
-            yield Step(row, _exists(own, kind), _call(train_local.main, arguments))
+            train = partial(train_local.main, _for(sources, scripts.local, without_action=True, out=own.weights))
+        yield Step(row, _exists(own, kind), train)
         for table in sources.world.tables:
             store = own.store_folder(wanted.split, table)
             make = partial(make_odometry, row, sources, wanted.split, table, wanted.trajectories)
@@ -215,10 +200,6 @@ def _speed(sources: Sources, scripts: Scripts) -> None:
     world: Any = sources.world.name
     speed = throughput.main(replace(scripts.speed, world=world))
     write_at_once(sources.speed_file, json.dumps(speed) + "\n")
-
-
-def _call(main: Callable[[Any], object], arguments: Any) -> Callable[[], object]:
-    return lambda: main(arguments)
 
 
 def _exists(sources: Sources, kind: str) -> Callable[[], bool]:

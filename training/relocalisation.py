@@ -26,7 +26,7 @@ from ngo_estimator.loops import pair_measurement
 from ngo_estimator.slam import localisation, online_trajectory, place_matcher, scan_matcher, scan_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.data.batches import seen_from_first
 from training.data.kidnapped_drives import Features, kidnapped_drives
 from training.data.lidar_drives import LidarDrive
@@ -78,11 +78,7 @@ class Arguments(Folders):
     log_starts: int = 20  # Starts in each log.
 
     def __post_init__(self) -> None:
-        if min(self.mazes, self.starts, self.aliased_starts) < 2:
-            raise ValueError(
-                f"mazes, starts, aliased_starts are {self.mazes}, {self.starts}, {self.aliased_starts}; expected at "
-                "least 2 of each"
-            )
+        check_at_least(self, mazes=2, starts=2, aliased_starts=2)
 
 
 def main(arguments: Arguments) -> dict[str, Any]:

@@ -14,8 +14,10 @@ measured in mazes that nothing was trained or chosen on. The command writes ``tr
 """
 
 import json
+import re
 import sys
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
@@ -25,7 +27,7 @@ from ngo_estimator.ngo import neural_graph_optimizer
 from ngo_estimator.trajectory import errors
 from training import results_doom, results_explore, results_graphs, results_scan, results_stress
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.prerequisites import Scripts, Wanted, prepare
@@ -54,13 +56,19 @@ class Arguments(Folders):
     """Numbers of steps after which errors are given, as if the robot had stopped there; none: the world's."""
 
     def __post_init__(self) -> None:
-        if (self.trajectories < 2 and self.trajectories != 0) or self.seeds < 1:
-            raise ValueError(
-                f"trajectories, seeds are {self.trajectories}, {self.seeds}; expected at least 2 and at least 1"
-            )
+        check_at_least(self, trajectories=2 if self.trajectories else 0, seeds=1)
         if min(self.prefixes, default=1) < 1:
             raise ValueError(f"prefixes are {self.prefixes}; expected numbers of steps, each at least 1")
 
+
+TABLES: dict[str, ModuleType] = {
+    "scan": results_scan,
+    "doom": results_doom,
+    "explore": results_explore,
+    "graphs": results_graphs,
+    "stress": results_stress,
+}
+"""The commands of tables that are not of a world of mazes."""
 
 _ATTENTION_TRAJECTORIES = 24
 _CODE = (row_estimators, prefix_errors_module, neural_graph_optimizer, overlaps, pair_measurement, errors)
@@ -167,16 +175,8 @@ def summary(
 
 
 if __name__ == "__main__":
-    given = " ".join(sys.argv).replace("--world=", "--world ")
-    if "--world scan" in given:
-        run_command(results_scan.main, results_scan.Arguments, results_scan.__doc__)
-    elif "--world doom" in given:
-        run_command(results_doom.main, results_doom.Arguments, results_doom.__doc__)
-    elif "--world explore" in given:
-        run_command(results_explore.main, results_explore.Arguments, results_explore.__doc__)
-    elif "--world graphs" in given:
-        run_command(results_graphs.main, results_graphs.Arguments, results_graphs.__doc__)
-    elif "--world stress" in given:
-        run_command(results_stress.main, results_stress.Arguments, results_stress.__doc__)
+    world = re.search(r"--world[= ](\w+)", " ".join(sys.argv))
+    if world and (table := TABLES.get(world[1])):
+        run_command(table.main, table.Arguments, table.__doc__)
     else:
         run_command(main, Arguments, __doc__)

@@ -25,7 +25,7 @@ from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
 from training.data.episodes import images_of
 from training.data.features import features_of
@@ -67,10 +67,7 @@ class Arguments(Folders):
     maps: int = 0  # Number of maps; 0: all.
 
     def __post_init__(self) -> None:
-        if self.seeds < 2 or self.frames < 2 or self.maps < 0:
-            raise ValueError(
-                f"seeds, frames, maps are {self.seeds}, {self.frames}, {self.maps}; expected at least 2, 2 and 0"
-            )
+        check_at_least(self, seeds=2, frames=2, maps=0)
 
 
 def main(arguments: Arguments) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from ngo_common.files import written_whole
 from ngo_sim.policy_network import SHIPPED, PolicyConfig
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.common.records import write_at_once
 from training.data.worlds import World, world_named
 from training.driver.driver_network import Features, MirroredPolicy, export
@@ -65,14 +65,8 @@ class Arguments:
     runs: Path = records.ROOT / "runs"  # Folder of checkpoints and logs.
 
     def __post_init__(self) -> None:
-        for name in (
-            "decisions", "environments", "steps", "batch_size", "passes", "episode_frames", "mazes",
-            "checkpoint_decisions", "threads", "lesson_decisions", "lesson_updates",
-        ):  # fmt: skip
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if self.lessons < 0:
-            raise ValueError(f"lessons is {self.lessons}; it must be at least 0")
+        check_at_least(self, decisions=1, environments=1, steps=1, batch_size=1, passes=1, episode_frames=1, mazes=1)
+        check_at_least(self, checkpoint_decisions=1, threads=1, lessons=0, lesson_decisions=1, lesson_updates=1)
 
 
 class Progress(BaseCallback):

@@ -35,7 +35,7 @@ from ngo_estimator.networks.familiarity import (
     told_vector,
 )
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.common.training import save_weights
 from training.data.batches import action_histories, relative_poses, seen_from_first
 from training.data.episodes import simulate
@@ -71,11 +71,7 @@ class Arguments(DataArguments):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min(self.drives, self.limit_drives, self.fault_drives) < 1 or self.frames < 2 * _WINDOWS[0]:
-            raise ValueError(
-                f"drives, limit_drives, fault_drives, frames are {self.drives}, {self.limit_drives}, "
-                f"{self.fault_drives}, {self.frames}; expected at least 1, 1, 1, {2 * _WINDOWS[0]}"
-            )
+        check_at_least(self, drives=1, limit_drives=1, fault_drives=1, frames=2 * _WINDOWS[0])
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,13 @@ def run_command(
         sys.exit(f"unusable: {error}")
 
 
+def check_at_least(arguments: object, **least: int) -> None:
+    """Raise ``ValueError`` for a field of arguments that is smaller than it may be."""
+    for name, smallest in least.items():
+        if not (given := getattr(arguments, name)) >= smallest:
+            raise ValueError(f"{name} is {given}; expected {smallest} or more")
+
+
 def quiet_framework() -> None:
     """Keep what Lightning says of itself off the terminal: hints at its products, and at settings that are ours."""
     for name in ("lightning.pytorch", "lightning.fabric"):
