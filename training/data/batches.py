@@ -34,6 +34,14 @@ def seen_from_first(poses_xyyaw: np.ndarray) -> np.ndarray:
     return se2.between(poses[:1], poses).numpy()
 
 
+def alike(poses_xyyaw: np.ndarray, radius_m: float, limit_rad: float) -> np.ndarray:
+    """Which pairs of poses ``(n, 3)`` are at one place, near in position and heading ``(n, n)``."""
+    xy, yaw = poses_xyyaw[:, :2], poses_xyyaw[:, 2]
+    near = np.linalg.norm(xy[:, None] - xy[None], axis=-1) < radius_m
+    turn = np.abs(np.remainder(yaw[:, None] - yaw[None] + np.pi, 2.0 * np.pi) - np.pi)
+    return near & (turn <= limit_rad)
+
+
 def mirrored(batch: Batch) -> Batch:
     """The batch seen in a mirror: pictures flipped left to right, left and right actions and motions exchanged."""
     result = dict(batch)

@@ -22,6 +22,7 @@ from training.data.batches import (
     Batch,
     Share,
     action_histories,
+    alike,
     mirrored,
     relative_poses,
 )
@@ -238,12 +239,9 @@ def revisits(poses_xyyaw: np.ndarray, world: World, min_steps_apart: int) -> np.
     A frame later than another by ``min_steps_apart`` forms a pair with it within the world's place radius and heading
     limit.
     """
-    xy, yaw = poses_xyyaw[:, :2], poses_xyyaw[:, 2]
-    distance = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
-    turn = np.abs(np.remainder(yaw[:, None] - yaw[None] + np.pi, 2 * np.pi) - np.pi)
-    index = np.arange(len(xy))
+    index = np.arange(len(poses_xyyaw))
     apart = index[None] - index[:, None] >= min_steps_apart
-    return np.argwhere(apart & (distance < world.place_radius_m) & (turn <= world.heading_limit_rad))
+    return np.argwhere(apart & alike(poses_xyyaw, world.place_radius_m, world.heading_limit_rad))
 
 
 def loader(stream: IterableDataset[Batch], workers: int) -> DataLoader[Batch]:

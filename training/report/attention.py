@@ -12,6 +12,7 @@ from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.meta_poses import OptimizedTrajectory
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
+from training.data.batches import alike
 from training.data.worlds import World
 from training.scoring.row_estimators import Arrays
 from training.scoring.statistics import mean_interval
@@ -91,12 +92,9 @@ def attention_of(
 
 def revisits(poses_xyyaw: np.ndarray, world: World) -> np.ndarray:
     """Which pairs of meta-poses ``(poses, 3)`` are at one place, well apart in time ``(poses, poses)``."""
-    xy, yaw = poses_xyyaw[:, :2], poses_xyyaw[:, 2]
-    near = np.linalg.norm(xy[:, None] - xy[None], axis=-1) < world.place_radius_m
-    turn = np.abs(np.remainder(yaw[:, None] - yaw[None] + np.pi, 2.0 * np.pi) - np.pi)
-    index = np.arange(len(xy))
+    index = np.arange(len(poses_xyyaw))
     apart = np.abs(index[:, None] - index[None]) >= _MIN_SEPARATION
-    return near & apart & (turn <= world.heading_limit_rad + 1e-9)
+    return apart & alike(poses_xyyaw, world.place_radius_m, world.heading_limit_rad)
 
 
 def attention_json(sources: Sources, arrays: Arrays) -> dict[str, Any]:

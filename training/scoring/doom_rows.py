@@ -13,7 +13,7 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.baselines.loop_factors import found_loops
 from training.baselines.pose_graph import PoseGraphSettings, optimize
-from training.data.batches import action_histories, relative_poses
+from training.data.batches import action_histories, alike, relative_poses
 from training.scoring.metrics import absolute_error_m, trajectory_error, within
 from training.scoring.online_estimate import carried_covariances, online_run, steps_of, with_origin
 from training.scoring.row_estimators import seen_in
@@ -128,10 +128,7 @@ def returning(truth: np.ndarray, radius_m: float, angle_rad: float) -> float:
     """
     poses = truth[7::8]
     earlier = np.tri(len(poses), k=-(_AGO // 8), dtype=bool)
-    near = np.hypot(*(poses[:, None, :2] - poses[:, :2]).transpose(2, 0, 1)) <= radius_m
-    turned = poses[:, None, 2] - poses[:, 2]
-    near &= np.abs(np.arctan2(np.sin(turned), np.cos(turned))) <= angle_rad
-    return float((near & earlier).any(axis=1).mean())
+    return float((alike(poses, radius_m, angle_rad) & earlier).any(axis=1).mean())
 
 
 def errors_of(estimate: Estimate, truth: np.ndarray) -> dict[str, float]:
