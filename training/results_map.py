@@ -24,7 +24,7 @@ from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.mapping import scan_source as scan_sources
-from ngo_estimator.mapping.occupancy_grid import OccupancyConfig, OccupancyMap
+from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
 from ngo_estimator.mapping.scan_source import KeyScans, ScanSource, scan_source
 from ngo_estimator.ngo import whole_trajectory
@@ -32,7 +32,7 @@ from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from ngo_estimator.slam import scan_trajectory
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_at_least, run_command
 from training.data.batches import seen_from_first
 from training.data.episodes import GROUP, simulate
 from training.data.features import OPTIMIZER_INPUTS, Networks, features_of
@@ -54,7 +54,8 @@ _CODE = (map_errors, whole_trajectory, scan_map, scan_sources)
 _LOG_CODE = (map_errors, scan_map, scan_sources, mixture_lidar, scan_trajectory)
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 _ROWS = ("odometry", "corrected", "true")
-_DEFAULT = OccupancyConfig()
+_CONFIG = ScanMapConfig(most_waiting=10**9)
+_THRESHOLDS = _CONFIG.occupancy.free, _CONFIG.occupancy.occupied
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,9 @@ class Arguments(Folders):
     mazes: int = 20  # Mazes of each world, each with a trajectory of its own.
     frames: int = 500  # Frames of a trajectory.
     logs: Path | None = None  # Folder of real logs (.bag, .log, .clf, gzipped or not); none: left out.
-    hit: float = _DEFAULT.hit  # Log odds that a scan adds to a cell in which it ends.
-    passed: float = _DEFAULT.passed  # Log odds that a scan takes from a cell which it looks through.
-    max_range_m: float = 0.0  # Longest range that enters a map; 0: that of ngo_map.
 
     def __post_init__(self) -> None:
-        if self.mazes < 2 or self.frames < 2:
-            raise ValueError(f"mazes, frames are {self.mazes}, {self.frames}; expected at least 2 of each")
-
-    @property
-    def map_config(self) -> ScanMapConfig:
-        """Settings of the maps."""
-        return ScanMapConfig(occupancy=OccupancyConfig(hit=self.hit, passed=self.passed), most_waiting=10**9)
+        check_at_least(self, mazes=2, frames=2)
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
@@ -99,11 +91,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
     return arguments.publish("map", result, map_page.page(result))
 
 
-def drawn(
-    config: ScanMapConfig, source: ScanSource, steps: list[Any], stamps_ns: np.ndarray, poses: np.ndarray
-) -> OccupancyMap:
+def drawn(source: ScanSource, steps: list[Any], stamps_ns: np.ndarray, poses: np.ndarray) -> OccupancyMap:
     """The probabilities of the map of all steps at poses ``(frames, 3)``."""
-    drawing = ScanMap(config)
+    drawing = ScanMap(_CONFIG)
     for step in steps:
         drawing.take(step, source.scans(step))
     drawing.update(stamps_ns, poses)
@@ -116,7 +106,7 @@ def maze_table(arguments: Arguments, world: World) -> dict[str, Any]:
     made = Mazes.load(arguments, world)
     # Mazes of a group are simulated together: all are of the size that is drawn for the first.
     groups = [tuple(seeds[first : first + GROUP]) for first in range(0, len(seeds), GROUP)]
-    identity = _identity(arguments, made.folder)
+    identity = _identity(made.folder)
     rows = {row: Row(partial(maze_errors, row=row, mazes=made), identity, _CODE) for row in _ROWS}
     drives = [
         Drive(f"mazes_{group[0]}_{len(group)}", f"{group}, {arguments.frames} frames", partial(made.drives, group))
@@ -135,19 +125,18 @@ class Mazes:
     networks: Networks
     optimizer: NeuralGraphOptimizer
     source: ScanSource
-    config: ScanMapConfig
     frames: int
 
     @classmethod
     def load(cls, arguments: Arguments, world: World) -> "Mazes":
         """From the folder of all weights; raises ``ValueError`` where these see no ranges."""
         folder, name = arguments.weights / world.name, world.name
-        source = scan_source(folder, name, arguments.max_range_m)
+        source = scan_source(folder, name)
         if source is None or world.registration is None:
             raise ValueError(f"the weights of {name} see no ranges; expected ranges behind their place codes")
         networks = Networks(load_local(folder, name)[0], load_place(folder, name)[0])
         optimizer = load_optimizer(folder, name)[0]
-        return cls(world, folder, networks, optimizer, source, arguments.map_config, arguments.frames)
+        return cls(world, folder, networks, optimizer, source, arguments.frames)
 
     def drives(self, seeds: tuple[int, ...]) -> list["MazeDrive"]:
         """A drive through each maze of a group."""
@@ -157,7 +146,7 @@ class Mazes:
         found = []
         for one in simulate(self.world, list(seeds), self.frames):
             assert one.maze is not None
-            true = true_map(one.maze, one.poses_xyyaw, angles, self.config.resolution_m)
+            true = true_map(one.maze, one.poses_xyyaw, angles, _CONFIG.resolution_m)
             features = features_of(self.world, one, self.folder, self.networks)
             found.append(MazeDrive(one.poses_xyyaw, features, true))
         return found
@@ -183,17 +172,17 @@ class MazeDrive:
 
 def maze_errors(drives: list[MazeDrive], row: str, mazes: Mazes) -> Measured:
     """IoU of the maps at the poses of a row, one sample a maze."""
-    occupancy, found = mazes.config.occupancy, []
+    found = []
     for one in drives:
         poses = mazes.poses(one, row).astype(np.float64)
-        cells = drawn(mazes.config, mazes.source, list(steps_of(one.features)), np.arange(mazes.frames), poses)
-        found.append(intersections(cells.trinary(occupancy.free, occupancy.occupied), one.true))
+        cells = drawn(mazes.source, list(steps_of(one.features)), np.arange(mazes.frames), poses)
+        found.append(intersections(cells.trinary(*_THRESHOLDS), one.true))
     free, occupied = np.array(found).T
     return Measured({"free_iou": free, "occupied_iou": occupied})
 
 
-def _identity(arguments: Arguments, weights: Path) -> str:
-    return json.dumps([folder_digest(weights), repr(arguments.map_config), arguments.max_range_m])
+def _identity(weights: Path) -> str:
+    return json.dumps([folder_digest(weights), repr(_CONFIG)])
 
 
 def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
@@ -202,10 +191,9 @@ def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
     if not logs:
         skipped.append("logs: no folder is given (--logs), or it has none")
     weights = arguments.weights / "scan"
-    identity = _identity(arguments, weights)
+    identity = _identity(weights)
     rows = {
-        row: Row(partial(log_errors, row=row, arguments=arguments), identity, _LOG_CODE)
-        for row in ("odometry", "corrected", "reference")
+        row: Row(partial(log_errors, row=row), identity, _LOG_CODE) for row in ("odometry", "corrected", "reference")
     }
     drives = [Drive(name, log_identity(path), partial(read_drive, path), (lidar_logs,)) for name, path in logs.items()]
     plan = [(with_runs(drive, weights), rows) for drive in drives]
@@ -220,7 +208,7 @@ def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
     }
 
 
-def log_errors(runs: DriveRuns, row: str, arguments: Arguments) -> Measured:
+def log_errors(runs: DriveRuns, row: str) -> Measured:
     """How crisp the map of a log is at the poses of a row; nothing for a reference that does not know each pose."""
     try:
         run = runs.run(Pipeline())
@@ -237,8 +225,8 @@ def log_errors(runs: DriveRuns, row: str, arguments: Arguments) -> Measured:
             return Measured()
         poses = np.array([known[stamp] for stamp in stamps])
     steps: list[LidarStep] = list(run.front.steps)
-    cells = drawn(arguments.map_config, KeyScans(arguments.max_range_m), steps, trajectory.stamps_ns, poses)
-    occupied = int((cells.trinary(_DEFAULT.free, _DEFAULT.occupied).values == 100).sum())
+    cells = drawn(KeyScans(), steps, trajectory.stamps_ns, poses)
+    occupied = int((cells.trinary(*_THRESHOLDS).values == 100).sum())
     way_m = path_length_m(trajectory.poses_xyyaw)
     return Measured.of({"entropy_bits": mean_entropy_bits(cells), "occupied_cells_a_metre": occupied / way_m})
 

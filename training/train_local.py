@@ -29,7 +29,7 @@ from training.common import runs
 from training.common.command_line import run_command
 from training.common.step_losses import LIKELIHOOD_WEIGHT, step_losses, step_metrics
 from training.common.training import Figures, OverallTraining, save_weights
-from training.data.batches import ACTION_HISTORY, Batch, Share, action_histories, relative_poses
+from training.data.batches import Batch, Share, action_histories, relative_poses
 from training.data.data_module import StreamedData
 from training.data.data_source import Domain
 from training.data.episodes import images_of, simulate
@@ -48,8 +48,6 @@ class Arguments(SourceArguments):
     """Settings of a training of the local pose network."""
 
     without_action: bool = False  # Worlds: whether the network sees images alone, without the actions.
-    action_history: int | None = None  # Latest actions that the network is told; none: the world's, recordings: 12.
-    error_windows: tuple[int, ...] | None = None  # Worlds: steps over which the loss sums errors; none: the world's.
     width: float = 0.25  # Channels of the convolutions, as a fraction of FlowNetS's.
     epochs: int = 8  # Passes of new data.
     datapoints: int = 200_000  # Frame pairs in an epoch, of all processes; each pair of recordings twice at most.
@@ -62,13 +60,6 @@ class Arguments(SourceArguments):
         super().__post_init__()
         if self.without_action and self.world is None:
             raise ValueError("without_action is given with recordings; expected --action none, which leaves it out")
-        if self.action_history is not None and not 1 <= self.action_history <= ACTION_HISTORY:
-            raise ValueError(f"action_history is {self.action_history}; expected 1 to {ACTION_HISTORY}")
-        if self.action_history is not None and self.without_action:
-            raise ValueError(f"action_history is {self.action_history} with without_action; expected one of the two")
-        if self.error_windows is not None and (self.world is None or min(self.error_windows, default=0) < 1):
-            given = f"{self.error_windows}{' with recordings' if self.world is None else ''}"
-            raise ValueError(f"error_windows is {given}; expected numbers of steps, each at least 1, of a world")
 
 
 class LocalTraining(OverallTraining):
@@ -90,16 +81,6 @@ class LocalTraining(OverallTraining):
         loss = step_losses(mean, log_std, truth, self.network.relative_std)[0]
         metrics = step_metrics(mean, log_std, truth)
         return {"validation_loss": loss, **{f"validation_{name}": value for name, value in metrics.items()}}
-
-
-def with_changes(domain: Domain, arguments: Arguments) -> Domain:
-    """The domain with the changes that the arguments ask for."""
-    changes: dict[str, Any] = {} if arguments.action_history is None else {"action_history": arguments.action_history}
-    if arguments.error_windows is not None:
-        changes["error_windows"] = arguments.error_windows
-    if arguments.without_action:
-        changes |= {"actions": 0, "mirrored_actions": ()}
-    return dataclasses.replace(domain, **changes)
 
 
 class SimulatedSteps:
@@ -207,7 +188,9 @@ def _sums(values: Tensor, steps: int) -> Tensor:
 def main(arguments: Arguments) -> dict[str, float]:
     """Train, calibrate, write the weights, and return the validation metrics (in the first process, which does so)."""
     source = open_source(arguments)
-    domain = with_changes(source.domain, arguments)
+    domain = source.domain
+    if arguments.without_action:
+        domain = dataclasses.replace(domain, actions=0, mirrored_actions=())
     settings: dict[str, Any] | None = None
     steps: SimulatedSteps | RecordedSteps
     if isinstance(domain, World):

@@ -74,8 +74,7 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
         return losses(*values)
 
     monkeypatch.setattr(train_local, "step_losses", noted)
-    told = {"maze2d": 3}.get(world)  # of the latest actions; the others' number is the world's
-    local_metrics = train_local.main(toy.local(world, tmp_path, action_history=told))
+    local_metrics = train_local.main(toy.local(world, tmp_path))
     place_metrics = train_place.main(toy.place(world, tmp_path))
     featurise.main(toy.features(world, tmp_path))
     smoothed = worlds.world_named(world).smoothing
@@ -121,7 +120,7 @@ def test_the_scripts_make_a_set_of_weights_that_the_estimator_takes(
     # A calibrated network has no constant error on what it was calibrated with: the normalisation was changed for it.
     config = load_local(weights, world)[0].config
     assert config.relative_bias[2] != 0.0
-    assert config.action_history == {"maze2d": 3, "maze3d": 12}[world]
+    assert config.action_history == {"maze2d": 1, "maze3d": 12}[world]
     # Steps alone of what is seen and in validation; the world's windows where earlier actions correct it.
     assert set(windows) == {"maze2d": {(1,)}, "maze3d": {(1,), (1, 4, 16)}}[world]
 
