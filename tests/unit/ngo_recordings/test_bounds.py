@@ -13,7 +13,6 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from ngo_recordings.association import header_stamp_ns
-from ngo_recordings.bounds import unpacked
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.poses import read_tum
 from ngo_recordings.recording import open_recording
@@ -82,20 +81,6 @@ def test_a_bomb_costs_little_memory(tmp_path: Path, compression: str, declared: 
     )
     done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
     assert int(done.stdout) < 500
-
-
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2", "none"])
-def test_what_fits_is_unpacked(compression: str) -> None:
-    import bz2
-
-    data = bytes(range(256)) * 100
-    pack = {**PACK, "bz2": bz2.compress, "none": bytes}[compression]
-    assert unpacked(pack(data), compression, len(data)) == data
-    assert unpacked(pack(data), compression, len(data), len(data)) == data
-    with pytest.raises(ValueError, match="holds more than 25599 bytes"):
-        unpacked(pack(data), compression, len(data) - 1)
-    with pytest.raises(ValueError, match="packed with 'rar'"):
-        unpacked(data, "rar", 100)
 
 
 SEPARATOR = "\n" + "=" * 80 + "\n"

@@ -294,11 +294,6 @@ def test_what_is_clear_is_chosen_and_nothing_is_guessed(rich: Path) -> None:
         assert choose_topics(recording, nothing) == RecordingTopics("/camera/image_raw", depth="/camera/depth")
 
 
-def test_the_topics_of_the_simulators_are_clear(tmp_path: Path) -> None:
-    with open_recording([m.write_mcap(tmp_path / "a.mcap", drive())]) as recording:
-        assert choose_topics(recording) == TOPICS
-
-
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [

@@ -147,14 +147,6 @@ def test_a_picture_is_refused_by_the_size_that_it_declares(side: int) -> None:
         tracemalloc.stop()
 
 
-def test_the_largest_size_is_taken_and_no_larger_one() -> None:
-    message = m.compressed(1, RGB, "png")
-    assert picture(message, COMPRESSED_TYPE, "/image", (4, 6))[0].shape == RGB.shape
-    for largest in ((3, 6), (4, 5)):
-        with pytest.raises(RecordingError, match=rf"is 6 x 4; expected at most {largest[1]} x {largest[0]}$"):
-            picture(message, COMPRESSED_TYPE, "/image", largest)
-
-
 def test_depth_becomes_a_fourth_channel_of_colour_alone() -> None:
     depth = np.full((4, 6, 1), 2.5, np.float32)
     image = with_depth(RGB, depth, "/depth")

@@ -31,11 +31,6 @@ def assert_same(one: Pose | None, other: Pose, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(one.rotation.as_matrix(), other.rotation.as_matrix(), atol=atol)
 
 
-@given(a=poses, b=poses)
-def test_a_pose_after_its_inverse_is_none(a: Pose, b: Pose) -> None:
-    assert_same(a.inverse() @ (a @ b), b, 1e-7)
-
-
 @given(x=metres, y=metres, z=metres, yaw=angles, pitch=st.floats(-1.4, 1.4), roll=angles)
 def test_planar_part_and_residual_are_the_usual_angles(
     x: float, y: float, z: float, yaw: float, pitch: float, roll: float
@@ -44,14 +39,6 @@ def test_planar_part_and_residual_are_the_usual_angles(
     planar, residual = pose.planar()
     np.testing.assert_allclose(planar, [x, y, yaw], atol=1e-7)
     np.testing.assert_allclose(residual, [z, roll, pitch], atol=1e-7)
-
-
-def test_between_two_poses_it_goes_straight_and_the_shortest_turn() -> None:
-    track = PoseTrack(gap_ns=2 * S)
-    track.add(1 * S, flat(0.0, 0.0, math.radians(170)))
-    track.add(3 * S, flat(4.0, 2.0, math.radians(-170)))
-    assert_same(track.at(round(1.5 * S)), flat(1.0, 0.5, math.radians(175)))
-    assert_same(track.at(3 * S), flat(4.0, 2.0, math.radians(-170)))
 
 
 @given(a=poses, b=poses, share=st.integers(0, 1000))

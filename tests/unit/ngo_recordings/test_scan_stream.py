@@ -175,15 +175,6 @@ def test_angles_follow_the_rule(
     assert (note is None) == (angles.note is None) and (note or "") in (angles.note or "")
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [(-90, math.nan, math.nan, 1), (0, 0, 0, 10), (0, 5000, 500, 11), (math.inf, 0, 1, 3), (0, 1, 1, 0)],
-)
-def test_angles_that_are_none_are_refused(bad: tuple[float, float, float, int]) -> None:
-    with pytest.raises(RecordingError, match="a scan of the scan has"):
-        scan_angles(geometry(*bad))
-
-
 @given(low=st.floats(), high=st.floats(), increment=st.floats(), rays=st.integers(0, 5))
 def test_angles_are_within_a_turn_or_refused(low: float, high: float, increment: float, rays: int) -> None:
     message = scan(stamp(0), rays=rays)

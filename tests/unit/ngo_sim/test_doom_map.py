@@ -15,7 +15,6 @@ from ngo_sim.doom_map import (
     UNITS_PER_M,
     WALL_HEIGHT_UNITS,
     WALL_TEXTURES,
-    MapStyle,
     map_lumps,
     random_decorations,
     random_style,
@@ -107,17 +106,6 @@ def test_decorations_are_of_all_kinds_in_free_blocks_and_off_the_walls() -> None
     for item in drawn:
         for dx, dy in itertools.product((-0.49, 0.49), repeat=2):
             assert not maze.walls[maze.block_at(item.x_m + dx, item.y_m + dy)]
-
-
-def test_mistakes_in_a_map_are_told() -> None:
-    maze = small_maze()
-    style = random_style(len(wall_faces(maze.walls)), np.random.default_rng(0))
-    with pytest.raises(ValueError, match="style has 1 wall textures; it must have"):
-        textmap(maze, MapStyle(("BROWN1",), "FLAT8", "FLAT5"), (4.5, 4.5), 0)
-    with pytest.raises(ValueError, match=re.escape("start_xy is (1.0, 1.0), inside a wall")):
-        textmap(maze, style, (1.0, 1.0), 0)
-    with pytest.raises(ValueError, match="light_level is 256; it must be from 0 to 255"):
-        MapStyle(("BROWN1",), "FLAT8", "FLAT5", light_level=256)
 
 
 def test_a_pwad_holds_the_maps_in_order(tmp_path: Path) -> None:

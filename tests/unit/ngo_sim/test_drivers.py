@@ -106,16 +106,6 @@ def test_corners_come_in_rounds_of_four_and_never_twice_in_a_row() -> None:
     assert len({tuple(goals[start : start + 4]) for start in range(0, len(goals) - 3, 4)}) > 5
 
 
-def test_it_plans_again_from_wherever_it_is_put() -> None:
-    driver = PathDriver(HOOK, np.random.default_rng(0), random_action_probability=0.0)
-    for block in ((1, 1), (3, 3), (1, 4), (2, 5), (3, 1)):
-        driver.action(np.array((*HOOK.block_center(block), 0.0)))
-    row, col = HOOK.shortest_path((1, 3), driver.goal)[1]
-    yaw = math.atan2(row - 1, col - 3)
-    driver.action(np.array((3.5, 1.5, yaw)))  # put there: what looks like momentum is gone in the next frame
-    assert driver.action(np.array((3.5, 1.5, yaw))) == Action.FORWARD
-
-
 def test_without_progress_it_heads_for_the_centre_of_its_block() -> None:
     driver = PathDriver(HOOK, np.random.default_rng(0), random_action_probability=0.0)
     # Held at the upper edge of a corridor along x, looking at the block's centre: the way on is to one side.

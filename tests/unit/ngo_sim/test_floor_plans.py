@@ -8,7 +8,6 @@ import pytest
 from ngo_sim.convex_shapes import contains, rectangle, union_walls
 from ngo_sim.corridors import LAYOUTS, Corridor
 from ngo_sim.floor_plans import FloorPlan, FloorPlanConfig, draw_floor_plan
-from ngo_sim.furniture import Placer, box
 from ngo_sim.routes import RouteMap
 
 SMALL = 0.6
@@ -40,15 +39,6 @@ def test_a_bent_corridor_keeps_its_width_at_the_bend() -> None:
     walls, _ = union_walls(quads, [()] * len(quads))
     # Outer sides 11 + 9, inner sides 9 + 7, two ends of 2; the seams of 1 mm add less than 1 cm.
     assert length_m(walls) == pytest.approx(20.0 + 16.0 + 4.0, abs=0.02)
-
-
-def test_furniture_keeps_clear_of_lanes_and_of_itself() -> None:
-    room, lane = rectangle((0, 0), 0.0, 6.0, 5.0), rectangle((0, 0), 0.0, 6.0, 0.9)
-    placer = Placer(room, [lane], np.random.default_rng(0))
-    assert not placer.put(box(1.0, 1.0), np.array((0.0, 0.5)), 0.0)
-    assert placer.put(box(1.0, 1.0), np.array((0.0, 1.2)), 0.0)
-    assert not placer.put(box(1.0, 1.0), np.array((0.5, 1.2)), 0.4)
-    assert not placer.put(box(1.0, 1.0), np.array((2.9, 1.2)), 0.0), "it would reach through the wall"
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -1,8 +1,6 @@
-import struct
-
 import pytest
 
-from ngo_sim.flow_control import FlowControl, Pacer, header_stamp_ns
+from ngo_sim.flow_control import FlowControl, Pacer
 
 
 def publish(flow: FlowControl, *stamps: int) -> None:
@@ -90,9 +88,3 @@ def test_pace_is_kept_without_drift_and_without_bursts() -> None:
     assert pacer.remaining_s(101.0) == 0.0
     pacer.taken(101.0, rate=10.0)
     assert pacer.remaining_s(101.0) == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(("kind", "order"), [(1, "<"), (0, ">")])
-def test_reads_the_stamp_of_a_header(kind: int, order: str) -> None:
-    cdr = bytes([0, kind, 0, 0]) + struct.pack(order + "iI", 12, 345) + b"rest"
-    assert header_stamp_ns(cdr) == 12_000_000_345

@@ -5,7 +5,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from ngo_sim.mazes import Maze, draw_maze, kruskal_maze, prim_maze, repeated_maze
+from ngo_sim.mazes import Maze, kruskal_maze, prim_maze, repeated_maze
 
 ALGORITHMS = [prim_maze, kruskal_maze]
 MakeMaze = Callable[..., Maze]
@@ -108,26 +108,6 @@ def test_wall_segments_of_a_hook() -> None:
     segments = maze_of(*HOOK, block_m=2.0).wall_segments() / 2.0
     assert {tuple(sorted(tuple(map(int, end)) for end in segment)) for segment in segments} == expected
     assert len(segments) == len(expected)
-
-
-def test_the_picture_is_one_image_with_y_up() -> None:
-    from matplotlib.figure import Figure
-
-    maze = maze_of(*HOOK, block_m=2.0)
-    axes = Figure(figsize=(7, 5), dpi=10).subplots()
-    draw_maze(axes, maze)
-    assert [len(axes.images), len(axes.patches), len(axes.lines), len(axes.collections)] == [1, 0, 0, 0]
-    image = axes.images[0]
-    assert image.origin == "lower" and tuple(image.get_extent()) == (0.0, 14.0, 0.0, 10.0)
-    dark = np.asarray(image.get_array()).mean(axis=-1) < 0.5
-    np.testing.assert_array_equal(dark, maze.walls)
-    colors = np.random.default_rng(0).random((*maze.walls.shape, 3))
-    draw_maze(axes, maze, colors)
-    drawn = np.asarray(axes.images[1].get_array())
-    np.testing.assert_allclose(drawn[maze.walls], colors[maze.walls])
-    assert (drawn[~maze.walls] == 1.0).all()
-    with pytest.raises(ValueError, match=r"colors has shape \(3,\); it must be \(5, 7, 3\)"):
-        draw_maze(axes, maze, np.zeros(3))
 
 
 def test_a_repeated_maze_is_connected_and_looks_the_same_from_module_to_module() -> None:

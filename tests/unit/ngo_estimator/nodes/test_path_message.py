@@ -31,8 +31,3 @@ def test_two_messages_share_no_memory() -> None:
     first = writer.write(1, stamps_ns, poses_xyyaw)
     writer.write(2, stamps_ns + 7, poses_xyyaw + 1.0)
     assert deserialize_message(first, Path) == plain_path("map", 1, stamps_ns, poses_xyyaw)
-
-
-def test_wrong_shapes_are_an_error() -> None:
-    with pytest.raises(ValueError, match=r"\(3,\) and poses \(2, 3\)"):
-        PathWriter("map").write(0, np.zeros(3, np.int64), np.zeros((2, 3)))

@@ -81,22 +81,6 @@ def test_measured_revisits_are_true_places_with_what_the_pair_head_says() -> Non
     np.testing.assert_allclose(loops.log_scale[5], log_scale, atol=1e-5)
 
 
-def test_a_place_that_is_found_and_true_is_measured_alike() -> None:
-    seen = drives(1, 800)
-    truth, search = circles(), LoopSearch(per_pose=12, most=5000, min_apart=0, views=5)
-    with torch.no_grad():
-        blocks = poses_in_blocks(torch.from_numpy(seen.relative), 8)
-        found = find_loops(small_pair_head(), torch.from_numpy(seen.codes).float(), blocks, search)
-    candidates = {pair: k for k, pair in enumerate(zip(found.frame[0].tolist(), found.end[0].tolist(), strict=True))}
-    loops = measured_revisits(small_pair_head(), seen, truth, search)
-    pairs = [column.tolist() for column in true_revisits(truth, search)]
-    both = [(k, candidates[pair]) for k, pair in enumerate(zip(*pairs, strict=True)) if pair in candidates]
-    assert len(both) > 5
-    for k, candidate in both:
-        np.testing.assert_allclose(loops.measured[k], found.measured[0, candidate], atol=1e-4)
-        np.testing.assert_allclose(loops.log_scale[k], found.log_scale[0, candidate], atol=1e-4)
-
-
 def test_overlaps_are_those_of_the_optimizer_under_the_graphs_poses() -> None:
     parts = [drive_with_a_camera(160, seed) for seed in (0, 1)]
     relative, _, codes, truth = (torch.cat(columns) for columns in zip(*parts, strict=True))

@@ -9,8 +9,8 @@ import pytest
 
 from training.common.records import ROOT, WEIGHTS
 from training.data.worlds import world_named
-from training.report import doom_page, faults_page, lidar_page, map_page, page, relocalisation_page, results_page
-from training.report.page import Column, joined, number, short, signed, table, with_interval
+from training.report import doom_page, faults_page, lidar_page, map_page, relocalisation_page, results_page
+from training.report.page import Column, number, short, table
 
 Page = Callable[[dict[str, Any], dict[str, str]], str]
 PAGES: dict[str, Page] = {
@@ -47,15 +47,6 @@ def test_a_table_has_a_line_a_row_and_an_empty_cell_for_no_number() -> None:
         "| ours | 2 [1, 150] | 12.3 |",
         "| other |  |  |",
     ]
-
-
-def test_signs_and_words() -> None:
-    assert with_interval(NUMBERS, signed(1)) == "+0.0 [+0.0, +1.5]"
-    assert joined([0]) == "0"
-    assert joined([0, 1, 2]) == "0, 1 and 2"
-    assert page.page(["# A", "", "b"]) == "# A\n\nb\n"
-    assert page.figures({}) == []
-    assert page.figures({"a.png": "What it shows."})[1].startswith("![What it shows.](images/a.png)")
 
 
 @pytest.mark.parametrize(

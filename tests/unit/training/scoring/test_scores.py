@@ -75,11 +75,3 @@ def test_whole_turns_are_no_error() -> None:
 
 def test_every_world_has_metrics() -> None:
     assert set(METRICS) == set(WORLDS)
-
-
-def test_trajectories_of_different_lengths_are_refused() -> None:
-    truth = walks(np.random.default_rng(2))
-    with pytest.raises(ValueError, match=r"\(4, 20, 3\)"):
-        scores(truth[:, :20], truth, world_named("maze2d"))
-    with pytest.raises(ValueError, match="no length"):
-        scores(truth, np.zeros_like(truth), world_named("maze2d"))
