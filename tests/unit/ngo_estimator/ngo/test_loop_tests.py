@@ -21,7 +21,7 @@ STEPS, STEP_M, STEP_STD = 200, 0.1, (0.0025, 0.0025, 0.001)
 def straight_on(world: str, value: float) -> tuple[float, float, int]:
     """Distance, its published deviation and the number of believed loops of a straight drive with one constant code."""
     core = OnlineTrajectory.load(WEIGHTS / world, world=world)
-    code = np.full(core._code_length or 0, value, np.float32)
+    code = np.full(core.feature_sizes[1], value, np.float32)
     motion = np.zeros(core._optimizer.config.aggregation.motion_feature_size, np.float32)
     for k in range(STEPS):
         pose, relative = np.array([STEP_M * (k + 1), 0.0, 0.0]), np.array([STEP_M, 0.0, 0.0])

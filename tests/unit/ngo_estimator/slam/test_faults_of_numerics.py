@@ -34,7 +34,7 @@ def maze3d() -> OnlineTrajectory:
 def drive(core: OnlineTrajectory, count: int, size: float = 1.0) -> list[RelativeStep]:
     """A drive through arcs, with features and codes of no camera, as large as ``size``."""
     rng = np.random.default_rng(0)
-    feature_size, code_length = core._optimizer.config.aggregation.motion_feature_size, core._code_length
+    feature_size, code_length = core.feature_sizes
     odom, steps = torch.zeros(3, dtype=torch.float64), []
     for k in range(count):
         relative = np.array([0.1, 0.0, 0.05]) + rng.normal(scale=0.01, size=3)

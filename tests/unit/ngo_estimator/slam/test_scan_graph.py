@@ -10,6 +10,7 @@ from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.scan_graph import ScanGraph
+from ngo_estimator.slam.step_log import TakenStep
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, TWICE, between, scan_at
 
 STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))
@@ -21,11 +22,17 @@ def driven(factors: np.ndarray, keys: int = 6, config: ScanGraphConfig | None = 
     nothing = np.zeros(0, np.float32)
     for k in range(keys):
         key = KeyScanStep(no_scan(k + 1), k, STEP, COVARIANCE, factors)
-        if k == 0:
-            graph.begin_at(RelativeStep(1, 0, STEP, COVARIANCE, 0, STEP, nothing, nothing, key=key))
-        graph.append(STEP, COVARIANCE, key)
-        graph.work()
+        step = RelativeStep(k + 1, k, STEP, COVARIANCE, 0, STEP, nothing, nothing, key=key)
+        take(graph, step)
     return graph
+
+
+def take(graph: ScanGraph, step: RelativeStep) -> None:
+    """Take a step, the first from the stamp 0, and do the work that it makes due."""
+    if step.from_stamp_ns == 0:
+        graph.begin_at(step)
+    graph.append(step, TakenStep(step.relative_xyyaw, step.covariance, step.from_stamp_ns == 0, False, False))
+    graph.work()
 
 
 @pytest.mark.parametrize("optimised", [False, True])
@@ -70,10 +77,8 @@ def first_loop(scans: list[KeyScan], config: ScanGraphConfig, step_std: tuple[fl
     graph, nothing, covariance = ScanGraph(config), np.zeros(0, np.float32), np.diag(np.square(step_std))
     for k, step in enumerate(between(TWICE[:-1], TWICE[1:])):
         key = KeyScanStep(scans[k + 1], k, step, covariance)
-        if k == 0:
-            graph.begin_at(RelativeStep(1, 0, step, covariance, 0, step, nothing, nothing, origin_scan=scans[0]))
-        graph.append(step, covariance, key)
-        graph.work()
+        origin = scans[0] if k == 0 else None
+        take(graph, RelativeStep(k + 1, k, step, covariance, 0, step, nothing, nothing, key=key, origin_scan=origin))
         if len(graph.measurements()[1].nodes):
             return graph.keys, int(graph.used_loops.agreeing.max())
     return len(scans), 0

@@ -43,29 +43,17 @@ class CorrectedTrajectory(ABC):
         self.reset()
 
     @abstractmethod
-    def localisation(self, origin: MapOrigin) -> MapLocalisation:
-        """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says; raises ``ValueError``."""
-
-    @abstractmethod
     def _new_graph(self) -> PoseGraph:
         """A graph without any frame."""
-
-    @abstractmethod
-    def _checked(self, step: RelativeStep) -> RelativeStep:
-        """The step as it is taken; raises ``RejectedStep`` for one that cannot be used."""
-
-    @abstractmethod
-    def _begin_at(self, step: RelativeStep) -> None:
-        """Give the graph what is known of the first frame."""
-
-    @abstractmethod
-    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
-        """Give the graph a step."""
 
     @property
     @abstractmethod
     def identity(self) -> dict[str, Any]:
         """What must be the same where a ``state()`` is restored: networks and settings, as JSON has them."""
+
+    def localisation(self, origin: MapOrigin) -> MapLocalisation:
+        """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says; raises ``ValueError``."""
+        return MapLocalisation(self._graph.localiser(origin), self._graph.checked)
 
     def state(self) -> Arrays:
         """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step.
@@ -144,7 +132,7 @@ class CorrectedTrajectory(ABC):
                 that is a little late; after loading, the first step of another odometry. The trajectory is as it was
                 before.
         """
-        step = self._checked(step)
+        step = self._graph.checked(step)
         self._begin_result()
         if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
             raise RejectedStep(
@@ -169,7 +157,7 @@ class CorrectedTrajectory(ABC):
         Raises:
             RejectedStep: as of ``update``; the stamp is not later than the newest one, or ``may_join`` is false.
         """
-        step = self._checked(step)
+        step = self._graph.checked(step)
         self._work()  # it may move the newest pose
         return self._join_at(step, *bridged(*self._graph.newest(), pose_xyyaw, covariance))
 
@@ -186,7 +174,7 @@ class CorrectedTrajectory(ABC):
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether the trajectory can go on with another odometry from this step's frame."""
-        return self._log.steps > 0
+        return self._log.steps > 0 and self._graph.may_join(step)
 
     def check_later(self, step: RelativeStep) -> None:
         """Raise ``RejectedStep`` if a step of another odometry is not later than the newest frame."""
@@ -195,9 +183,9 @@ class CorrectedTrajectory(ABC):
     def _take(self, step: RelativeStep, taken: TakenStep, optimize: bool) -> TrajectoryUpdate:
         self._loaded = False
         if taken.begins:
-            self._begin_at(step)
+            self._graph.begin_at(step)
             self._online.append(np.zeros(3))
-        self._append(step, taken)
+        self._graph.append(step, taken)
         self._odom = step.tf_odom_xyyaw
         self._due, self._optimize = True, optimize
         if not self._answers_first:

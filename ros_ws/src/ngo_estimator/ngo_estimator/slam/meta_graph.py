@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between, between, chained
@@ -18,15 +19,20 @@ from ngo_estimator.graph.solved_graph import SolvedGraph
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.loops.place_loop_finder import PlaceLoopFinder
 from ngo_estimator.loops.place_loops import PlaceLoops
-from ngo_estimator.loops.place_map import PlaceMap
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.meta_poses import MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_variances
+from ngo_estimator.slam.localisation import Localiser
+from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
+from ngo_estimator.slam.place_matcher import PlaceMatcher
 from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
-from ngo_estimator.slam.step_log import StepLog
+from ngo_estimator.slam.step_log import StepLog, TakenStep
+
+_VARIANCES = (1e-12, 1e4)
+"""What lies below or above is exact or unknown, and float32 has no room for it."""
 
 _SHRUNK = 1e-5
 """By less (m or rad) are poses those of the solution: a hundredth of what corrections are good to."""
@@ -57,7 +63,7 @@ class MetaGraph(PoseGraph):
     ) -> None:
         super().__init__(NodeChain())
         self._keys = KeyFrames(key_frames)
-        self._optimizer = optimizer
+        self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
         self._log = log  # of the steps as they came
@@ -79,32 +85,31 @@ class MetaGraph(PoseGraph):
         """Share of the window that is in use."""
         return min(1.0, self._odometry.steps / (self._window * self._block))
 
-    def begin_at(self, origin_code: np.ndarray | None) -> None:
-        """Take the place code of the first frame, where it is known, before the first step."""
-        if origin_code is not None:
-            self._origin_code = origin_code
+    def checked(self, step: RelativeStep) -> RelativeStep:
+        """See ``PoseGraph.checked``."""
+        codes = None if self._pair_head is None else self._pair_head.config.code_length
+        check_step(step, self._optimizer.config.aggregation.motion_feature_size, codes)
+        return step
 
-    def append(
-        self,
-        relative: np.ndarray,
-        variance: np.ndarray,
-        motion: np.ndarray,
-        code: np.ndarray,
-        joins: bool = False,
-        familiar: bool = True,
-    ) -> None:
-        """Take a step ``(3,)`` with its variances, motion feature and place code; ``work`` does what it makes due.
+    def begin_at(self, step: RelativeStep) -> None:
+        """Take the place code of the first frame, where it is known."""
+        if self._pair_head is not None and step.from_place_code is not None:
+            self._origin_code = step.from_place_code
 
-        With ``joins`` the step is where another odometry goes on, in another place.
-        A frame that is not ``familiar`` closes no loops, and networks leave the odometry around it as it is. Its
-        variances are honest, so that ``covariance_scale`` is not for them. The first one recalls those before it.
+    def append(self, step: RelativeStep, taken: TakenStep) -> None:
+        """Take a step with its motion feature and place code.
+
+        An unfamiliar frame closes no loops, and networks leave the odometry around it as it is. Its variances are
+        honest, so that ``covariance_scale`` is not for them. The first one recalls those before it.
         """
+        variance, code = np.clip(np.diagonal(taken.covariance), *_VARIANCES), step.place_code
+        familiar = step.unlikeness <= UNFAMILIAR
         if not familiar:
             code, variance = np.zeros_like(code), variance / self._scale
             if self._odometry.is_familiar:
                 self._recall()
-        self._nodes.append(relative.astype(np.float64), np.diag(variance.astype(np.float64)), joins)
-        self._odometry.append(relative, variance, motion, familiar)
+        self._nodes.append(taken.relative.astype(np.float64), np.diag(variance.astype(np.float64)), taken.joins)
+        self._odometry.append(taken.relative, variance, step.motion_feature, familiar)
         if self._loops is not None:
             self._loops.append(code)
 
@@ -290,11 +295,12 @@ class MetaGraph(PoseGraph):
         """See ``PoseGraph.remove_loops``."""
         return super().remove_loops(which)
 
-    def places(self) -> PlaceMap:
-        """The frames whose place codes are kept; raises ``ValueError`` where none are."""
-        if self._loops is None:
+    def localiser(self, origin: MapOrigin) -> Localiser:
+        """Localises by the frames whose place codes are kept; raises ``ValueError`` where none are."""
+        if self._loops is None or self._pair_head is None:
             raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
-        return self._loops.places(self.frame_poses())
+        places = self._loops.places(origin.poses(self.frame_poses()))
+        return Localiser(PlaceMatcher(self._pair_head, places, self._optimizer.config.search))
 
     SAVED = (
         "_nodes", "_keys", "_odometry", "_loops", "_solved", "_annealed", "_shrunk", "_corrections", "_origin_code",

@@ -7,24 +7,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from safetensors.torch import save
 
 from ngo_estimator.checkpoint import load_optimizer, load_place
-from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
 from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
-from ngo_estimator.slam.localisation import Localiser
-from ngo_estimator.slam.map_localisation import MapLocalisation
-from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.meta_graph import MetaGraph
-from ngo_estimator.slam.place_matcher import PlaceMatcher
-from ngo_estimator.slam.step_log import TakenStep
-
-_VARIANCES = (1e-12, 1e4)
-"""What lies below or above is exact or unknown, and float32 has no room for it."""
 
 _NETWORK_EVERY, _ANNEAL_EVERY = 32, 8
 """Meta-poses from one run of attention and convolutions to the next, and from one judgement of all loops to the next,
@@ -75,7 +65,6 @@ class OnlineTrajectory(CorrectedTrajectory):
         self._window = window_frames // block * block
         if iterations_per_step < 0:
             raise ValueError(f"iterations_per_step is {iterations_per_step}; expected 0 (before the answer) or more")
-        self._code_length = None if pair_head is None else pair_head.config.code_length
         self._key_frames = key_frames
         self._every = (_NETWORK_EVERY, _ANNEAL_EVERY) if iterations_per_step else (1, 1)
         super().__init__(answers_first=iterations_per_step > 0)
@@ -109,7 +98,8 @@ class OnlineTrajectory(CorrectedTrajectory):
     @property
     def feature_sizes(self) -> tuple[int, int]:
         """Lengths of a step's motion feature and place code, 0 where codes are not used."""
-        return self._optimizer.config.aggregation.motion_feature_size, self._code_length or 0
+        codes = 0 if self._pair_head is None else self._pair_head.config.code_length
+        return self._optimizer.config.aggregation.motion_feature_size, codes
 
     @property
     def window_frames(self) -> int:
@@ -134,30 +124,3 @@ class OnlineTrajectory(CorrectedTrajectory):
     def _new_graph(self) -> MetaGraph:
         blocks = self._window // self._block
         return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, *self._every, lambda: self._log)
-
-    def _checked(self, step: RelativeStep) -> RelativeStep:
-        check_step(step, self._optimizer.config.aggregation.motion_feature_size, self._code_length)
-        return step
-
-    def _begin_at(self, step: RelativeStep) -> None:
-        if self._pair_head is not None:
-            self._graph.begin_at(step.from_place_code)
-
-    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
-        code = step.place_code if self._pair_head is not None else np.zeros(0, np.float32)
-        variance = np.clip(np.diagonal(taken.covariance), *_VARIANCES)
-        familiar = step.unlikeness <= UNFAMILIAR
-        self._graph.append(taken.relative, variance, step.motion_feature, code, taken.joins, familiar)
-
-    def localisation(self, origin: MapOrigin) -> MapLocalisation:
-        """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says.
-
-        Raises:
-            ValueError: there are no place codes.
-        """
-        places = self._graph.places()
-        if self._pair_head is None:
-            raise ValueError("the optimizer has no pair head; expected one with loops")
-        places = dataclasses.replace(places, poses=origin.poses(places.poses))
-        matcher = PlaceMatcher(self._pair_head, places, self._optimizer.config.search)
-        return MapLocalisation(Localiser(matcher), self._checked)

@@ -10,8 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.loops.loop_record import LoopRecord, rows
+from ngo_estimator.slam.localisation import Localiser
+from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.step_log import TakenStep
 from ngo_estimator.slam.trajectory_update import fault_of
 
 WhichLoops = Callable[[np.ndarray], np.ndarray]
@@ -45,6 +49,26 @@ class PoseGraph(ABC):
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
         self.took_s = 0.0
         """Computing time of the last work that ended with an optimisation."""
+
+    @abstractmethod
+    def checked(self, step: RelativeStep) -> RelativeStep:
+        """The step as it is taken; raises ``RejectedStep`` for one that cannot be used."""
+
+    @abstractmethod
+    def begin_at(self, step: RelativeStep) -> None:
+        """Take what is known of the first frame, before the step from it."""
+
+    @abstractmethod
+    def append(self, step: RelativeStep, taken: TakenStep) -> None:
+        """Take a step to the next frame, and the motion that the log of steps has of it."""
+
+    def may_join(self, step: RelativeStep) -> bool:
+        """Whether another odometry may go on from this step's frame."""
+        return True
+
+    @abstractmethod
+    def localiser(self, origin: MapOrigin) -> Localiser:
+        """Localises in the graph as it is, which lies in ``map`` as ``origin`` says; raises ``ValueError``."""
 
     def work(self, optimize: bool = True) -> bool:
         """Do what the newest frame made due; returns whether it optimised.

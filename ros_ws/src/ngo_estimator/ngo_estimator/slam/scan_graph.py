@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
+from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep, check_step
 from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import no_scan
+from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
 from ngo_estimator.graph.key_scan_chain import OPEN, KeyScanChain
@@ -24,10 +25,12 @@ from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.thinned_loops import without_nodes
 from ngo_estimator.loops.walls_seen_through import profile_rays
+from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
 from ngo_estimator.slam.scan_matcher import ScanMatcher
+from ngo_estimator.slam.step_log import TakenStep
 
 _KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key scan."""
@@ -88,33 +91,37 @@ class ScanGraph(PoseGraph):
             scan = replace(scan, angles=angles, ranges=ranges)
         return self._nodes.key_step(key, scan, self._scans[max(0, key - 1)].stamp_ns)
 
+    def checked(self, step: RelativeStep) -> RelativeStep:
+        """See ``PoseGraph.checked``; covariances are bounded."""
+        check_step(step, 0, None)
+        covariance = bounded(step.covariance)
+        return step if np.array_equal(covariance, step.covariance) else replace(step, covariance=covariance)
+
     def begin_at(self, step: RelativeStep) -> None:
-        """Take the first frame, before the first step. Where its scan is missing, it adds no points to submaps."""
+        """Take the first frame. Where its scan is missing, it adds no points to submaps."""
         self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
         self._nodes.begin_at(step.from_stamp_ns)
 
-    def append(
-        self,
-        relative: np.ndarray,
-        covariance: np.ndarray,
-        key: KeyScanStep | None,
-        joins: bool = False,
-        segment: bool = False,
-    ) -> None:
-        """Take a step ``(3,)`` with its covariance ``(3, 3)``; ``work`` does what it makes due.
+    def append(self, step: RelativeStep, taken: TakenStep) -> None:
+        """Take a step, with its key scan where there is one.
 
-        With ``joins`` the step, which ends at a key scan, is where another odometry goes on, in another place. With
-        ``segment`` nobody measured it: it tells where the robot is taken to be until a loop does.
+        Where another odometry goes on in another place, it ends at a key scan. Where it begins a segment, nobody
+        measured it: it tells where the robot is taken to be until a loop does.
         """
-        if segment:
+        covariance = bounded(taken.covariance)
+        if step.segment:
             covariance = OPEN
             self._nodes.open_segment()
-        self._nodes.append(relative, covariance, joins or segment)
-        if key is not None:
-            self._nodes.add_key(key, joins)
+        self._nodes.append(taken.relative, covariance, taken.joins or step.segment)
+        if step.key is not None:
+            self._nodes.add_key(step.key, taken.joins)
             self._own_map.follow(self._nodes)
-            self._scans.append(key.scan)
+            self._scans.append(step.key.scan)
             self._is_key = True
+
+    def may_join(self, step: RelativeStep) -> bool:
+        """Whether another odometry may go on from this step's frame, which needs a key scan."""
+        return step.key is not None
 
     @property
     def _has_new_node(self) -> bool:
@@ -230,6 +237,10 @@ class ScanGraph(PoseGraph):
         scans, chain = self._scans[:], self._nodes
         poses = origin.poses(chain.poses.copy())
         return ScanMatcher(scans, poses, self._finder.views, self.config.loops, borders=chain.borders)
+
+    def localiser(self, origin: MapOrigin) -> Localiser:
+        """Localises in the key scans as they are; raises ``ValueError`` where none has a point."""
+        return Localiser(self.matcher(origin))
 
     @property
     def used_loops(self) -> ScanLoops:

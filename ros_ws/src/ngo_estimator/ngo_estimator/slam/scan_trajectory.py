@@ -7,16 +7,12 @@ from typing import Any
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
-from ngo_estimator.data.relative_step import RelativeStep, check_step
-from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.graph.key_scan_chain import OPEN
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
-from ngo_estimator.slam.localisation import Localiser
-from ngo_estimator.slam.map_localisation import MapLocalisation
-from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_graph import ScanGraph
-from ngo_estimator.slam.step_log import StepLog, TakenStep
+from ngo_estimator.slam.step_log import StepLog
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of
 
@@ -57,7 +53,7 @@ class ScanTrajectory(CorrectedTrajectory):
         Raises:
             RejectedStep: as of ``update``; the stamp is not later than the newest one, or the step has no key scan.
         """
-        return self._join_at(replace(self._checked(step), segment=True), np.zeros(3), OPEN)
+        return self._join_at(replace(self._graph.checked(step), segment=True), np.zeros(3), OPEN)
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
@@ -78,26 +74,3 @@ class ScanTrajectory(CorrectedTrajectory):
 
     def _new_graph(self) -> ScanGraph:
         return ScanGraph(self._config)
-
-    def _checked(self, step: RelativeStep) -> RelativeStep:
-        check_step(step, 0, None)
-        covariance = bounded(step.covariance)
-        return step if np.array_equal(covariance, step.covariance) else replace(step, covariance=covariance)
-
-    def _begin_at(self, step: RelativeStep) -> None:
-        self._graph.begin_at(step)
-
-    def _append(self, step: RelativeStep, taken: TakenStep) -> None:
-        self._graph.append(taken.relative, bounded(taken.covariance), step.key, taken.joins, step.segment)
-
-    def may_join(self, step: RelativeStep) -> bool:
-        """Whether the trajectory can go on with another odometry from this step's frame, which needs a key scan."""
-        return super().may_join(step) and step.key is not None
-
-    def localisation(self, origin: MapOrigin) -> MapLocalisation:
-        """Localisation in the key scans as they are, which lie in ``map`` as ``origin`` says.
-
-        Raises:
-            ValueError: no key scan has a point.
-        """
-        return MapLocalisation(Localiser(self._graph.matcher(origin)), self._checked)
