@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.data.relative_step import KeyScanStep
-from ngo_estimator.geometry.key_scan import no_scan
-from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
@@ -13,13 +11,12 @@ from ngo_estimator.loops.scan_settings import ScanGraphConfig
 COVARIANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
 
 
-def straight(keys: int) -> KeyScanChain:
+def straight(keys: int) -> PoseGraph:
     """Key scans on a line, one each metre."""
-    chain, step = KeyScanChain(1e-8 * np.eye(3)), np.array((1.0, 0.0, 0.0))
-    chain.begin_at(0)
-    for k in range(1, keys):
+    chain, step = PoseGraph(1e-8 * np.eye(3)), np.array((1.0, 0.0, 0.0))
+    for _ in range(1, keys):
         chain.append(step, COVARIANCE, joins=False)
-        chain.add_key(KeyScanStep(no_scan(k), k - 1, step, COVARIANCE), joins=False)
+        chain.add_node(COVARIANCE)
     return chain
 
 

@@ -53,6 +53,16 @@ def test_optimising_a_chain_without_loops_keeps_its_covariance() -> None:
     np.testing.assert_allclose(graph.newest()[1], before, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("from_key_ns", "registered"), [(0, True), (1, False)])
+def test_a_step_in_the_same_key_scans_is_as_sure_as_its_registration(from_key_ns: int, registered: bool) -> None:
+    graph, nothing = ScanGraph(ScanGraphConfig(step_m=1e-6, step_deg=1e-6)), np.zeros(0, np.float32)
+    for k, key in enumerate((None, KeyScanStep(no_scan(2), from_key_ns, STEP, COVARIANCE))):
+        take(graph, RelativeStep(k + 1, k, STEP, COVARIANCE, 0, STEP, nothing, nothing, key=key))
+    covariance = np.linalg.inv(graph.measurements()[0].information[0])
+    assert np.allclose(covariance, COVARIANCE, rtol=1e-3) == registered
+    assert covariance[2, 2] == pytest.approx(COVARIANCE[2, 2] * (1.0 if registered else 2.0), rel=1e-6)
+
+
 def test_a_key_scan_has_no_factors_by_default() -> None:
     key = KeyScanStep(no_scan(1), 0, STEP, COVARIANCE)
     np.testing.assert_array_equal(key.factors, 1.0)

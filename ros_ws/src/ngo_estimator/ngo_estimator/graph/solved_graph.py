@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ngo_estimator.data.row_buffers import SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, part, taken, under
-from ngo_estimator.graph.node_chain import NodeChain
 from ngo_estimator.graph.normal_equations import FactorisedInformation
+from ngo_estimator.graph.pose_graph import PoseGraph
 
 _MOST_DRIFT = 4.0
 """How much the variance between a key frame and the newest pose is taken to be more than the graph says."""
@@ -28,26 +27,23 @@ class SolvedGraph:
         """Before the first optimisation: the origin alone."""
         return cls(np.zeros(1, np.int64), None)
 
-    def most_drift(
-        self, starts: np.ndarray, window: int, chain: NodeChain, step_std: SlidingRows, scale: float
-    ) -> np.ndarray:
+    def most_drift(self, starts: np.ndarray, window: int, graph: PoseGraph, scale: float) -> np.ndarray:
         """How far loops from key frames to the newest node may be off at most, variances ``(n, 3)``; else infinite.
 
         The odometry alone would let a pose of long ago lie anywhere; the loops that were closed since say more.
 
         Args:
             starts: nodes where the loops begin ``(n,)``; ``window``: node where the window begins.
-            step_std: deviations of each block.
             scale: factor of the graph's variances.
         """
         limits = np.full((len(starts), 3), np.inf)
-        frames, nodes, end = chain.frames.nodes, chain.poses, len(self.frames) - 1
+        frames, nodes, end = graph.frames.nodes, graph.poses, len(self.frames) - 1
         last = int(np.searchsorted(frames, self.frames[-1]))
         if self.information is None or last < window:
             return limits  # nothing was optimised, or all of what was lies behind the window by now
-        since = step_std.slice(len(step_std) - (len(frames) - 1 - last)).astype(np.float64)
+        since = np.diagonal(graph.step_covariance[last:], axis1=1, axis2=2)
         travelled = nodes[last + 1 :, :2] - nodes[-1, :2]
-        own = (since**2).sum(0) + np.array([1.0, 1.0, 0.0]) * (since[:, 2] ** 2 @ (travelled**2).sum(1))
+        own = since.sum(0) + np.array([1.0, 1.0, 0.0]) * (since[:, 2] @ (travelled**2).sum(1))
         for k in np.flatnonzero(starts < window):
             start = int(starts[k])
             key = int(np.searchsorted(self.frames, frames[start]))

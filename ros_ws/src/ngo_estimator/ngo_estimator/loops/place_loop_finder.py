@@ -17,7 +17,7 @@ from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
-from ngo_estimator.graph.node_chain import NodeChain
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.loops.loop_closure import Loops, LoopSearch, may_show_one_place
 from ngo_estimator.loops.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.loops.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
@@ -65,7 +65,7 @@ class PlaceLoopFinder:
     """
 
     def __init__(
-        self, pair_head: PairHead, search: LoopSearch, block: int, window: int, nodes: NodeChain, keys: KeyFrames
+        self, pair_head: PairHead, search: LoopSearch, block: int, window: int, nodes: PoseGraph, keys: KeyFrames
     ) -> None:
         self._pair_head, self._search, self._block = pair_head, search, block
         self._nodes, self._keys = nodes, keys
@@ -277,13 +277,13 @@ class PlaceLoopFinder:
     def _ranges(self, codes: Tensor) -> Tensor:
         return codes[..., self._pair_head.config.code_size :].contiguous()
 
-    def key_frame(self, relative: np.ndarray, variance: np.ndarray) -> KeyFrame:
+    def key_frame(self) -> KeyFrame:
         """The key frame that the window's first node becomes."""
         first = int(self._begins[len(self._keys)])
         at = np.maximum(np.arange(first - MARGIN, first + self._block + MARGIN), 0)
         embeddings = self._embeddings.slice(first, first + self._block).copy()
         poses = _seen_from(self._odometry[first], self._odometry[at + 1])
-        return KeyFrame(relative, variance, embeddings, self._codes.at(at), poses)
+        return KeyFrame(embeddings, self._codes.at(at), poses)
 
     def places(self, poses: np.ndarray) -> PlaceMap:
         """The frames whose codes are kept: those of the window, and those of the key frames.
@@ -301,9 +301,10 @@ class PlaceLoopFinder:
         """Forget loops that nobody believes, when the window has moved on and they lie before it."""
         self.loops = self.loops.without_doubtful(len(self._keys), _MOST_TO_KEY_FRAMES)
 
-    def thin(self, keep: np.ndarray, poses: np.ndarray, variance: np.ndarray) -> None:
-        """Hang the loops of key frames that go upon the ones before them; arguments as of ``PlaceLoops.thinned``."""
-        self.loops = self.loops.thinned(keep, poses, variance, self._begins)
+    def thin(self, keep: np.ndarray, keys: int) -> None:
+        """Hang loops upon the ``keys`` key frames before those that are not among ``keep`` ``(nodes,)``."""
+        variance = np.diagonal(self._nodes.step_covariance[:keys], axis1=1, axis2=2)
+        self.loops = self.loops.thinned(keep, self._nodes.poses[:keys], variance, self._begins)
 
     def for_optimizer(self) -> tuple[Loops, np.ndarray]:
         """The loops for the optimizer, and which of ``loops`` these are."""

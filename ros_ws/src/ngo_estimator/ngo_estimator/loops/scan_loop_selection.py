@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from ngo_estimator.data.row_buffers import GrowingRows
-from ngo_estimator.graph.key_scan_chain import KeyScanChain
 from ngo_estimator.graph.path_covariance import path_covariances
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.sparsification import WALLS_M, largest_variances, needed_loops
 from ngo_estimator.loops.scan_loops import ScanLoops
@@ -45,7 +45,7 @@ class ScanLoopSelection:
         self._used.set(used)
         self.doubted = doubted
 
-    def believed(self, fresh: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> np.ndarray:
+    def believed(self, fresh: np.ndarray, found: ScanLoops, chain: PoseGraph) -> np.ndarray:
         """Those of the newly accepted loops that the graph may use, and of others that have waited.
 
         A search distinguishes places within its window alone. A robot that may be farther away may be in another place
@@ -70,7 +70,7 @@ class ScanLoopSelection:
         self.doubted = rows[~believed & may_grow]
         return rows[believed]
 
-    def use(self, rows: np.ndarray, found: ScanLoops, chain: KeyScanChain) -> bool:
+    def use(self, rows: np.ndarray, found: ScanLoops, chain: PoseGraph) -> bool:
         """Take those of the believed loops into the graph that it needs; returns whether one surprises."""
         loops, known, config = found[rows], found[self.rows], self._config
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)

@@ -11,11 +11,11 @@ from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import Arrays, StateError, attributes_of, require, with_attributes
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.graph.relative_poses import BELIEVED
+from ngo_estimator.slam.back_end import BackEnd
 from ngo_estimator.slam.bridge import bridged
 from ngo_estimator.slam.loop_report import LoopReport, loop_report
 from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
-from ngo_estimator.slam.pose_graph import PoseGraph
 from ngo_estimator.slam.step_log import StepLog, TakenStep
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of_frames
@@ -35,7 +35,7 @@ class CorrectedTrajectory(ABC):
     """
 
     SAVED = ("_log", "_graph", "_online", "_optimized", "_odom")
-    _graph: PoseGraph
+    _graph: BackEnd
 
     def __init__(self, answers_first: bool) -> None:
         self._answers_first = answers_first
@@ -43,7 +43,7 @@ class CorrectedTrajectory(ABC):
         self.reset()
 
     @abstractmethod
-    def _new_graph(self) -> PoseGraph:
+    def _new_graph(self) -> BackEnd:
         """A graph without any frame."""
 
     @property

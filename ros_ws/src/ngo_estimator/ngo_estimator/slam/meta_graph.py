@@ -12,9 +12,9 @@ import torch
 from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_motion import all_between, between, chained
+from ngo_estimator.geometry.planar_motion import all_between, chained
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
-from ngo_estimator.graph.node_chain import NodeChain
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.graph.solved_graph import SolvedGraph
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.loops.place_loop_finder import PlaceLoopFinder
@@ -22,13 +22,13 @@ from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.meta_poses import MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
+from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, WhichLoops, require_sound
 from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_variances
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
 from ngo_estimator.slam.place_matcher import PlaceMatcher
-from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
 from ngo_estimator.slam.step_log import StepLog, TakenStep
 
 _VARIANCES = (1e-12, 1e4)
@@ -44,7 +44,7 @@ _FRESH = 2
 """Blocks since the last optimisation up to which poses say what frames share."""
 
 
-class MetaGraph(PoseGraph):
+class MetaGraph(BackEnd):
     """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
 
     The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
@@ -61,7 +61,7 @@ class MetaGraph(PoseGraph):
         anneal_every: int = 1,
         log: Callable[[], StepLog] = StepLog,
     ) -> None:
-        super().__init__(NodeChain())
+        super().__init__(PoseGraph())
         self._keys = KeyFrames(key_frames)
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._window = optimizer.block, window
@@ -86,7 +86,7 @@ class MetaGraph(PoseGraph):
         return min(1.0, self._odometry.steps / (self._window * self._block))
 
     def checked(self, step: RelativeStep) -> RelativeStep:
-        """See ``PoseGraph.checked``."""
+        """See ``BackEnd.checked``."""
         codes = None if self._pair_head is None else self._pair_head.config.code_length
         check_step(step, self._optimizer.config.aggregation.motion_feature_size, codes)
         return step
@@ -130,7 +130,7 @@ class MetaGraph(PoseGraph):
 
     @torch.inference_mode()
     def work(self, optimize: bool = True) -> bool:
-        """Take in the block that is complete, if there is one, and optimise; see ``PoseGraph.work``."""
+        """Take in the block that is complete, if there is one, and optimise; see ``BackEnd.work``."""
         return super().work(optimize)
 
     def _take_in(self) -> bool:
@@ -138,9 +138,15 @@ class MetaGraph(PoseGraph):
         self._odometry.complete()
         self._nodes.add_node()
         self._guarded("taking in a meta-pose", self._odometry.aggregate)
+        self._restate()
         self._guarded("the search for loops", self._look_for_loops)
         self._make_room()
         return True
+
+    def _restate(self) -> None:
+        """Have the odometry of the window as it is now."""
+        odometry, first = self._odometry, self._first
+        self._nodes.restate(len(self._keys), odometry.relative.slice(first), _variance(odometry.std.slice(first)))
 
     def _register(self) -> None:
         """Measure the newest block again."""
@@ -154,6 +160,7 @@ class MetaGraph(PoseGraph):
     def _recall(self) -> None:
         """Take the newest frames back, which were taken for familiar: their loops, and what was registered by them."""
         first = self._odometry.recall()
+        self._restate()
         if self._loops is not None:
             self._loops.recall(first)
 
@@ -163,9 +170,8 @@ class MetaGraph(PoseGraph):
             return
         new = self._loops.find(self._nodes.frames.nodes[-1] - self._solved.frames[-1] <= _FRESH * self._block)
         if len(self._keys) and len(new):
-            starts, std = self._loops.loops.start[new], self._odometry.std
-            limits = self._solved.most_drift(starts, len(self._keys), self._nodes, std, self._scale)
-            self._loops.loops.most_drift[new] = limits
+            loops = self._loops.loops
+            loops.most_drift[new] = self._solved.most_drift(loops.start[new], len(self._keys), self._nodes, self._scale)
 
     def _make_room(self) -> None:
         """Let the window slide, and some key frames go."""
@@ -174,28 +180,27 @@ class MetaGraph(PoseGraph):
             if self._loops is not None:
                 self._loops.leave()
         if self._keys.crowded:
-            poses, variance = self._nodes.poses[: len(self._keys)].copy(), self._keys.variance
-            keep = np.ones(len(self._nodes), bool)
-            keep[: len(poses)] = self._keys.thin(poses)
+            keep, keys = np.ones(len(self._nodes), bool), len(self._keys)
+            keep[:keys] = self._keys.thin(self._nodes.poses[:keys], self._nodes.relative[:keys])
             if self._loops is not None:
-                self._loops.thin(keep, poses, variance)
+                self._loops.thin(keep, keys)
             self._nodes.let_go(keep)
 
     def _key_frame(self) -> KeyFrame:
-        """The key frame that the window's first node becomes."""
+        """The key frame that the window's first node becomes; the step from it is as the last optimisation had it."""
         first = len(self._keys)
-        relative = between(*self._nodes.poses[[first, first + 1]])
-        variance = self._odometry.optimized_std.slice(self._first, self._first + 1)[0] ** 2
+        believed = self._odometry.optimized_std.slice(self._first, self._first + 1)
+        self._nodes.restate(first, all_between(*self._nodes.poses[first : first + 2, None]), believed**2)
         if self._loops is not None:
-            return self._loops.key_frame(relative, variance)
+            return self._loops.key_frame()
         nothing = np.zeros((self._block, 0), np.float32)
-        return KeyFrame(relative, variance, nothing, nothing, np.zeros((self._block, 3)))
+        return KeyFrame(nothing, nothing, np.zeros((self._block, 3)))
 
     def _optimise(self) -> None:
         """Optimise all nodes of the window and the key frames before it."""
-        odometry, keys, first, blocks = self._odometry, self._keys, self._first, self._odometry.blocks
-        relative = np.concatenate((keys.relative, odometry.relative.slice(first))).astype(np.float32)
-        std = np.concatenate((np.sqrt(keys.variance), odometry.std.slice(first))).astype(np.float32)
+        odometry, first, blocks = self._odometry, self._first, self._odometry.blocks
+        relative = self._nodes.relative.astype(np.float32)
+        std = np.sqrt(np.diagonal(self._nodes.step_covariance, axis1=1, axis2=2)).astype(np.float32)
         known = None if self._network_is_due else self._corrections
         runs_network = self._optimizer.config.network and known is None
         features = None
@@ -263,7 +268,7 @@ class MetaGraph(PoseGraph):
         solution = chained(result.meta_relative[-1][0].double().numpy())
         poses = self._shrink(solution)
         moved = poses[-1] - solution[-1]
-        self._nodes.move(np.arange(len(poses)), poses, end + np.outer(moved, moved))
+        self._nodes.move(poses, end + np.outer(moved, moved))
         self._odometry.optimized_std.replace(self._first, result.step_std[0, len(self._keys) :].double().numpy())
         self._solved = SolvedGraph(self._nodes.frames.nodes.copy(), result.equations)
 
@@ -292,7 +297,7 @@ class MetaGraph(PoseGraph):
 
     @torch.inference_mode()
     def remove_loops(self, which: WhichLoops) -> int:
-        """See ``PoseGraph.remove_loops``."""
+        """See ``BackEnd.remove_loops``."""
         return super().remove_loops(which)
 
     def localiser(self, origin: MapOrigin) -> Localiser:
@@ -334,3 +339,8 @@ def is_due(since: int, seen: int, every: int) -> bool:
     A short trajectory changes a lot with each block.
     """
     return since >= min(every, 1 + seen // 8)
+
+
+def _variance(std: np.ndarray) -> np.ndarray:
+    variance: np.ndarray = std.astype(np.float64) ** 2
+    return variance

@@ -17,7 +17,7 @@ from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance
-from ngo_estimator.graph.key_scan_chain import KeyScanChain
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.place_evidence import PlaceEvidence, evidence_of, last_stretch
@@ -74,13 +74,13 @@ class OwnMap:
         # Key scans of looks: the last one that agreed with the map where the pose is sure, and those against it since.
         self._agreed, self._astray = 0, np.zeros(0, np.int64)
 
-    def follow(self, chain: KeyScanChain) -> None:
+    def follow(self, chain: PoseGraph) -> None:
         """Take the step to the newest key scan; nobody knows it where that begins a segment."""
         if chain.segments[-1] == len(chain) - 1:
             self._forget_looks()
             self._trial = self._against = 0
         else:
-            self._window.move(chain.last_step, chain.step_covariance[-1])
+            self._window.move(chain.relative[-1], chain.step_covariance[-1])
 
     def fits(self, keys: int) -> bool:
         """Whether all key scans that it names are among the first so many."""
@@ -91,7 +91,7 @@ class OwnMap:
         self.looks = self.looks[:0]
 
     def look(
-        self, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain, windows: np.ndarray, parts: np.ndarray
+        self, scans: Sequence[KeyScan], views: KeyScanViews, chain: PoseGraph, windows: np.ndarray, parts: np.ndarray
     ) -> ScanLoops:
         """Loops of the last key scans, where it is beyond doubt that they are right; mostly none.
 
@@ -132,16 +132,14 @@ class OwnMap:
         return loops
 
     def _evidence(
-        self, pose: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain
+        self, pose: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews, chain: PoseGraph
     ) -> PlaceEvidence:
         """How the last stretch of the way agrees with the searched key scans, where the newest one is at a pose."""
         stretch = last_stretch(chain.poses, int(chain.segments[-1]))
         at = se2.compose(pose, se2.between(chain.poses[-1], chain.poses[stretch]))
         return evidence_of(scans, views, (stretch, at), (self._keys, self._poses), count_walls=True)
 
-    def contradicted(
-        self, scans: Sequence[KeyScan], views: KeyScanViews, chain: KeyScanChain, parts: np.ndarray
-    ) -> bool:
+    def contradicted(self, scans: Sequence[KeyScan], views: KeyScanViews, chain: PoseGraph, parts: np.ndarray) -> bool:
         """Whether the key scans since the newest segment was joined show that it lies elsewhere.
 
         Two places may be alike for as far as the robot went; what it sees next is alike in one place alone.
@@ -165,7 +163,7 @@ class OwnMap:
         self,
         scans: Sequence[KeyScan],
         views: KeyScanViews,
-        chain: KeyScanChain,
+        chain: PoseGraph,
         windows: np.ndarray,
         has_loops: bool,
     ) -> int | None:

@@ -12,7 +12,7 @@ from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
-from ngo_estimator.graph.key_scan_chain import OPEN, KeyScanChain
+from ngo_estimator.graph.pose_graph import OPEN, PoseGraph
 from ngo_estimator.graph.redundant_nodes import redundant_nodes
 from ngo_estimator.graph.relative_poses import BELIEVED, RelativePoses
 from ngo_estimator.graph.robust import Robust
@@ -25,10 +25,10 @@ from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.thinned_loops import without_nodes
 from ngo_estimator.loops.walls_seen_through import profile_rays
+from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, WhichLoops, require_sound
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
-from ngo_estimator.slam.pose_graph import ClosedLoops, PoseGraph, WhichLoops, require_sound
 from ngo_estimator.slam.scan_matcher import ScanMatcher
 from ngo_estimator.slam.step_log import TakenStep
 
@@ -42,14 +42,12 @@ _MOVED_M = 0.5
 """Where an optimisation moves a key scan that far, the map is another one to search in."""
 
 
-class ScanGraph(PoseGraph):
+class ScanGraph(BackEnd):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
-    _nodes: KeyScanChain
-
     def __init__(self, config: ScanGraphConfig) -> None:
-        floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
-        super().__init__(KeyScanChain(floor))
+        self._floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
+        super().__init__(PoseGraph(self._floor))
         self.config = config
         self._scans = KeyScanStore()
         self._finder = ScanLoopFinder(config.loops)
@@ -89,10 +87,16 @@ class ScanGraph(PoseGraph):
         if len(scan.points) and not len(scan.ranges):
             angles, ranges = profile_rays(self._finder.views.profiles[key].astype(np.float64))
             scan = replace(scan, angles=angles, ranges=ranges)
-        return self._nodes.key_step(key, scan, self._scans[max(0, key - 1)].stamp_ns)
+        from_stamp_ns = self._scans[max(0, key - 1)].stamp_ns
+        if key == 0:
+            return KeyScanStep(scan, from_stamp_ns, np.zeros(3), OPEN)  # nobody knows it
+        graph, step = self._nodes, key - 1
+        given, published = (of[step] - self._floor for of in (graph.step_covariance, graph.published_covariance))
+        factors = np.sqrt(np.diagonal(published) / np.diagonal(given))
+        return KeyScanStep(scan, from_stamp_ns, graph.relative[step].copy(), given, factors)
 
     def checked(self, step: RelativeStep) -> RelativeStep:
-        """See ``PoseGraph.checked``; covariances are bounded."""
+        """See ``BackEnd.checked``; covariances are bounded."""
         check_step(step, 0, None)
         covariance = bounded(step.covariance)
         return step if np.array_equal(covariance, step.covariance) else replace(step, covariance=covariance)
@@ -100,7 +104,6 @@ class ScanGraph(PoseGraph):
     def begin_at(self, step: RelativeStep) -> None:
         """Take the first frame. Where its scan is missing, it adds no points to submaps."""
         self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
-        self._nodes.begin_at(step.from_stamp_ns)
 
     def append(self, step: RelativeStep, taken: TakenStep) -> None:
         """Take a step, with its key scan where there is one.
@@ -114,10 +117,19 @@ class ScanGraph(PoseGraph):
             self._nodes.open_segment()
         self._nodes.append(taken.relative, covariance, taken.joins or step.segment)
         if step.key is not None:
-            self._nodes.add_key(step.key, taken.joins)
+            self._add_key(step.key, taken.joins)
             self._own_map.follow(self._nodes)
             self._scans.append(step.key.scan)
             self._is_key = True
+
+    def _add_key(self, key: KeyScanStep, joins: bool) -> None:
+        """Make the newest frame, which ends at a key scan, a node."""
+        if key.from_key_stamp_ns == self._scans[-1].stamp_ns and not joins:
+            # Registration in the same key scans: errors of the steps between do not add up.
+            covariance = bounded(key.covariance)
+            self._nodes.add_node(covariance, covariance * np.outer(key.factors, key.factors))
+        else:
+            self._nodes.add_node(bounded(self._nodes.since_covariance))
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether another odometry may go on from this step's frame, which needs a key scan."""
@@ -213,7 +225,7 @@ class ScanGraph(PoseGraph):
             kept = replace(thinned.loops, pairs=number[thinned.loops.pairs])
             others = replace(found[unused], pairs=number[found.pairs[unused]])
             doubted = len(kept) + np.flatnonzero(np.isin(unused, self._selection.doubted))
-            chain.bridge(~leaves, thinned.bridges)
+            chain.let_go(~leaves, thinned.bridges)
             self._scans.thin(~leaves)
             self._finder.thin(~leaves, kept.extended(others))
             self._selection.replace(np.arange(len(kept)), doubted)
@@ -284,7 +296,7 @@ class ScanGraph(PoseGraph):
         end = self._end_covariance(solution) if self.keys > 1 else self._nodes.end
         require_sound(solution.poses, end)
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
-        self._nodes.move(np.arange(self.keys), solution.poses, end)
+        self._nodes.move(solution.poses, end)
         self._close(loops, solution.loop_weights)
         self._parts = joined_parts(self._nodes.segments, self._joining_pairs)
         if self.largest_move_m > _MOVED_M:

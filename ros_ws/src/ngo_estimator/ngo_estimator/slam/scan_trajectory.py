@@ -8,7 +8,7 @@ import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.graph.key_scan_chain import OPEN
+from ngo_estimator.graph.pose_graph import OPEN
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.scan_graph import ScanGraph

@@ -11,7 +11,7 @@ import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.planar_motion import between
-from ngo_estimator.graph.key_scan_chain import OPEN
+from ngo_estimator.graph.pose_graph import OPEN
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 
 _NOTHING = np.zeros(0, np.float32)

@@ -1,7 +1,4 @@
-"""The pose graph behind a corrected trajectory: a chain of nodes, the loops that join them, and the work they make due.
-
-A meta-pose is a node by count, a key scan one by motion.
-"""
+"""The back end of every sensor: a pose graph, the loops that join its nodes, and the work that a new node makes due."""
 
 import time
 from abc import ABC, abstractmethod
@@ -11,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.graph.node_chain import NodeChain
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.loops.loop_record import LoopRecord, rows
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
@@ -33,17 +30,15 @@ class ClosedLoops(LoopRecord):
     weight: np.ndarray = rows(np.float64)
 
 
-class PoseGraph(ABC):
+class BackEnd(ABC):
     """Follows frames by odometry; a node makes work due: the search for its loops, and an optimisation.
 
     Args:
-        chain: owns all poses in ``map``, and the newest covariance.
+        graph: owns all poses in ``map``.
     """
 
-    _nodes: NodeChain
-
-    def __init__(self, chain: NodeChain) -> None:
-        self._nodes = chain
+    def __init__(self, graph: PoseGraph) -> None:
+        self._nodes = graph
         self.closed = ClosedLoops.none()
         self.fault = ""
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
