@@ -170,7 +170,7 @@ def lecture_hall(folder: Path) -> JudgedProblem:
     places = RelativePoses.of_deviations(pairs, np.zeros((len(pairs), 3)), deviations)
     truth = np.stack([np.interp(stamps[nodes], tracked[:, 0], tracked[:, k]) for k in (1, 2)], axis=1)
     right = np.hypot(*(truth[pairs[:, 0]] - truth[pairs[:, 1]]).T) < 2.0 * _PLACE_STD
-    return JudgedProblem(GraphProblem(poses[nodes], steps, places, np.ones(len(pairs)), loops[:, 2:3]), truth, right)
+    return JudgedProblem(GraphProblem(poses[nodes], steps, places, np.ones(len(pairs))), truth, right)
 
 
 def _propagated(poses: np.ndarray, nodes: np.ndarray, variances: np.ndarray) -> np.ndarray:
