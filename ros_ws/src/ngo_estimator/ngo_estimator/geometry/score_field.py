@@ -116,6 +116,13 @@ class ScoreField:
         unknown = round(255 * self.config.unknown)
         return float(_score(self.levels[0], points, pose, self.corner, self.config.cell_m, unknown))
 
+    def scores(self, points: Array, poses: Array, unknown: float) -> Array:
+        """Mean scores ``(m,)`` of at least one point ``(n, 2)`` at each of the poses ``(m, 3)``, where what was never
+        seen scores ``unknown``."""
+        code = round(255 * self.config.unknown)
+        result: Array = _scores(self.levels[0], points, poses, self.corner, self.config.cell_m, code, unknown)
+        return result
+
 
 def _kernel(config: ScoreFieldConfig) -> Field:
     reach = math.ceil(2.5 * config.deviation_m / config.cell_m)
@@ -236,6 +243,23 @@ def _score(field: Field, points: Array, pose: Array, corner: Array, cell: float,
         row, column = math.floor(y / cell), math.floor(x / cell)
         total += field[row, column] if 0 <= row < rows and 0 <= column < columns else unknown
     return total / (255.0 * len(points))
+
+
+@njit(cache=True)
+def _scores(
+    field: Field, points: Array, poses: Array, corner: Array, cell: float, code: int, unknown: float
+) -> Array:  # fmt: skip
+    rows, columns = field.shape
+    result = np.zeros(len(poses))
+    for i in range(len(poses)):
+        cos, sin = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        for k in range(len(points)):
+            x = cos * points[k, 0] - sin * points[k, 1] + poses[i, 0] - corner[0]
+            y = sin * points[k, 0] + cos * points[k, 1] + poses[i, 1] - corner[1]
+            row, column = math.floor(y / cell), math.floor(x / cell)
+            value = field[row, column] if 0 <= row < rows and 0 <= column < columns else code
+            result[i] += unknown if value == code else value / 255.0
+    return result / len(points)
 
 
 @njit(cache=True)

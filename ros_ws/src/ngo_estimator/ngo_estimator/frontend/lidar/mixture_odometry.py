@@ -30,6 +30,7 @@ from ngo_estimator.geometry.planar_motion import (
     wrap,
 )
 from ngo_estimator.geometry.scan_matching import IcpConfig, Registration, icp
+from ngo_estimator.geometry.score_profile import held_along
 
 _FAR = 9.0
 """Squared deviations beyond which a prior counts less."""
@@ -221,7 +222,12 @@ class MixtureOdometry:
         config = self.config
         misfit = 1.0 - self._usual if self._usual else 1.0
         sure = min(max(misfit / config.usual_misfit, _LEAST_WEIGHT), 1.0)
-        return config.prior_weight * sure * math.sqrt(config.search_points / min(len(points), config.search_points))
+        return config.prior_weight * sure * self._fewer(points)
+
+    def _fewer(self, points: Array) -> float:
+        """How much less few points say than as many as are searched with."""
+        most = self.config.search_points
+        return math.sqrt(most / min(len(points), most))
 
     def _found(self, scan: KeyScan) -> _Mode | None:
         """The best mode, with the doubt that others leave; None where the scan fits nowhere.
@@ -315,6 +321,8 @@ class MixtureOdometry:
         squared = squared_deviations(mode.pose, mean, inverted(covariance + walls))
         information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
         found = self._icp(scan, mode.pose, mean, information, self._last_steps)
+        noise = self.config.noise, self.config.prior_weight * self._fewer(few.points)
+        found = held_along(found, self._submap.field, few.points, self._usual, *noise)
         return _Mode(found, likeliest, self._submap.field.score(few.points, found.pose), mode.total)
 
     def _icp(

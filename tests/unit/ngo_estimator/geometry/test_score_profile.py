@@ -1,0 +1,79 @@
+"""What a score tells along a corridor, whose lines leave that direction open."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ngo_estimator.geometry.planar_motion import inverted
+from ngo_estimator.geometry.scan_matching import Registration
+from ngo_estimator.geometry.score_field import RayCounts, ScoreField, ScoreFieldConfig
+from ngo_estimator.geometry.score_profile import held_along
+
+CONFIG = ScoreFieldConfig(reach_m=6.0)
+SETTINGS = {"unknown": 0.97, "noise": 0.5, "weight": 0.025}
+
+
+def corridor(doors: bool, half_m: float = 4.0) -> np.ndarray:
+    """Two walls along x, one with two recesses of 0.4 m and their sides, where it has ``doors``."""
+    along = np.arange(-half_m, half_m, 0.05)
+    recessed = (np.abs(along - 0.8) < 0.4) | (np.abs(along + 0.9) < 0.3)
+    upper = np.stack((along, 1.0 + np.where(doors & recessed, 0.4, 0.0)), -1)
+    sides = [np.stack((np.full(9, x), np.linspace(1.0, 1.4, 9)), -1) for x in (-1.2, -0.6, 0.4, 1.2) if doors]
+    return np.concatenate((upper, np.stack((along, np.full(len(along), -1.0)), -1), *sides))
+
+
+def field_of(points: np.ndarray) -> ScoreField:
+    counts = RayCounts(CONFIG, np.zeros(2))
+    counts.add(np.zeros(2), points)
+    return counts.field(points)
+
+
+def registered(x: float, deviation: float, yaw: float = 0.0) -> Registration:
+    """What lines and a prior leave: 1 cm across the corridor, ``deviation`` along it."""
+    information = np.diag((0.0, 1e4, 1e5))
+    prior = np.diag((deviation**-2, 1.0, 1.0))
+    return Registration(np.array((x, 0.0, yaw)), inverted(information + prior), information, 1.0, 160)
+
+
+@pytest.mark.parametrize("off", [-0.3, 0.2])
+def test_doors_hold_the_way_along_a_corridor(off: float) -> None:
+    found = registered(off, 0.3)
+    held = held_along(found, field_of(corridor(True)), corridor(True, 2.0), **SETTINGS)
+    deviation = math.sqrt(held.covariance[0, 0])
+    assert abs(held.pose[0]) < 0.7 * abs(off) and abs(held.pose[0]) < deviation < 0.25
+    # The information is that of the score alone, along the open direction alone.
+    np.testing.assert_allclose(held.covariance, inverted(held.information + np.diag((0.3**-2, 1.0, 1.0))), atol=1e-9)
+    np.testing.assert_allclose(held.information[1:, 1:], found.information[1:, 1:], atol=1e-6)
+
+
+@pytest.mark.parametrize("off", [-0.3, 0.0, 0.3])
+def test_smooth_walls_tell_nothing_of_the_way_along_them(off: float) -> None:
+    """Also where a scan sees farther than any before: what was never seen speaks neither for nor against."""
+    found = registered(off, 0.3)
+    held = held_along(found, field_of(corridor(False, 2.0)), corridor(False, 2.0), **SETTINGS)
+    assert abs(held.pose[0] - off) < 0.02
+    assert held.covariance[0, 0] > 0.95 * found.covariance[0, 0]
+
+
+def test_what_is_known_already_stays_as_it_is() -> None:
+    found = registered(0.04, 0.05)
+    assert held_along(found, field_of(corridor(True)), corridor(True), **SETTINGS) is found
+
+
+def test_a_map_turned_round_tells_the_same() -> None:
+    walls, seen = corridor(True), corridor(True, 2.0)
+    straight = held_along(registered(0.2, 0.3), field_of(walls), seen, **SETTINGS)
+    turned = np.stack((-walls[:, 1], walls[:, 0]), -1)
+    rotation = np.array(((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    found = registered(0.2, 0.3)
+    found = Registration(
+        np.array((0.0, 0.2, 0.5 * math.pi)),
+        rotation @ found.covariance @ rotation.T,
+        rotation @ found.information @ rotation.T,
+        1.0,
+        160,
+    )
+    held = held_along(found, field_of(turned), seen, **SETTINGS)
+    np.testing.assert_allclose(held.pose, (0.0, straight.pose[0], 0.5 * math.pi), atol=0.02)
+    assert held.covariance[1, 1] == pytest.approx(straight.covariance[0, 0], rel=0.3)
