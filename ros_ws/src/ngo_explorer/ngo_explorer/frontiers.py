@@ -206,15 +206,15 @@ def _viewpoints(
 @njit(cache=True)
 def _gain(state: Cells, row: int, column: int, resolution: float, reach: float) -> float:
     rows, columns = state.shape
-    rays = 2 * _DIRECTIONS
     area = 0.0
-    for ray in range(rays):
-        dy, dx = math.sin(ray * math.tau / rays), math.cos(ray * math.tau / rays)
+    for ray in range(_DIRECTIONS):
+        angle = (ray + 0.5) * math.tau / _DIRECTIONS
+        dy, dx = math.sin(angle), math.cos(angle)
         for step in range(1, int(reach / resolution)):
             r, c = math.floor(row + 0.5 + step * dy), math.floor(column + 0.5 + step * dx)
             inside = 0 <= r < rows and 0 <= c < columns
             if inside and state[r, c] == 1:
                 break
             if not inside or state[r, c] == -1:
-                area += step * resolution * resolution * math.tau / rays
+                area += step * resolution * resolution * math.tau / _DIRECTIONS
     return area

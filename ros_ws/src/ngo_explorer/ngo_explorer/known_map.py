@@ -55,12 +55,11 @@ class KnownMap:
         self._begin(resolution_m, origin_xy)
         row, column = self._offset(origin_xy)
         self._cover(row, column, *values.shape)
-        whole = _states(values)
         inside = slice(row - self._low[0], row - self._low[0] + values.shape[0])
         across = slice(column - self._low[1], column - self._low[1] + values.shape[1])
-        placed = np.full_like(self.state, UNKNOWN)
-        placed[inside, across] = whole
-        return self._take(placed, slice(0, placed.shape[0]), slice(0, placed.shape[1]))
+        placed = np.full(self.state.shape, UNKNOWN, np.int8)
+        placed[inside, across] = values
+        return self._take(placed)
 
     def points(self, cells: NDArray[np.int64]) -> Floats:
         """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
@@ -130,9 +129,9 @@ class KnownMap:
         self._low = (low[0], low[1])
         self._corner = self._anchor + np.array((low[1], low[0])) * self.resolution_m
 
-    def _take(self, states: Cells, rows: slice, columns: slice) -> bool:
+    def _take(self, values: NDArray[np.int8]) -> bool:
         tile, changed = self._tile, np.zeros(self._known.shape, np.bool_)
-        _write(self.state, states, rows.start, columns.start, tile, changed)
+        _write(self.state, values, tile, changed)
         if not changed.any():
             return False
         self.changes += 1
@@ -153,10 +152,6 @@ class KnownMap:
         self._frontiers[tile_row, tile_column] = _edge(self.state, self.frontier, row, column, tile)
 
 
-def _states(values: NDArray[np.int8]) -> Cells:
-    return np.select([values < 0, values <= 25, values >= 65], [UNKNOWN, FREE, OCCUPIED], UNKNOWN).astype(np.int8)
-
-
 def _grown(before: NDArray, shape: tuple[int, int], shift: tuple[int, int], unit: int, fill: float) -> NDArray:
     """An array of ``shape`` in cells, one entry a square of ``unit`` cells, that holds ``before`` at ``shift``."""
     grown = np.full((shape[0] // unit, shape[1] // unit), fill, before.dtype)
@@ -173,12 +168,15 @@ def _beside(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @njit(cache=True)
-def _write(state: Cells, states: Cells, row0: int, column0: int, tile: int, changed: NDArray[np.bool_]) -> None:
-    for row in range(states.shape[0]):
-        for column in range(states.shape[1]):
-            if state[row0 + row, column0 + column] != states[row, column]:
-                state[row0 + row, column0 + column] = states[row, column]
-                changed[(row0 + row) // tile, (column0 + column) // tile] = True
+def _write(state: Cells, values: NDArray[np.int8], tile: int, changed: NDArray[np.bool_]) -> None:
+    """Enter values in percent, and mark the tiles that change."""
+    for row in range(state.shape[0]):
+        for column in range(state.shape[1]):
+            value = values[row, column]
+            now = UNKNOWN if value < 0 or 25 < value < 65 else FREE if value <= 25 else OCCUPIED
+            if state[row, column] != now:
+                state[row, column] = now
+                changed[row // tile, column // tile] = True
 
 
 @njit(cache=True)

@@ -90,17 +90,18 @@ def _along_a_tour(seen: Situation, config: ExplorerConfig) -> int:
 
 
 def _between(seen: Situation, points: Floats) -> Floats:
-    """``(n, n)`` costs of the paths between points, in m."""
+    """``(n, n)`` costs of the paths between points, the nearest to the robot first, in m."""
     known, count = seen.known, len(points)
     unit = known.block * known.resolution_m / 10.0
     blocks = np.array([known.cell(point) for point in points]) // known.block
     between = np.zeros((count, count))
-    for index in range(count - 1):
-        field = cost_field(known, points[index], seen.need_m, points[index + 1 :])
+    # A search ends at the farthest of the points that are left: those near the robot come last, near each other.
+    for index in range(count - 1, 0, -1):
+        field = cost_field(known, points[index], seen.need_m, points[:index])
         costs = field[blocks[:, 0], blocks[:, 1]].astype(np.float64) * unit
         straight = np.hypot(*(points - points[index]).T)
         row = np.where(costs < 0.0, 1e3, np.maximum(costs, straight))
-        between[index, index + 1 :] = between[index + 1 :, index] = row[index + 1 :]
+        between[index, :index] = between[:index, index] = row[:index]
     return between
 
 
