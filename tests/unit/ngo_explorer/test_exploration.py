@@ -63,6 +63,18 @@ def test_a_room_behind_a_gap_too_narrow_is_named_with_the_reason() -> None:
     assert all(left.point_xy[0] > 1.6 and left.reason for left in exploration.unreachable)
 
 
+def test_the_far_end_of_a_room_that_it_cannot_enter_is_looked_at_through_its_door() -> None:
+    wall, door, free = "#" * 17, "#" * 8 + "." + "#" * 8, "#" + "." * 15 + "#"
+    truth = drawn(wall, free, free, door, *[free] * 11, wall, cells=5)
+    exploration, known = Exploration(ExplorerConfig(radius_m=0.25)), np.full_like(truth, -1)
+    for x in np.arange(3.5, 4.0, 0.1):
+        seen_from(truth, known, x, 7.0)
+    exploration.known.update(known, RESOLUTION_M, np.zeros(2))
+    assert exploration.decide(np.array((1.0, 7.0, 0.0)), 0.0) is not None
+    deep = [found for found in exploration.candidates if found.frontier.point_xy[1] < 3.0]
+    assert deep and all(found.viewpoint_xy[1] > 6.3 and found.gain_m2 > 1.0 for found in deep)
+
+
 def looking(config: ExplorerConfig) -> tuple[Exploration, np.ndarray, np.ndarray]:
     exploration, known, robot = Exploration(config), np.full_like(ROOMS, -1), np.array((*START, 0.0))
     seen_from(ROOMS, known, *START)

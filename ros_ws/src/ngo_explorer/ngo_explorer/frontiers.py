@@ -107,7 +107,8 @@ def viewpoint(
     if not len(found):
         return None
     points = known.points(found)
-    gains = np.array([gain_m2(known, point, range_m) for point in points])
+    gaps = np.hypot(*(points - frontier.point_xy).T)
+    gains = np.array([gain_m2(known, point, gap + range_m) for point, gap in zip(points, gaps, strict=True)])
     best = int(np.flatnonzero(gains >= 0.5 * gains.max())[0])
     return points[best], float(costs[best]), float(gains[best])
 
