@@ -62,7 +62,7 @@ class Watched:
         self.block = self.core.block
         self.optimisations = Times()
         self._given: tuple[MetaSteps, Loops] | None = None
-        iterate, graph = optimizer.iterate, self.core._graph
+        iterate, graph = optimizer.iterate, self.core._back_end
         optimise = graph._optimise
 
         def remembered(steps: MetaSteps, loops: Loops | None = None, *others: Any) -> Any:

@@ -200,7 +200,7 @@ def _scans(drive: LidarDrive, odometry: MixtureLidar, core: ScanTrajectory) -> I
 def stored_path_mb(core: CorrectedTrajectory) -> float:
     """What of the trajectory has to be kept for every frame."""
     owners = PoseGraph | OdometryBlocks | ScanLoopSelection
-    parts = (core, core._log, *(part for part in vars(core._graph).values() if isinstance(part, owners)))
+    parts = (core, core._log, *(part for part in vars(core._back_end).values() if isinstance(part, owners)))
     rows = [value for part in parts for value in vars(part).values() if isinstance(value, GrowingRows)]
     return sum(each.values.nbytes for each in rows) / 2**20
 

@@ -65,7 +65,7 @@ def log_starts(drive: LidarDrive, weights: Path, count: int) -> Iterator[LogStar
     away_m = KDTree(known.truth[:, :2]).query(whole[:, :2])[0]
     way_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(whole[:, :2], axis=0), axis=1)))
     ends = np.searchsorted(way_m, way_m[-1] - WAY_M)
-    matcher = mapped.graph.matcher(MapOrigin.of_first_pose(np.zeros(3)))
+    matcher = mapped.back_end.matcher(MapOrigin.of_first_pose(np.zeros(3)))
     for start in np.linspace(half, max(half, int(ends) - 1), count).astype(np.int64).tolist():
         shown = away_m[start : int(np.searchsorted(way_m, way_m[start] + _MAPPED_WAY_M))] <= 2.0 * ScanMatcher.place_m
         yield _start(Localiser(matcher), errors, steps, way_m, start, bool(shown.mean() >= _LEAST_MAPPED))

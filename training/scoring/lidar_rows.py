@@ -171,8 +171,8 @@ def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
         trajectory.odometry_xyyaw,
         run.online.walls(_MOST_WALL_POINTS),
         {
-            "keys": run.online.graph.keys,
-            "loops": len(run.online.graph.closed),
+            "keys": len(run.online.back_end.graph),
+            "loops": len(run.online.back_end.closed),
             "lag_s": run.front.lag_s,
             "unsure": run.front.unsure,
         },
@@ -182,12 +182,12 @@ def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
 def graph_peer(runs: DriveRuns, solve: Solver, config: GraphPeerConfig) -> Estimate:
     """Another solver on the steps and the loops of our own run, from its odometry."""
     run = runs.run(Pipeline())
-    graph = run.online.graph
-    steps, loops = graph.measurements()
+    back_end = run.online.back_end
+    steps, loops = back_end.measurements()
     began = time.process_time()
     nodes = solve(steps, loops, chained(steps.relative), config)
     seconds = time.process_time() - began
-    poses = graph.frame_poses(nodes=nodes)
+    poses = back_end.graph.frame_poses(nodes=nodes)
     facts = {"solver_s": seconds, "loops": len(loops.nodes)}
     return Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw, facts=facts)
 
@@ -197,11 +197,11 @@ def fed_with_wrong_loops(
 ) -> list[Estimate]:
     """A solver on the steps and the loops of our own run and wrong loops, one estimate for each seed of these."""
     run = runs.run(Pipeline())
-    steps, loops = run.online.graph.measurements()
+    steps, loops = run.online.back_end.measurements()
     start, estimates = chained(steps.relative), []
     for seed in wrong.seeds:
         fed = with_wrong_loops(loops, len(start), wrong.percent, np.random.default_rng(seed))
-        poses = run.online.graph.frame_poses(nodes=solve(steps, fed, start, config))
+        poses = run.online.back_end.graph.frame_poses(nodes=solve(steps, fed, start, config))
         estimates.append(Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw))
     return estimates
 

@@ -85,13 +85,13 @@ def join_row() -> Row:
 
 def _ours_with_joins(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
     found, run = ours(runs, pipeline), runs.run(pipeline)
-    graph, truth = run.online.graph, _truth(runs.drive)
-    rows = np.searchsorted(truth.stamps_ns, run.trajectory.stamps_ns[graph.closed.pairs])
-    wrong = wrong_joins(truth.poses_xyyaw, rows, graph.closed.relative)
+    back_end, truth = run.online.back_end, _truth(runs.drive)
+    rows = np.searchsorted(truth.stamps_ns, run.trajectory.stamps_ns[back_end.closed.pairs])
+    wrong = wrong_joins(truth.poses_xyyaw, rows, back_end.closed.relative)
     facts = {
         "wrong_loops": wrong.sum(),
-        "wrong_believed": (wrong & (graph.closed.weight > BELIEVED)).sum(),
-        "lost_at_end": float(graph.lost_since is not None),
+        "wrong_believed": (wrong & (back_end.closed.weight > BELIEVED)).sum(),
+        "lost_at_end": float(back_end.lost_since is not None),
     }
     return dataclasses.replace(found, facts={**found.facts, **facts})
 

@@ -97,7 +97,7 @@ def test_a_scanner_that_sees_no_more_than_what_is_ahead_is_found_on_the_way_back
     for step in lidar_steps(way, lambda k, stamp_ns: scan_at(HOUSE, way[k], stamp_ns, angles)):
         mapped.update(step)
     back = way[40::-1] + (0.0, 0.0, math.pi)
-    matcher, seen, asked = mapped.graph.matcher(MapOrigin.of_first_pose(np.zeros(3))), 0, 0
+    matcher, seen, asked = mapped.back_end.matcher(MapOrigin.of_first_pose(np.zeros(3))), 0, 0
     odometry = np.array([between(back[0], pose) for pose in back])
     for step in lidar_steps(odometry, lambda k, stamp_ns: scan_at(HOUSE, back[k], stamp_ns, angles)):
         if matcher.append(step, step.odom_xyyaw):

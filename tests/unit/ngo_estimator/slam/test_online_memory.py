@@ -183,9 +183,9 @@ def test_what_is_kept_does_not_grow() -> None:
     for count, step in enumerate(steps, start=1):
         core.update(step)
         if count % LAP == 0:
-            graph = core._graph
-            assert graph._loops is not None
-            sizes.append((len(graph._keys), len(graph._loops.loops), graph._loops._codes._buffer.size))
+            back_end = core._back_end
+            assert back_end._loops is not None
+            sizes.append((len(back_end._keys), len(back_end._loops.loops), back_end._loops._codes._buffer.size))
     assert max(size[0] for size in sizes) <= 16 + 32
     assert sizes[-1][1] <= 1.3 * sizes[1][1] and sizes[-1][2] == sizes[0][2]
 

@@ -183,7 +183,7 @@ def test_meta_steps_and_features_are_those_of_all_steps_however_far_the_networks
         if count % 8 == 0:
             whole = core._optimizer.aggregate(*(value[:, :count] for value in inputs))
             assert whole.features is not None
-            odometry, first = core._graph._odometry, max(0, count - window_frames) // 8
+            odometry, first = core._back_end._odometry, max(0, count - window_frames) // 8
             for rows, expected in (
                 (odometry.relative, whole.relative),
                 (odometry.std, whole.std),

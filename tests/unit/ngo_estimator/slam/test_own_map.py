@@ -96,7 +96,7 @@ def test_a_robot_that_drives_the_other_way_is_found() -> None:
 
 
 def joining_loops(core: ScanTrajectory) -> int:
-    segment = core.graph.used_loops.pairs >= len(FIRST)
+    segment = core.back_end.used_loops.pairs >= len(FIRST)
     return int((segment[:, 0] != segment[:, 1]).sum())
 
 

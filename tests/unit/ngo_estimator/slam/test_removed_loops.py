@@ -53,8 +53,8 @@ def pictures() -> OnlineTrajectory:
 
 
 def test_the_graph_of_a_lidar_is_what_was_solved(lidar: ScanTrajectory) -> None:
-    graph, (steps, loops) = graph_of(lidar), lidar.graph.measurements()
-    assert len(graph.ids) == lidar.graph.keys and graph.is_loop.sum() == len(loops) > 10
+    graph, (steps, loops) = graph_of(lidar), lidar.back_end.measurements()
+    assert len(graph.ids) == len(lidar.back_end.graph) and graph.is_loop.sum() == len(loops) > 10
     np.testing.assert_array_equal(graph.information[graph.is_loop], loops.information)
     assert set(graph.belief[graph.is_loop]) <= {0.0, 1.0} and np.nanmean(graph.belief) > 0.9
     assert len(steps) == (~graph.is_loop).sum()
@@ -65,7 +65,7 @@ def test_without_a_loop_a_lidar_has_the_poses_that_the_others_give(lidar: ScanTr
     chosen, *others = loops_of(core)
     assert core.remove_loops(*chosen) == 1 and core.fault == ""
     assert loops_of(core) == others and core.remove_loops(*chosen) == 0
-    steps, loops = core.graph.measurements()
+    steps, loops = core.back_end.measurements()
     alone = Robust().correct(GraphProblem(graph_of(lidar).poses, steps, loops, np.ones(len(loops))))
     np.testing.assert_allclose(se2.between(graph_of(core).poses, alone.poses), 0.0, atol=1e-9)
     again = core.restored(core.state())

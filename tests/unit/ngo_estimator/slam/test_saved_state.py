@@ -108,7 +108,7 @@ def test_saved_and_loaded_at_any_step_it_goes_on_as_if_never_stopped(tmp_path: P
 def test_a_session_that_was_paused_for_longer_than_its_window_is_loaded() -> None:
     core, steps = networks("loops", 1), make_steps(200)
     drive(core, steps[:160], range(100, 160))
-    assert core._graph._corrections is not None and core._graph._corrections.last <= core._graph._first
+    assert core._back_end._corrections is not None and core._back_end._corrections.last <= core._back_end._first
     loaded = networks("loops", 1).restored(core.state())
     for step in steps[160:]:
         core.update(step), loaded.update(step)
@@ -118,11 +118,11 @@ def test_a_session_that_was_paused_for_longer_than_its_window_is_loaded() -> Non
 def test_the_round_trip_holds_where_key_frames_have_gone() -> None:
     core, steps = networks("loops", 1), make_steps(160)
     drive(core, steps[:145], range(0))
-    graph = core._graph
-    assert len(graph._nodes) < 1 + graph._odometry.blocks and graph._solved.information is not None
+    back_end = core._back_end
+    assert len(back_end.graph) < 1 + back_end._odometry.blocks and back_end._solved.information is not None
     loaded = networks("loops", 1).restored(core.state())
     drive(core, steps[145:], range(0)), drive(loaded, steps[145:], range(0))
-    assert len(core._graph.closed)
+    assert len(core._back_end.closed)
     assert_same(core, loaded)
 
 
@@ -159,12 +159,12 @@ def test_the_round_trip_of_a_lidar_is_exact(tmp_path: Path, when: str, monkeypat
     original, steps = scans(config), lidar_drive(rounds)
     for count, step in enumerate(steps, start=1):
         original.update(step)
-        graph = original.graph
-        gone = len(graph._nodes.borders) > 1
+        back_end = original.back_end
+        gone = len(back_end.graph.borders) > 1
         reached = {
             "halfway": count == len(steps) // 2,
-            "while a loop waits": graph.unfinished,
-            "after key scans have gone": gone and len(graph._finder._submaps) > 0,
+            "while a loop waits": back_end.unfinished,
+            "after key scans have gone": gone and len(back_end._finder._submaps) > 0,
         }
         if reached[when]:
             break
@@ -292,7 +292,7 @@ def test_arrays_that_no_trajectory_gave_are_refused_and_leave_the_old_one(make: 
         for wrong in ({}, {name: array[..., None]}, {name: array.astype(np.complex128)}):
             with pytest.raises(StateError):
                 core.restored({**{k: v for k, v in good.items() if k != name}, **wrong})
-        if array.ndim and len(array) and name != "_graph._nodes._before":  # which says how many nodes there were
+        if array.ndim and len(array) and name != "_back_end.graph._before":  # which says how many nodes there were
             with pytest.raises(StateError):
                 core.restored({**good, name: np.concatenate((array, array[generator.integers(len(array))][None]))})
     assert_same(core, core.restored(good))

@@ -214,8 +214,8 @@ def test_a_robot_that_stands_adds_frames_alone() -> None:
             )
         )
     assert update.frames == 10_051
-    graph = trajectory._graph
-    assert graph.keys == 1 + sum(step.key is not None for step in steps[:50]) == len(graph._scans)
+    back_end = trajectory._back_end
+    assert len(back_end.graph) == 1 + sum(step.key is not None for step in steps[:50]) == len(back_end._scans)
     assert errors(trajectory, np.concatenate((true[:51], np.tile(true[50], (10_000, 1))))).max() < 0.3
 
 

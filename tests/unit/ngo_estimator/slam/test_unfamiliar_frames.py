@@ -60,7 +60,7 @@ def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back(
     late = [replace(step, unlikeness=2.0 if k >= told else 0.0) for k, step in enumerate(steps)]
     core = OnlineTrajectory.load(WEIGHTS / "maze2d", world="maze2d")
     trajectory, _ = corrected(late, core)
-    assert core._graph.closed.pairs[:, 1].max() <= told - 16
+    assert core._back_end.closed.pairs[:, 1].max() <= told - 16
     ends = [told - 16, told]
     found, came = (between(*of[ends]) for of in (trajectory.poses_xyyaw, trajectory.odometry_xyyaw))
     np.testing.assert_allclose(found, came, atol=1e-4)
@@ -89,7 +89,7 @@ def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_lef
     unknown = np.diag([4.0, 4.0, 0.04])
     blind = [replace(s, unlikeness=2.0, covariance=unknown) if 80 <= k < 88 else s for k, s in enumerate(steps)]
     core = OnlineTrajectory.load(WEIGHTS / "maze3d", 96, "maze3d", 16, 1)
-    graph, iterate = core._graph, core._optimizer.iterate
+    graph, iterate = core._back_end, core._optimizer.iterate
     solved, differences, behind = [np.zeros((1, 3))], [], []
 
     def remembered(*given: Any) -> Iterator[Any]:
@@ -121,7 +121,7 @@ def test_place_codes_alone_close_no_loop_across_a_blind_stretch(tmp_path: Path) 
     def across(stretch: range) -> int:
         core.reset()
         corrected([replace(step, unlikeness=2.0 if k in stretch else 0.0) for k, step in enumerate(steps)], core)
-        believed = core._graph.closed.pairs[core._graph.closed.weight > 0.1]
+        believed = core._back_end.closed.pairs[core._back_end.closed.weight > 0.1]
         return int(((believed[:, 0] < half) & (believed[:, 1] >= half)).sum())
 
     assert across(range(0)) > 0

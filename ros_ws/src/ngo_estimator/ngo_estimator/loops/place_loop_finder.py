@@ -61,14 +61,14 @@ class PlaceLoopFinder:
 
     Args:
         window: blocks in the window.
-        nodes: of the graph, those of ``keys`` and then those of the window; their owner adds to both.
+        graph: its nodes are those of ``keys`` and then those of the window; their owner adds to both.
     """
 
     def __init__(
-        self, pair_head: PairHead, search: LoopSearch, block: int, window: int, nodes: PoseGraph, keys: KeyFrames
+        self, pair_head: PairHead, search: LoopSearch, block: int, window: int, graph: PoseGraph, keys: KeyFrames
     ) -> None:
         self._pair_head, self._search, self._block = pair_head, search, block
-        self._nodes, self._keys = nodes, keys
+        self._graph, self._keys = graph, keys
         keep = window * block + 2 * block + MARGIN
         self._codes = SlidingRows((pair_head.config.code_length,), np.float32, keep)
         self._embeddings = SlidingRows((pair_head.config.embedding_size,), np.float32, keep)
@@ -80,7 +80,7 @@ class PlaceLoopFinder:
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
-        frames, nodes = len(self._nodes.frames) - 1, len(self._nodes)
+        frames, nodes = len(self._graph.frames) - 1, len(self._graph)
         require(len(self._codes) == len(self._embeddings) == frames, f"there are not {frames} place codes")
         newest = int(self.loops.end.max(initial=0))
         require(newest < nodes, f"a loop ends at node {newest} of {nodes}")
@@ -88,11 +88,11 @@ class PlaceLoopFinder:
     @property
     def _begins(self) -> np.ndarray:
         """The numbers ``(nodes,)`` of the steps with which the blocks behind the nodes begin."""
-        return self._nodes.frames.nodes
+        return self._graph.frames.nodes
 
     @property
     def _odometry(self) -> np.ndarray:
-        return self._nodes.frames.odometry
+        return self._graph.frames.odometry
 
     def append(self, place_code: np.ndarray) -> None:
         """Take the place code of the next frame; zeros are those of a frame that closes no loops."""
@@ -111,7 +111,7 @@ class PlaceLoopFinder:
         Returns:
             Which of ``loops`` ``(n,)`` these are.
         """
-        newest, window = len(self._nodes) - 1, len(self._keys)
+        newest, window = len(self._graph) - 1, len(self._keys)
         overlaps = fresh and self._search.overlaps > 0
         if overlaps and newest - _AGAIN > window:
             self._find_overlaps(newest - _AGAIN, window)
@@ -241,7 +241,7 @@ class PlaceLoopFinder:
         earlier = earlier[begins[earlier] <= begins[end] - self._search.min_separation * self._block]
         if len(earlier) == 0:
             return
-        keys, poses = earlier[earlier < window], self._nodes.poses
+        keys, poses = earlier[earlier < window], self._graph.poses
         of_keys = [self._keys.frame(key).codes[MARGIN - 1 : MARGIN] for key in keys.tolist()]
         codes = np.concatenate((*of_keys, self._codes.at(begins[earlier[len(keys) :]] - 1)))
         relative = torch.from_numpy(_seen_from(poses[earlier], poses[end])).float()
@@ -303,8 +303,8 @@ class PlaceLoopFinder:
 
     def thin(self, keep: np.ndarray, keys: int) -> None:
         """Hang loops upon the ``keys`` key frames before those that are not among ``keep`` ``(nodes,)``."""
-        variance = np.diagonal(self._nodes.step_covariance[:keys], axis1=1, axis2=2)
-        self.loops = self.loops.thinned(keep, self._nodes.poses[:keys], variance, self._begins)
+        variance = np.diagonal(self._graph.step_covariance[:keys], axis1=1, axis2=2)
+        self.loops = self.loops.thinned(keep, self._graph.poses[:keys], variance, self._begins)
 
     def for_optimizer(self) -> tuple[Loops, np.ndarray]:
         """The loops for the optimizer, and which of ``loops`` these are."""

@@ -38,7 +38,7 @@ class BackEnd(ABC):
     """
 
     def __init__(self, graph: PoseGraph) -> None:
-        self._nodes = graph
+        self.graph = graph
         self.closed = ClosedLoops.none()
         self.fault = ""
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
@@ -137,22 +137,6 @@ class BackEnd(ABC):
     @abstractmethod
     def window_fill(self) -> float:
         """Share of the window that is in use."""
-
-    @property
-    def largest_move_m(self) -> float:
-        """How far the last optimisation moved a node at most."""
-        return self._nodes.largest_move_m
-
-    def newest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose ``(3,)`` of the newest frame and its covariance ``(3, 3)``."""
-        return self._nodes.newest()
-
-    def frame_poses(self, before: bool = False, nodes: np.ndarray | None = None) -> np.ndarray:
-        """Poses ``(frames, 3)`` of all frames, as they are or as they were before the last optimisation.
-
-        With ``nodes`` ``(nodes, 3)`` these are the poses of the nodes.
-        """
-        return self._nodes.frame_poses(before, nodes)
 
 
 def require_sound(poses: np.ndarray, end: np.ndarray) -> None:

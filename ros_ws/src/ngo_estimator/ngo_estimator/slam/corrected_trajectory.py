@@ -1,4 +1,4 @@
-"""The state of a trajectory that is corrected online: one log of steps, one graph that owns poses and covariance."""
+"""The state of a trajectory that is corrected online: a log of steps, and a back end, whose graph owns all poses."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -24,7 +24,7 @@ AnyTrajectory = TypeVar("AnyTrajectory", bound="CorrectedTrajectory")
 
 
 class CorrectedTrajectory(ABC):
-    """Takes steps into a log and a graph, and reports what each changed.
+    """Takes steps into a log and a back end, and reports what each changed.
 
     A step is answered by the odometry behind the last corrected pose. ``correct`` does the work that it makes due: the
     search for loops, and an optimisation. A live node calls it when it has published the answer, in the time until the
@@ -34,8 +34,8 @@ class CorrectedTrajectory(ABC):
         answers_first: False: the work is done before the step is answered.
     """
 
-    SAVED = ("_log", "_graph", "_online", "_optimized", "_odom")
-    _graph: BackEnd
+    SAVED = ("_log", "_back_end", "_online", "_optimized", "_odom")
+    _back_end: BackEnd
 
     def __init__(self, answers_first: bool) -> None:
         self._answers_first = answers_first
@@ -43,8 +43,8 @@ class CorrectedTrajectory(ABC):
         self.reset()
 
     @abstractmethod
-    def _new_graph(self) -> BackEnd:
-        """A graph without any frame."""
+    def _new_back_end(self) -> BackEnd:
+        """A back end without any frame."""
 
     @property
     @abstractmethod
@@ -53,7 +53,7 @@ class CorrectedTrajectory(ABC):
 
     def localisation(self, origin: MapOrigin) -> MapLocalisation:
         """Localisation in this trajectory as it is, which lies in ``map`` as ``origin`` says; raises ``ValueError``."""
-        return MapLocalisation(self._graph.localiser(origin), self._graph.checked)
+        return MapLocalisation(self._back_end.localiser(origin), self._back_end.checked)
 
     def state(self) -> Arrays:
         """Copies of all that later steps depend on, for ``restored``; raises ``StateError`` before the first step.
@@ -111,8 +111,8 @@ class CorrectedTrajectory(ABC):
     def _begin(self) -> None:
         self._loaded = False  # and no step taken since
         self._online = GrowingRows((3,), np.float64)
-        self._graph = self._new_graph()
-        self._due, self._optimize = False, True  # whether the graph has work, and may optimise
+        self._back_end = self._new_back_end()
+        self._due, self._optimize = False, True  # whether the back end has work, and may optimise
         self._optimized, self._fault = False, ""  # since the last result
         self._odom = np.zeros(3)  # of the newest frame, on TF
 
@@ -132,7 +132,7 @@ class CorrectedTrajectory(ABC):
                 that is a little late; after loading, the first step of another odometry. The trajectory is as it was
                 before.
         """
-        step = self._graph.checked(step)
+        step = self._back_end.checked(step)
         self._begin_result()
         if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
             raise RejectedStep(
@@ -157,9 +157,9 @@ class CorrectedTrajectory(ABC):
         Raises:
             RejectedStep: as of ``update``; the stamp is not later than the newest one, or ``may_join`` is false.
         """
-        step = self._graph.checked(step)
+        step = self._back_end.checked(step)
         self._work()  # it may move the newest pose
-        return self._join_at(step, *bridged(*self._graph.newest(), pose_xyyaw, covariance))
+        return self._join_at(step, *bridged(*self._back_end.graph.newest(), pose_xyyaw, covariance))
 
     def _join_at(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
         """Go on with another odometry; its first frame is ``relative`` ``(3,)`` to the newest one."""
@@ -174,7 +174,7 @@ class CorrectedTrajectory(ABC):
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether the trajectory can go on with another odometry from this step's frame."""
-        return self._log.steps > 0 and self._graph.may_join(step)
+        return self._log.steps > 0 and self._back_end.may_join(step)
 
     def check_later(self, step: RelativeStep) -> None:
         """Raise ``RejectedStep`` if a step of another odometry is not later than the newest frame."""
@@ -183,9 +183,9 @@ class CorrectedTrajectory(ABC):
     def _take(self, step: RelativeStep, taken: TakenStep, optimize: bool) -> TrajectoryUpdate:
         self._loaded = False
         if taken.begins:
-            self._graph.begin_at(step)
+            self._back_end.begin_at(step)
             self._online.append(np.zeros(3))
-        self._graph.append(step, taken)
+        self._back_end.append(step, taken)
         self._odom = step.tf_odom_xyyaw
         self._due, self._optimize = True, optimize
         if not self._answers_first:
@@ -203,8 +203,8 @@ class CorrectedTrajectory(ABC):
         """Do the work that is due."""
         if self._due:
             self._due = False
-            self._optimized |= self._graph.work(self._optimize)
-            self._fault = self._graph.fault or self._fault
+            self._optimized |= self._back_end.work(self._optimize)
+            self._fault = self._back_end.fault or self._fault
 
     def correct(self) -> TrajectoryUpdate | None:
         """Do the work that the newest step made due; None where it changed nothing."""
@@ -214,19 +214,19 @@ class CorrectedTrajectory(ABC):
     @property
     def unfinished(self) -> bool:
         """Whether there is anything left to optimise, which later steps, or ``finish``, are to do."""
-        return self._due or self._graph.unfinished
+        return self._due or self._back_end.unfinished
 
     @property
     def optimization_s(self) -> float:
         """Computing time of the last optimisation, and of the search for loops before it."""
-        return self._graph.took_s
+        return self._back_end.took_s
 
     def finish(self) -> TrajectoryUpdate | None:
         """Optimise what is left, when no more steps come; None where there is nothing, or where it failed."""
         self._begin_result()
-        if self._log.steps > 0 and self._graph.finish():
+        if self._log.steps > 0 and self._back_end.finish():
             self._optimized = True
-        self._fault = self._graph.fault or self._fault
+        self._fault = self._back_end.fault or self._fault
         return self._result(restarted=False, gap=False) if self._optimized else None
 
     def remove_loops(self, first: int, second: int, stretch: bool = False) -> int:
@@ -245,9 +245,9 @@ class CorrectedTrajectory(ABC):
             return np.asarray(within if stretch else exact)
 
         self._begin_result()
-        removed = self._graph.remove_loops(which)
-        self._optimized |= removed > 0 and not self._graph.fault
-        self._fault = self._graph.fault or self._fault
+        removed = self._back_end.remove_loops(which)
+        self._optimized |= removed > 0 and not self._back_end.fault
+        self._fault = self._back_end.fault or self._fault
         return removed
 
     def planar_graph(self) -> PlanarGraph | None:
@@ -257,15 +257,15 @@ class CorrectedTrajectory(ABC):
 
     def loop_report(self) -> LoopReport:
         """What the last optimisation thinks of the loops."""
-        graph, closed = self._graph, self._graph.closed
-        seen = closed.pairs, closed.relative, closed.weight, graph.waiting_loops
-        return loop_report(*seen, self._log.stamps_ns.values, graph.frame_poses())
+        back_end, closed = self._back_end, self._back_end.closed
+        seen = closed.pairs, closed.relative, closed.weight, back_end.waiting_loops
+        return loop_report(*seen, self._log.stamps_ns.values, back_end.graph.frame_poses())
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""
         if self._log.steps == 0:
             return None
-        graph, log, closed = self._graph, self._log, self._graph.closed
+        graph, log, closed = self._back_end.graph, self._log, self._back_end.closed
         poses, moved = graph.frame_poses(), np.zeros(log.steps + 1)
         if self._optimized:
             before = graph.frame_poses(before=True)
@@ -277,10 +277,10 @@ class CorrectedTrajectory(ABC):
         return Trajectory(*map(_read_only, arrays))
 
     def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
-        graph = self._graph
-        pose, covariance = graph.newest()
+        back_end = self._back_end
+        pose, covariance = back_end.graph.newest()
         map_from_odom = compose(pose, between(self._odom, np.zeros(3)))
-        lost = graph.lost_since
+        lost = back_end.lost_since
         return TrajectoryUpdate(
             stamp_ns=int(self._log.stamps_ns.values[-1]),
             pose_xyyaw=_read_only(pose.copy()),
@@ -290,9 +290,9 @@ class CorrectedTrajectory(ABC):
             optimized=self._optimized,
             restarted=restarted,
             gap=gap,
-            largest_move_m=graph.largest_move_m if self._optimized else 0.0,
-            closed_loops=int((graph.closed.weight > BELIEVED).sum()),
-            window_fill=graph.window_fill,
+            largest_move_m=back_end.graph.largest_move_m if self._optimized else 0.0,
+            closed_loops=int((back_end.closed.weight > BELIEVED).sum()),
+            window_fill=back_end.window_fill,
             fault=self._fault,
             lost_since_ns=None if lost is None else int(self._log.stamps_ns.values[lost]),
         )

@@ -14,7 +14,7 @@ from ngo_estimator.data.weights_file import CheckpointError
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
-from ngo_estimator.slam.meta_graph import MetaGraph
+from ngo_estimator.slam.place_back_end import PlaceBackEnd
 
 _NETWORK_EVERY, _ANNEAL_EVERY = 32, 8
 """Meta-poses from one run of attention and convolutions to the next, and from one judgement of all loops to the next,
@@ -36,7 +36,7 @@ class OnlineTrajectory(CorrectedTrajectory):
     give hardly changes from one to the next. All loops are judged for each eighth, and new ones alone between.
     """
 
-    _graph: MetaGraph
+    _back_end: PlaceBackEnd
 
     def __init__(
         self,
@@ -121,6 +121,6 @@ class OnlineTrajectory(CorrectedTrajectory):
             "answers_first": self._answers_first,
         }
 
-    def _new_graph(self) -> MetaGraph:
+    def _new_back_end(self) -> PlaceBackEnd:
         blocks = self._window // self._block
-        return MetaGraph(self._optimizer, self._pair_head, blocks, self._key_frames, *self._every, lambda: self._log)
+        return PlaceBackEnd(self._optimizer, self._pair_head, blocks, self._key_frames, *self._every, lambda: self._log)

@@ -11,7 +11,7 @@ from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.graph.pose_graph import OPEN
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
-from ngo_estimator.slam.scan_graph import ScanGraph
+from ngo_estimator.slam.scan_back_end import ScanBackEnd
 from ngo_estimator.slam.step_log import StepLog
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
 from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of
@@ -24,7 +24,7 @@ class ScanTrajectory(CorrectedTrajectory):
     scans.
     """
 
-    _graph: ScanGraph
+    _back_end: ScanBackEnd
 
     def __init__(self, config: ScanGraphConfig | None = None, iterations_per_step: int = 0) -> None:
         if iterations_per_step < 0:
@@ -38,9 +38,9 @@ class ScanTrajectory(CorrectedTrajectory):
         return cls(read_lidar_file(weights, "graph", ScanGraphConfig, world), iterations_per_step)
 
     @property
-    def graph(self) -> ScanGraph:
-        """The graph of key scans."""
-        return self._graph
+    def back_end(self) -> ScanBackEnd:
+        """The graph of key scans, and its loops."""
+        return self._back_end
 
     @property
     def log(self) -> StepLog:
@@ -53,24 +53,24 @@ class ScanTrajectory(CorrectedTrajectory):
         Raises:
             RejectedStep: as of ``update``; the stamp is not later than the newest one, or the step has no key scan.
         """
-        return self._join_at(replace(self._graph.checked(step), segment=True), np.zeros(3), OPEN)
+        return self._join_at(replace(self._back_end.checked(step), segment=True), np.zeros(3), OPEN)
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
-        return self._graph.walls(most)
+        return self._back_end.walls(most)
 
     def planar_graph(self) -> PlanarGraph | None:
         """The graph of key scans as it is now; see ``CorrectedTrajectory.planar_graph``."""
         if self._log.steps == 0:
             return None
-        graph, poses = self._graph, self._graph.frame_poses()
-        frames = graph.key_frames
-        return graph_of(self._log.stamps_ns.values[frames], poses[frames], *graph.measurements(), graph.belief())
+        back_end, graph = self._back_end, self._back_end.graph
+        frames, measured = graph.frames.nodes, back_end.measurements()
+        return graph_of(self._log.stamps_ns.values[frames], graph.poses.copy(), *measured, back_end.belief())
 
     @property
     def identity(self) -> dict[str, Any]:
         """The settings: there are no networks."""
         return {"graph": asdict(self._config)}
 
-    def _new_graph(self) -> ScanGraph:
-        return ScanGraph(self._config)
+    def _new_back_end(self) -> ScanBackEnd:
+        return ScanBackEnd(self._config)

@@ -71,10 +71,10 @@ def _with(union: ScanTrajectory, session: ScanTrajectory) -> tuple[ScanTrajector
 
 def steps_again(session: ScanTrajectory) -> Iterator[RelativeStep]:
     """The steps of a session as its odometry had them; the first, which nobody measured, ends at the first frame."""
-    log, graph = session.log, session.graph
-    stamps, frames = log.stamps_ns.values.tolist(), graph.odometry
+    log, graph = session.log, session.back_end.graph
+    stamps, frames = log.stamps_ns.values.tolist(), graph.frames.odometry
     variance = log.odometry_std.values.astype(np.float64) ** 2
-    keys = {frame: key for key, frame in enumerate(graph.key_frames.tolist())}
+    keys = {frame: key for key, frame in enumerate(graph.frames.nodes.tolist())}
     opens = set(graph.segment_frames.tolist())
     for frame, stamp_ns in enumerate(stamps):
         yield RelativeStep(
@@ -86,7 +86,7 @@ def steps_again(session: ScanTrajectory) -> Iterator[RelativeStep]:
             log.odometry.values[frame].copy(),
             _NOTHING,
             _NOTHING,
-            key=graph.key_step(keys[frame]) if frame in keys else None,
+            key=session.back_end.key_step(keys[frame]) if frame in keys else None,
             segment=frame in opens,
         )
 

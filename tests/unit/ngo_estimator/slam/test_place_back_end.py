@@ -1,6 +1,6 @@
 """The graph of meta-poses repeats work the more often the less of the trajectory it saw."""
 
-from ngo_estimator.slam.meta_graph import is_due
+from ngo_estimator.slam.place_back_end import is_due
 
 
 def test_a_short_trajectory_is_judged_anew_more_often() -> None:

@@ -1,4 +1,4 @@
-"""The graph of meta-poses behind the online trajectory: key frames, a window, and loops between any of them.
+"""The back end of pictures: a graph of meta-poses, key frames and a window of them, with loops between any of them.
 
 Its nodes are the poses before blocks of frames: those of the key frames, and then those of the window.
 """
@@ -44,7 +44,7 @@ _FRESH = 2
 """Blocks since the last optimisation up to which poses say what frames share."""
 
 
-class MetaGraph(BackEnd):
+class PlaceBackEnd(BackEnd):
     """Takes frames, keeps nodes, and optimises those of the window together with the key frames before it.
 
     The network runs for each ``network_every``-th block; between, what it gave is taken again. For each
@@ -67,13 +67,13 @@ class MetaGraph(BackEnd):
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
         self._log = log  # of the steps as they came
-        self._odometry = OdometryBlocks(optimizer, pair_head, window, log, self._nodes.frames)
+        self._odometry = OdometryBlocks(optimizer, pair_head, window, log, self.graph.frames)
         self._loops: PlaceLoopFinder | None = None
         self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
             assert pair_head is not None
             search = optimizer.config.search
-            self._loops = PlaceLoopFinder(pair_head, search, self._block, window, self._nodes, self._keys)
+            self._loops = PlaceLoopFinder(pair_head, search, self._block, window, self.graph, self._keys)
         self._solved = SolvedGraph.none()
         self._network_every, self._anneal_every = network_every, anneal_every
         self._shrunk = False  # whether corrections of the last result were shrunk
@@ -108,7 +108,7 @@ class MetaGraph(BackEnd):
             code, variance = np.zeros_like(code), variance / self._scale
             if self._odometry.is_familiar:
                 self._recall()
-        self._nodes.append(taken.relative.astype(np.float64), np.diag(variance.astype(np.float64)), taken.joins)
+        self.graph.append(taken.relative.astype(np.float64), np.diag(variance.astype(np.float64)), taken.joins)
         self._odometry.append(taken.relative, variance, step.motion_feature, familiar)
         if self._loops is not None:
             self._loops.append(code)
@@ -120,13 +120,13 @@ class MetaGraph(BackEnd):
     @property
     def _blocks_before(self) -> np.ndarray:
         """How many blocks lie before each node ``(nodes,)``."""
-        blocks: np.ndarray = self._nodes.frames.nodes // self._block
+        blocks: np.ndarray = self.graph.frames.nodes // self._block
         return blocks
 
     @property
     def _first(self) -> int:
         """Number of the first block of the window."""
-        return int(self._nodes.frames.nodes[len(self._keys)]) // self._block
+        return int(self.graph.frames.nodes[len(self._keys)]) // self._block
 
     @torch.inference_mode()
     def work(self, optimize: bool = True) -> bool:
@@ -136,7 +136,7 @@ class MetaGraph(BackEnd):
     def _take_in(self) -> bool:
         self._guarded("the registration of steps", self._register)
         self._odometry.complete()
-        self._nodes.add_node()
+        self.graph.add_node()
         self._guarded("taking in a meta-pose", self._odometry.aggregate)
         self._restate()
         self._guarded("the search for loops", self._look_for_loops)
@@ -146,7 +146,7 @@ class MetaGraph(BackEnd):
     def _restate(self) -> None:
         """Have the odometry of the window as it is now."""
         odometry, first = self._odometry, self._first
-        self._nodes.restate(len(self._keys), odometry.relative.slice(first), _variance(odometry.std.slice(first)))
+        self.graph.restate(len(self._keys), odometry.relative.slice(first), _variance(odometry.std.slice(first)))
 
     def _register(self) -> None:
         """Measure the newest block again."""
@@ -168,29 +168,29 @@ class MetaGraph(BackEnd):
         """Look for loops of the newest node, and limit how far those from key frames may be off."""
         if self._loops is None:
             return
-        new = self._loops.find(self._nodes.frames.nodes[-1] - self._solved.frames[-1] <= _FRESH * self._block)
+        new = self._loops.find(self.graph.frames.nodes[-1] - self._solved.frames[-1] <= _FRESH * self._block)
         if len(self._keys) and len(new):
             loops = self._loops.loops
-            loops.most_drift[new] = self._solved.most_drift(loops.start[new], len(self._keys), self._nodes, self._scale)
+            loops.most_drift[new] = self._solved.most_drift(loops.start[new], len(self._keys), self.graph, self._scale)
 
     def _make_room(self) -> None:
         """Let the window slide, and some key frames go."""
-        while len(self._nodes) - 1 - len(self._keys) > self._window:
+        while len(self.graph) - 1 - len(self._keys) > self._window:
             self._keys.add(self._key_frame())
             if self._loops is not None:
                 self._loops.leave()
         if self._keys.crowded:
-            keep, keys = np.ones(len(self._nodes), bool), len(self._keys)
-            keep[:keys] = self._keys.thin(self._nodes.poses[:keys], self._nodes.relative[:keys])
+            keep, keys = np.ones(len(self.graph), bool), len(self._keys)
+            keep[:keys] = self._keys.thin(self.graph.poses[:keys], self.graph.relative[:keys])
             if self._loops is not None:
                 self._loops.thin(keep, keys)
-            self._nodes.let_go(keep)
+            self.graph.let_go(keep)
 
     def _key_frame(self) -> KeyFrame:
         """The key frame that the window's first node becomes; the step from it is as the last optimisation had it."""
         first = len(self._keys)
         believed = self._odometry.optimized_std.slice(self._first, self._first + 1)
-        self._nodes.restate(first, all_between(*self._nodes.poses[first : first + 2, None]), believed**2)
+        self.graph.restate(first, all_between(*self.graph.poses[first : first + 2, None]), believed**2)
         if self._loops is not None:
             return self._loops.key_frame()
         nothing = np.zeros((self._block, 0), np.float32)
@@ -199,8 +199,8 @@ class MetaGraph(BackEnd):
     def _optimise(self) -> None:
         """Optimise all nodes of the window and the key frames before it."""
         odometry, first, blocks = self._odometry, self._first, self._odometry.blocks
-        relative = self._nodes.relative.astype(np.float32)
-        std = np.sqrt(np.diagonal(self._nodes.step_covariance, axis1=1, axis2=2)).astype(np.float32)
+        relative = self.graph.relative.astype(np.float32)
+        std = np.sqrt(np.diagonal(self.graph.step_covariance, axis1=1, axis2=2)).astype(np.float32)
         known = None if self._network_is_due else self._corrections
         runs_network = self._optimizer.config.network and known is None
         features = None
@@ -216,7 +216,7 @@ class MetaGraph(BackEnd):
             loops, rows = self._loops.for_optimizer()
             loops = self._verified(loops)
             if not self._annealing_is_due:
-                known_loops, poses = self._loops.loops[rows], self._nodes.poses
+                known_loops, poses = self._loops.loops[rows], self.graph.poses
                 steps_solved = torch.from_numpy(all_between(poses[:-1], poses[1:])).unsqueeze(0)
                 solution = Solution(steps_solved, known_loops.weight, known_loops.information)
         corrections = None if known is None else known.for_blocks(first, blocks)
@@ -268,9 +268,9 @@ class MetaGraph(BackEnd):
         solution = chained(result.meta_relative[-1][0].double().numpy())
         poses = self._shrink(solution)
         moved = poses[-1] - solution[-1]
-        self._nodes.move(poses, end + np.outer(moved, moved))
+        self.graph.move(poses, end + np.outer(moved, moved))
         self._odometry.optimized_std.replace(self._first, result.step_std[0, len(self._keys) :].double().numpy())
-        self._solved = SolvedGraph(self._nodes.frames.nodes.copy(), result.equations)
+        self._solved = SolvedGraph(self.graph.frames.nodes.copy(), result.equations)
 
     def _shrink(self, solution: np.ndarray) -> np.ndarray:
         """Poses of all nodes ``(nodes, 3)``, whose corrections are shrunk across blind stretches."""
@@ -279,7 +279,7 @@ class MetaGraph(BackEnd):
         if not blind.any():
             return solution
         log = self._log().odometry.values
-        odometry = se2.between(log[0], log[self._nodes.frames.nodes])
+        odometry = se2.between(log[0], log[self.graph.frames.nodes])
         loops = PlaceLoops.none() if self._loops is None else self._loops.loops
         variances = summed_variances(blind, self._blocks_before)
         shrunk = shrunk_corrections(solution, odometry, variances, loops.pairs, loops.weight)
@@ -304,18 +304,18 @@ class MetaGraph(BackEnd):
         """Localises by the frames whose place codes are kept; raises ``ValueError`` where none are."""
         if self._loops is None or self._pair_head is None:
             raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
-        places = self._loops.places(origin.poses(self.frame_poses()))
+        places = self._loops.places(origin.poses(self.graph.frame_poses()))
         return Localiser(PlaceMatcher(self._pair_head, places, self._optimizer.config.search))
 
     SAVED = (
-        "_nodes", "_keys", "_odometry", "_loops", "_solved", "_annealed", "_shrunk", "_corrections", "_origin_code",
+        "graph", "_keys", "_odometry", "_loops", "_solved", "_annealed", "_shrunk", "_corrections", "_origin_code",
         "closed",
     )  # fmt: skip
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
         frames, blocks, joined = self._odometry.steps, self._odometry.blocks, self.closed.pairs
-        window = self._nodes.frames.nodes[len(self._keys) :]
+        window = self.graph.frames.nodes[len(self._keys) :]
         require(
             len(window) > 0 and np.array_equal(window, self._block * np.arange(blocks + 1)[-len(window) :]),
             f"{frames} steps, {blocks} meta-poses and {len(self._keys)} key frames do not belong together",

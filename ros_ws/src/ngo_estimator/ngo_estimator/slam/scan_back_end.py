@@ -1,4 +1,4 @@
-"""The graph of key scans behind the online trajectory of a lidar: a chain of nodes, verified loops, warm starts."""
+"""The back end of a lidar: a graph of key scans, verified loops, warm starts."""
 
 import math
 from dataclasses import replace
@@ -42,7 +42,7 @@ _MOVED_M = 0.5
 """Where an optimisation moves a key scan that far, the map is another one to search in."""
 
 
-class ScanGraph(BackEnd):
+class ScanBackEnd(BackEnd):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
     def __init__(self, config: ScanGraphConfig) -> None:
@@ -61,26 +61,6 @@ class ScanGraph(BackEnd):
         self._claimed = np.zeros(0, np.int64)  # used loops by which the robot was found since the last optimisation
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
 
-    @property
-    def keys(self) -> int:
-        """Key scans so far."""
-        return len(self._nodes)
-
-    @property
-    def key_frames(self) -> np.ndarray:
-        """The frames that are nodes ``(keys,)``."""
-        return self._nodes.frames.nodes
-
-    @property
-    def odometry(self) -> np.ndarray:
-        """Poses ``(frames, 3)`` of all frames by the steps that came."""
-        return self._nodes.frames.odometry
-
-    @property
-    def segment_frames(self) -> np.ndarray:
-        """The frames ``(n,)`` with which a segment begins, but the first."""
-        return self._nodes.segment_frames
-
     def key_step(self, key: int) -> KeyScanStep:
         """A key scan and the step to it, as the odometry had them; of old scans rays tell what loops ask of them."""
         scan = self._scans[key]
@@ -90,7 +70,7 @@ class ScanGraph(BackEnd):
         from_stamp_ns = self._scans[max(0, key - 1)].stamp_ns
         if key == 0:
             return KeyScanStep(scan, from_stamp_ns, np.zeros(3), OPEN)  # nobody knows it
-        graph, step = self._nodes, key - 1
+        graph, step = self.graph, key - 1
         given, published = (of[step] - self._floor for of in (graph.step_covariance, graph.published_covariance))
         factors = np.sqrt(np.diagonal(published) / np.diagonal(given))
         return KeyScanStep(scan, from_stamp_ns, graph.relative[step].copy(), given, factors)
@@ -114,11 +94,11 @@ class ScanGraph(BackEnd):
         covariance = bounded(taken.covariance)
         if step.segment:
             covariance = OPEN
-            self._nodes.open_segment()
-        self._nodes.append(taken.relative, covariance, taken.joins or step.segment)
+            self.graph.open_segment()
+        self.graph.append(taken.relative, covariance, taken.joins or step.segment)
         if step.key is not None:
             self._add_key(step.key, taken.joins)
-            self._own_map.follow(self._nodes)
+            self._own_map.follow(self.graph)
             self._scans.append(step.key.scan)
             self._is_key = True
 
@@ -127,9 +107,9 @@ class ScanGraph(BackEnd):
         if key.from_key_stamp_ns == self._scans[-1].stamp_ns and not joins:
             # Registration in the same key scans: errors of the steps between do not add up.
             covariance = bounded(key.covariance)
-            self._nodes.add_node(covariance, covariance * np.outer(key.factors, key.factors))
+            self.graph.add_node(covariance, covariance * np.outer(key.factors, key.factors))
         else:
-            self._nodes.add_node(bounded(self._nodes.since_covariance))
+            self.graph.add_node(bounded(self.graph.since_covariance))
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether another odometry may go on from this step's frame, which needs a key scan."""
@@ -149,20 +129,21 @@ class ScanGraph(BackEnd):
     def _wait(self) -> int:
         """Key scans for which a loop waits."""
         # An optimisation takes longer the more nodes there are: its cost for each key must not grow.
-        return max(self.config.keys_between, self.keys // _KEYS_PER_OPTIMISED)
+        return max(self.config.keys_between, len(self.graph) // _KEYS_PER_OPTIMISED)
 
     def _look_for_loops(self) -> None:
         """Ask for loops of the newest key."""
-        if (self.keys - 1) % self.config.loops.every == 0:
-            chain, joining = self._nodes, self._joining_pairs
-            distances = graph_distances(chain.poses, joining, self.keys - 1, chain.segments)
+        if (len(self.graph) - 1) % self.config.loops.every == 0:
+            chain, joining = self.graph, self._joining_pairs
+            distances = graph_distances(chain.poses, joining, len(self.graph) - 1, chain.segments)
             windows = distance_windows(self.config.windows, distances)
             fresh = self._finder.find(self._scans, chain.poses, windows, segments=chain.borders)
             self._scans.compact()
             believed = self._selection.believed(fresh, self._finder.loops, chain)
             if len(believed):
                 surprises = self._selection.use(believed, self._finder.loops, chain)
-                self._waiting = max(self._waiting, self._wait - self.keys // _KEYS_PER_SURPRISED if surprises else 1)
+                waited = self._wait - len(chain) // _KEYS_PER_SURPRISED if surprises else 1
+                self._waiting = max(self._waiting, waited)
             self._parts = joined_parts(chain.segments, joining)
             if self._own_map.contradicted(self._scans, self._finder.views, chain, self._parts):
                 self._part_newest_segment()
@@ -179,13 +160,13 @@ class ScanGraph(BackEnd):
         """Take loops by which the robot was found again in its own map; the next optimisation judges them."""
         if len(loops):
             first = len(self._selection)
-            self._selection.use(self._finder.add(loops), self._finder.loops, self._nodes)
+            self._selection.use(self._finder.add(loops), self._finder.loops, self.graph)
             self._claimed = np.concatenate((self._claimed, np.arange(first, len(self._selection))))
             self._waiting = self._wait + 1
 
     def _part_newest_segment(self) -> None:
         """Take back what joined the newest segment with others: it lies elsewhere."""
-        first = self._nodes.frames.nodes[self._nodes.segments[-1]]
+        first = self.graph.frames.nodes[self.graph.segments[-1]]
         self._drop_loops(lambda frames: (frames < first).any(1) & (frames >= first).any(1))
         self._waiting = self._wait + 1
 
@@ -194,22 +175,22 @@ class ScanGraph(BackEnd):
         """Keys ``(n, 2)`` that loops join: of two segments only where the last optimisation believed the loop."""
         pairs, weight = self._finder.loops.pairs[self._selection.rows], np.zeros(len(self._selection))
         weight[: len(self.closed)] = self.closed.weight
-        first, last = segment_of(self._nodes.segments, pairs).T
+        first, last = segment_of(self.graph.segments, pairs).T
         return pairs[(first == last) | (weight > BELIEVED)]
 
     @property
     def lost_since(self) -> int | None:
         """The frame from which on nobody knows where the newest is in the map, for no loop joins its segment."""
-        segments = self._nodes.segments
+        segments = self.graph.segments
         if len(segments) == 1:
             return None
         known = np.flatnonzero(self._parts == 0)
         last = int(known[-1]) if len(known) else 0  # of the segments that are joined with the first
-        return None if last == len(segments) - 1 else int(self._nodes.frames.nodes[segments[last + 1]])
+        return None if last == len(segments) - 1 else int(self.graph.frames.nodes[segments[last + 1]])
 
     def _thin(self) -> None:
         """Let go of key scans whose places newer ones show; what their edges said goes to their neighbours."""
-        chain, loops, count = self._nodes, self.used_loops, self.keys
+        chain, loops, count = self.graph, self.used_loops, len(self.graph)
         stays = np.arange(count) >= count - self._newest
         stays[chain.ends_of_segments] = stays[self._own_map.looks] = True
         part = self._parts[segment_of(chain.segments, np.arange(count))]
@@ -242,11 +223,11 @@ class ScanGraph(BackEnd):
     def _close(self, loops: ScanLoops, weights: np.ndarray) -> None:
         """Say what is thought of the loops that are used ``(n,)``."""
         variance = np.diagonal(loops.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]
-        self.closed = ClosedLoops(self._nodes.frames.nodes[loops.pairs], loops.relative, np.sqrt(variance), weights)
+        self.closed = ClosedLoops(self.graph.frames.nodes[loops.pairs], loops.relative, np.sqrt(variance), weights)
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
-        scans, chain = self._scans[:], self._nodes
+        scans, chain = self._scans[:], self.graph
         poses = origin.poses(chain.poses.copy())
         return ScanMatcher(scans, poses, self._finder.views, self.config.loops, borders=chain.borders)
 
@@ -263,10 +244,10 @@ class ScanGraph(BackEnd):
         """The steps from each node to the next, and the loops that the graph needs."""
         loops = self.used_loops
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
-        return self._nodes.steps, measured
+        return self.graph.steps, measured
 
     def _drop_loops(self, which: WhichLoops) -> int:
-        frames, found = self._nodes.frames.nodes, self._finder.loops
+        frames, found = self.graph.frames.nodes, self._finder.loops
         removed = self._selection.drop(lambda rows: which(frames[found.pairs[rows]]))
         if removed:
             self.closed, self._loops_from_nothing = ClosedLoops.none(), 0
@@ -292,28 +273,28 @@ class ScanGraph(BackEnd):
             if not (solution.loop_weights[claimed] > BELIEVED).any():
                 solution = None
         if solution is None:
-            solution = self._corrected(self._nodes.poses)
-        end = self._end_covariance(solution) if self.keys > 1 else self._nodes.end
+            solution = self._corrected(self.graph.poses)
+        end = self._end_covariance(solution) if len(self.graph) > 1 else self.graph.end
         require_sound(solution.poses, end)
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
-        self._nodes.move(solution.poses, end)
+        self.graph.move(solution.poses, end)
         self._close(loops, solution.loop_weights)
-        self._parts = joined_parts(self._nodes.segments, self._joining_pairs)
-        if self.largest_move_m > _MOVED_M:
+        self._parts = joined_parts(self.graph.segments, self._joining_pairs)
+        if self.graph.largest_move_m > _MOVED_M:
             self._own_map.map_changed()
-        if self.keys > self.config.most_scans + self.config.most_scans // 10:
+        if len(self.graph) > self.config.most_scans + self.config.most_scans // 10:
             self._thin()
 
     def _corrected(self, poses: np.ndarray, anew: bool = False) -> CorrectedGraph:
         """The solution from these poses ``(keys, 3)`` on; ``anew``, without what the last one believed."""
-        steps, measured = self._nodes.steps_at(poses), self.measurements()[1]
+        steps, measured = self.graph.steps_at(poses), self.measurements()[1]
         problem = GraphProblem(poses, steps, measured, np.ones(len(measured)))
         return self._corrector.correct(problem, None if anew else self._warm_start(problem))
 
     def _found_poses(self, claimed: ScanLoops) -> np.ndarray:
         """Poses of all keys ``(keys, 3)`` with two parts of the map put together as the last claimed loop says."""
-        poses, (earlier, later) = self._nodes.poses.copy(), claimed.pairs[-1]
-        part = self._parts[segment_of(self._nodes.segments, np.arange(self.keys))]
+        poses, (earlier, later) = self.graph.poses.copy(), claimed.pairs[-1]
+        part = self._parts[segment_of(self.graph.segments, np.arange(len(self.graph)))]
         if part[earlier] != part[later]:
             found = compose(poses[earlier], claimed.relative[-1])
             if part[earlier] < part[later]:
@@ -337,12 +318,12 @@ class ScanGraph(BackEnd):
         Neighbouring scans err together, so that small residuals do not say that covariances are stated too large. An
         edge that fits badly says less.
         """
-        steps, loops = self._nodes.published_steps, solution.problem.loops
+        steps, loops = self.graph.published_steps, solution.problem.loops
         parts = (
             (steps, _soft_weights(solution.problem.steps, solution.poses, self.config.kernel)),
             (loops, solution.loop_weights * _soft_weights(loops, solution.poses, self.config.kernel)),
         )
-        return normal_equations(solution.poses, *parts).covariance([self.keys - 1])
+        return normal_equations(solution.poses, *parts).covariance([len(self.graph) - 1])
 
     @property
     def unfinished(self) -> bool:
@@ -362,18 +343,18 @@ class ScanGraph(BackEnd):
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
         every = max(1, -(-self._scans.points // most))
-        placed = self._nodes.poses[: len(self._scans)]  # before the first step the origin has no scan
+        placed = self.graph.poses[: len(self._scans)]  # before the first step the origin has no scan
         parts = [transformed(pose, scan.points[::every]) for pose, scan in zip(placed, self._scans, strict=True)]
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     SAVED = (
-        "_nodes", "_scans", "_finder", "_selection", "_own_map", "_parts", "_claimed", "_waiting", "closed",
+        "graph", "_scans", "_finder", "_selection", "_own_map", "_parts", "_claimed", "_waiting", "closed",
         "_loops_from_nothing", "_scale",
     )  # fmt: skip
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
-        require(len(self._scans) == self.keys, f"there are not {self.keys} key scans")
+        require(len(self._scans) == len(self.graph), f"there are not {len(self.graph)} key scans")
         found = len(self._finder.loops)
         for rows in (self._selection.rows, self._selection.doubted):
             require(bool(((rows >= 0) & (rows < found)).all()), f"loops are named that are not among the {found}")
@@ -385,8 +366,8 @@ class ScanGraph(BackEnd):
         )
         parts, claimed = self._parts, self._claimed
         require(
-            self._own_map.fits(self.keys)
-            and len(parts) <= len(self._nodes.segments)
+            self._own_map.fits(len(self.graph))
+            and len(parts) <= len(self.graph.segments)
             and bool(((parts >= 0) & (parts <= np.arange(len(parts)))).all())
             and bool(((claimed >= 0) & (claimed < len(self._selection))).all()),
             "key scans are searched, parts of the map named, or loops claimed that are not there",
