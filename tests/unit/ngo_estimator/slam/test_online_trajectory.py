@@ -183,13 +183,14 @@ def test_meta_steps_and_features_are_those_of_all_steps_however_far_the_networks
         if count % 8 == 0:
             whole = core._optimizer.aggregate(*(value[:, :count] for value in inputs))
             assert whole.features is not None
-            odometry, first = core._back_end._odometry, max(0, count - window_frames) // 8
+            back_end, first = core._back_end, max(0, count - window_frames) // 8
+            graph, window = back_end.graph, len(back_end._keys)
             for rows, expected in (
-                (odometry.relative, whole.relative),
-                (odometry.std, whole.std),
-                (odometry.features, whole.features),
+                (graph.relative[window:], whole.relative),
+                (np.sqrt(np.diagonal(graph.step_covariance[window:], axis1=1, axis2=2)), whole.std),
+                (back_end._odometry.features.slice(first), whole.features),
             ):
-                np.testing.assert_allclose(rows.slice(first), expected[0, first:].numpy(), rtol=1e-4, atol=1e-5)
+                np.testing.assert_allclose(rows, expected[0, first:].numpy(), rtol=1e-4, atol=1e-5)
 
 
 def test_moved_is_how_far_each_pose_moved() -> None:

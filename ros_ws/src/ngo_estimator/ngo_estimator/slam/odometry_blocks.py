@@ -1,4 +1,4 @@
-"""The odometry of the graph: steps, and the blocks of steps between its nodes."""
+"""The odometry of a graph of meta-poses: steps, and the blocks of steps between its nodes."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,8 @@ import torch
 from ngo_estimator.data.row_buffers import GrowingRows, SlidingRows
 from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
-from ngo_estimator.graph.frames import Frames
+from ngo_estimator.graph.key_frames import KeyFrames
+from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.pose_aggregation import block_variances, poses_in_blocks
@@ -23,9 +24,14 @@ _STD = (1e-6, 1e2)
 
 
 class OdometryBlocks:
-    """Takes steps, and makes blocks of them: registered, aggregated and smoothed.
+    """Takes steps, and makes blocks of them, which it states in the graph: registered, aggregated and smoothed.
 
     Networks leave blocks near unfamiliar frames as they are.
+
+    Args:
+        log: of the steps as they came.
+        graph: its last nodes are the ends of the last blocks; their owner appends the frames.
+        keys: before the window; steps from them stay as they are.
     """
 
     def __init__(
@@ -34,16 +40,16 @@ class OdometryBlocks:
         pair_head: PairHead | None,
         window: int,
         log: Callable[[], StepLog],
-        frames: Frames,
+        graph: PoseGraph,
+        keys: KeyFrames,
     ) -> None:
         self._optimizer, self._pair_head = optimizer, pair_head
         self._block, self._context = optimizer.block, optimizer.config.context
         self._scale = optimizer.config.covariance_scale
-        self._log = log  # of the steps as they came
+        self._log, self._graph, self._keys = log, graph, keys
         registers = pair_head is not None and pair_head.config.registers_odometry
         self.registrations = optimizer.config.registrations if registers else 0
         """Of each step; 0: steps stay as they came."""
-        self._frames = frames  # each last one of a block a node; their owner appends to them
         config = optimizer.config.aggregation
         recalled = -(-_NOTICED_LATE // self._block) + 1
         steps_kept = (2 * self._context + 2 + recalled) * self._block
@@ -52,9 +58,6 @@ class OdometryBlocks:
         self._motion = SlidingRows((config.motion_feature_size,), np.float32, steps_kept)
         self._familiar = SlidingRows((), np.bool_, steps_kept)
         blocks_kept = max(window, self._context) + 2
-        self.relative = SlidingRows((3,), np.float32, blocks_kept)
-        """Relative pose of each block, smoothed if the optimizer has a smoother, and its deviations ``std``."""
-        self.std = SlidingRows((3,), np.float32, blocks_kept)
         self.optimized_std = SlidingRows((3,), np.float64, blocks_kept)
         """Deviations with which the last optimisation believed each block."""
         self.features = SlidingRows((config.width,), np.float32, blocks_kept)
@@ -72,7 +75,7 @@ class OdometryBlocks:
     @property
     def blocks(self) -> int:
         """Whole blocks so far."""
-        return len(self.relative)
+        return len(self.fixed)
 
     @property
     def blind(self) -> np.ndarray:
@@ -100,7 +103,7 @@ class OdometryBlocks:
         first = self.blocks * self._block
         if self._pair_head is None or self.registrations == 0 or not self._familiar.slice(first).all():
             return
-        if self._frames.last_join > first:
+        if self._graph.frames.last_join > first:
             return  # the frames were seen from two places
         before = None if code_before is None else torch.from_numpy(code_before).unsqueeze(0)
         rows = self._relative.slice(first), self._log_std.slice(first), codes
@@ -110,17 +113,23 @@ class OdometryBlocks:
         )
         self._relative.replace(first, relative[0].numpy())
         self._log_std.replace(first, log_std[0].numpy())
-        odometry = torch.from_numpy(self._frames.odometry)
+        odometry = torch.from_numpy(self._graph.frames.odometry)
         odometry[first + 1 :] = se2.compose(odometry[first], se2.r2g(relative[0].double()))
 
     def complete(self) -> None:
-        """Make a block of the newest steps."""
+        """Make a block of the newest steps, and its end a node."""
         in_block, std = self._in_blocks(self.blocks * self._block)
         self._blind.append(self._blind_variance(self.blocks))
-        self.relative.append(in_block[0, 0, -1])
-        self.std.append(std[0])
         self.optimized_std.append(std[0])
         self.fixed.append(False)
+        self._graph.add_node()
+        self._state(self.blocks - 1, in_block[0, :, -1], std)
+
+    def _state(self, first: int, relative: torch.Tensor, std: torch.Tensor) -> None:
+        """State the blocks from number ``first`` on in the graph, with relative poses and deviations ``(n, 3)``."""
+        node = first + len(self._graph) - 1 - self.blocks
+        left = max(0, len(self._keys) - node)  # so many lie before the window by now
+        self._graph.restate(node + left, relative[left:].numpy(), std[left:].double().square().numpy())
 
     def _in_blocks(self, first: int, stop: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Poses within the blocks of steps from number ``first`` on, and the deviations ``(blocks, 3)`` of blocks."""
@@ -147,11 +156,10 @@ class OdometryBlocks:
         relative = se2.between(torch.from_numpy(odometry[:-1]), torch.from_numpy(odometry[1:]))
         self._relative.replace(began, relative.numpy())
         self._log_std.replace(began, np.log(std[: len(relative)].clip(*_STD)))
-        own = torch.from_numpy(self._frames.odometry)
+        own = torch.from_numpy(self._graph.frames.odometry)
         own[began + 1 :] = se2.compose(own[began], se2.r2g(relative))
         in_block, block_std = self._in_blocks(began, self.blocks * self._block)
-        self.relative.replace(first, in_block[0, :, -1].numpy())
-        self.std.replace(first, block_std.numpy())
+        self._state(first, in_block[0, :, -1], block_std)
 
     def _blind_variance(self, block: int) -> np.ndarray:
         """Variance ``(3,)`` of the unfamiliar steps of a block, as the odometry has it."""
@@ -179,12 +187,12 @@ class OdometryBlocks:
         if self._optimizer.config.smoother is not None:
             in_blocks, std = self._in_blocks(*ends)
             stays = torch.from_numpy(fixed).unsqueeze(-1)
-            smoothed = (self.relative, steps.relative[0], in_blocks[0, :, -1]), (self.std, steps.std[0], std)
-            for buffer, smooth, raw in smoothed:
-                buffer.replace(changed, torch.where(stays, raw, smooth)[changed - start :].numpy())
+            raw, smooth = (in_blocks[0, :, -1], std), (steps.relative[0], steps.std[0])
+            stated = (torch.where(stays, *both)[changed - start :] for both in zip(raw, smooth, strict=True))
+            self._state(changed, *stated)
 
     _OF_STEPS = ("_relative", "_log_std", "_motion", "_familiar")
-    _OF_BLOCKS = ("relative", "std", "optimized_std", "fixed")
+    _OF_BLOCKS = ("optimized_std", "fixed")
     SAVED = (*_OF_STEPS, *_OF_BLOCKS, "_blind", "_recalled", "features")
 
     def check_state(self) -> None:
@@ -194,8 +202,8 @@ class OdometryBlocks:
             steps // self._block == blocks == len(self._blind)
             and {len(getattr(self, name)) for name in self._OF_STEPS} == {steps}
             and {len(getattr(self, name)) for name in self._OF_BLOCKS} == {blocks}
-            and len(self._frames) == steps + 1
-            and self._frames.nodes[-1] == self._block * blocks,
+            and len(self._graph.frames) == steps + 1
+            and self._graph.frames.nodes[-1] == self._block * blocks,
             f"{steps} steps and {blocks} meta-poses do not belong together",
         )
         require(self._recalled >= 0, f"frames are recalled from meta-pose {self._recalled} on")

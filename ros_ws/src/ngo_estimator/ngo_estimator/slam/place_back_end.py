@@ -67,7 +67,7 @@ class PlaceBackEnd(BackEnd):
         self._block, self._window = optimizer.block, window
         self._scale = optimizer.config.covariance_scale
         self._log = log  # of the steps as they came
-        self._odometry = OdometryBlocks(optimizer, pair_head, window, log, self.graph.frames)
+        self._odometry = OdometryBlocks(optimizer, pair_head, window, log, self.graph, self._keys)
         self._loops: PlaceLoopFinder | None = None
         self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
@@ -136,17 +136,10 @@ class PlaceBackEnd(BackEnd):
     def _take_in(self) -> bool:
         self._guarded("the registration of steps", self._register)
         self._odometry.complete()
-        self.graph.add_node()
         self._guarded("taking in a meta-pose", self._odometry.aggregate)
-        self._restate()
         self._guarded("the search for loops", self._look_for_loops)
         self._make_room()
         return True
-
-    def _restate(self) -> None:
-        """Have the odometry of the window as it is now."""
-        odometry, first = self._odometry, self._first
-        self.graph.restate(len(self._keys), odometry.relative.slice(first), _variance(odometry.std.slice(first)))
 
     def _register(self) -> None:
         """Measure the newest block again."""
@@ -160,7 +153,6 @@ class PlaceBackEnd(BackEnd):
     def _recall(self) -> None:
         """Take the newest frames back, which were taken for familiar: their loops, and what was registered by them."""
         first = self._odometry.recall()
-        self._restate()
         if self._loops is not None:
             self._loops.recall(first)
 
@@ -339,8 +331,3 @@ def is_due(since: int, seen: int, every: int) -> bool:
     A short trajectory changes a lot with each block.
     """
     return since >= min(every, 1 + seen // 8)
-
-
-def _variance(std: np.ndarray) -> np.ndarray:
-    variance: np.ndarray = std.astype(np.float64) ** 2
-    return variance
