@@ -119,7 +119,7 @@ def test_the_round_trip_holds_where_key_frames_have_gone() -> None:
     core, steps = networks("loops", 1), make_steps(160)
     drive(core, steps[:145], range(0))
     back_end = core._back_end
-    assert len(back_end.graph) < 1 + back_end._odometry.blocks and back_end._solved.information is not None
+    assert len(back_end.graph) < 1 + back_end._odometry.blocks
     loaded = networks("loops", 1).restored(core.state())
     drive(core, steps[145:], range(0)), drive(loaded, steps[145:], range(0))
     assert len(core._back_end.closed)

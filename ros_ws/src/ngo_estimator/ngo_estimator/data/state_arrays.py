@@ -2,8 +2,8 @@
 
 An object saves the attributes that its class names in ``SAVED``, a dataclass all of its fields: arrays, numbers, and
 objects that save something themselves. A new object says what is expected of a saved one: types, shapes (an axis of
-length 0 may have any), and, in ``check_state``, what belongs together. A class with ``state`` and ``restore`` (or
-``from_state``) of its own is asked instead.
+length 0 may have any), and, in ``check_state``, what belongs together. A class with ``state`` and ``restore`` of
+its own is asked instead.
 """
 
 import dataclasses
@@ -48,9 +48,6 @@ def restore(owner: Saved, arrays: Mapping[str, np.ndarray]) -> Saved:
     if hasattr(owner, "restore"):
         owner.restore(arrays)
         return owner
-    if hasattr(owner, "from_state"):
-        other: Saved = owner.from_state(arrays)
-        return other
     return with_attributes(owner, arrays)
 
 

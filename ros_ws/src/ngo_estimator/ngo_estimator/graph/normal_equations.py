@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from ngo_estimator.data.state_arrays import Arrays, require, taken
 from ngo_estimator.geometry.planar_motion import wrap
 from ngo_estimator.graph.block_cholesky import Array, BlockCholesky, BlockStructure, placed
 from ngo_estimator.graph.rounding import RELATIVE_JITTER
@@ -37,22 +36,34 @@ class GraphStructure:
         return np.zeros((unknown, 3, 3)), np.zeros((self.blocks.blocks, 3, 3)), np.zeros((unknown, 3, 1))
 
 
-class FactorisedInformation:
-    """The factorised information matrix of the poses of one graph, node 0 excepted, which is known.
+class NormalEquations:
+    """The factorised normal equations of measured relative poses, linearised at the poses of all nodes.
+
+    Node 0 is known.
 
     Args:
-        structure: of the matrix.
-        diagonal, lower: its blocks, as ``BlockCholesky`` takes them; they stay as they are.
+        structure: of the factors.
+        poses: where they are linearised ``(count, 3)``.
+        relative: measured pose of each factor's second node, seen from its first ``(factors, 3)``.
+        information: inverse covariance of these ``(factors, 3, 3)``, along the axes of the first node.
 
     Raises:
         ArithmeticError: the matrix is not positive definite, as where a pose has no factor at all.
     """
 
-    def __init__(self, structure: BlockStructure, diagonal: Array, lower: Array) -> None:
-        self._structure, self._diagonal, self._lower = structure, diagonal, lower
-        diagonal = diagonal.copy()
+    def __init__(self, structure: GraphStructure, poses: Array, relative: Array, information: Array) -> None:
+        self._structure = structure.blocks
+        diagonal, lower, self._right = structure.empty()
+        _linearise(
+            poses, structure.nodes, relative, information, structure.ranks, structure.place, diagonal, lower,
+            self._right,
+        )  # fmt: skip
         np.einsum("kii->ki", diagonal)[:] *= 1.0 + RELATIVE_JITTER
-        self._factor = BlockCholesky(structure, diagonal, lower.copy())
+        self._factor = BlockCholesky(self._structure, diagonal, lower)
+
+    def solution(self) -> Array:
+        """Changes ``(count, 3)`` of all poses; node 0 stays where it is."""
+        return self.step(self._right.copy())
 
     def step(self, right: Array) -> Array:
         """Changes ``(nodes + 1, 3)`` of all poses, node 0 staying where it is.
@@ -92,47 +103,6 @@ class FactorisedInformation:
         block[~first_below] = block[~first_below].mT
         joint[both, 0, :, 1], joint[both, 1, :, 0] = block, block.mT
         return joint.reshape(-1, 6, 6)
-
-    def state(self) -> Arrays:
-        """The matrix, for ``from_state``."""
-        pairs = np.unique(np.sort(self._structure.pairs, axis=1), axis=0)
-        return {"pairs": pairs, "diagonal": self._diagonal, "lower": self._lower}
-
-    @classmethod
-    def from_state(cls, arrays: Arrays) -> "FactorisedInformation":
-        """The same again, to the last bit; raises ``StateError``."""
-        pairs, diagonal = taken(arrays, "pairs", np.int64, -1, 2), taken(arrays, "diagonal", np.float64, -1, 3, 3)
-        require(bool(((pairs >= 0) & (pairs < len(diagonal))).all()), "blocks are named that are not there")
-        once = np.array_equal(pairs, np.unique(np.sort(pairs, axis=1), axis=0))
-        require(once, "blocks are named twice, or in another order")
-        structure = BlockStructure(pairs, len(diagonal))
-        return FactorisedInformation(structure, diagonal, taken(arrays, "lower", np.float64, structure.blocks, 3, 3))
-
-
-class NormalEquations(FactorisedInformation):
-    """The factorised normal equations of measured relative poses, linearised at the poses of all nodes.
-
-    Args:
-        structure: of the factors.
-        poses: where they are linearised ``(count, 3)``.
-        relative: measured pose of each factor's second node, seen from its first ``(factors, 3)``.
-        information: inverse covariance of these ``(factors, 3, 3)``, along the axes of the first node.
-
-    Raises:
-        ArithmeticError: a pose has no factor at all.
-    """
-
-    def __init__(self, structure: GraphStructure, poses: Array, relative: Array, information: Array) -> None:
-        diagonal, lower, self._right = structure.empty()
-        _linearise(
-            poses, structure.nodes, relative, information, structure.ranks, structure.place, diagonal, lower,
-            self._right,
-        )  # fmt: skip
-        super().__init__(structure.blocks, diagonal, lower)
-
-    def solution(self) -> Array:
-        """Changes ``(count, 3)`` of all poses; node 0 stays where it is."""
-        return self.step(self._right.copy())
 
 
 def diagonal_information(values: Array) -> Array:

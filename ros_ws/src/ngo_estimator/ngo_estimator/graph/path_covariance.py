@@ -1,4 +1,4 @@
-"""How well a graph of key scans knows one of them against another: the covariance along the surest path between them.
+"""How well a graph knows one of its nodes against another: the covariance along the surest path between them.
 
 One path knows less than all of them together, so that the covariance is no smaller than the graph's.
 """
@@ -11,12 +11,12 @@ from ngo_estimator.graph.sparsification import largest_variances
 
 
 def path_covariances(poses: np.ndarray, edges: np.ndarray, covariance: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Covariances ``(n, 3, 3)`` of the second key of each pair ``(n, 2)`` against the first, along the map's axes.
+    """Covariances ``(n, 3, 3)`` of the second node of each pair ``(n, 2)`` against the first, along the map's axes.
 
     Args:
-        poses: of all keys in the map ``(keys, 3)``.
-        edges: keys ``(e, 2)`` that the graph joins, in one piece, with the covariance of each ``(e, 3, 3)``, along the
-            axes of its first key.
+        poses: of all nodes in the map ``(nodes, 3)``.
+        edges: nodes ``(e, 2)`` that the graph joins, in one piece, with the covariance of each ``(e, 3, 3)``, along the
+            axes of its first node.
     """
     count, variance = len(poses), largest_variances(covariance)
     # Of several edges between two keys the path leads over the surest.

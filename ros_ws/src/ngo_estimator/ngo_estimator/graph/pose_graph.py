@@ -74,6 +74,11 @@ class PoseGraph:
         return float(np.hypot(moved[:, 0], moved[:, 1]).max(initial=0.0))
 
     @property
+    def unmoved(self) -> int:
+        """How many nodes came since the last ``move``."""
+        return len(self) - max(1, len(self._before))
+
+    @property
     def since_covariance(self) -> np.ndarray:
         """Covariance ``(3, 3)`` of the newest frame, seen from the last node."""
         return self._since

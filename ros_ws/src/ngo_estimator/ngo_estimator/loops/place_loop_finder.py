@@ -17,7 +17,9 @@ from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
+from ngo_estimator.graph.path_covariance import path_covariances
 from ngo_estimator.graph.pose_graph import PoseGraph
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.loops.loop_closure import Loops, LoopSearch, may_show_one_place
 from ngo_estimator.loops.overlaps import LEAST_SHARED, OVERLAP_LOGIT, shared_views
 from ngo_estimator.loops.pair_measurement import OVERLAP_VIEWS, VIEWS, PairViews, measure_overlaps, measure_pairs
@@ -37,6 +39,9 @@ _MOST_TO_KEY_FRAMES = 128
 
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""
+
+_MOST_DRIFT = 4.0
+"""How much the variance between a key frame and the newest pose is taken to be more than the graph says."""
 
 _Offsets = tuple[tuple[int, int], ...]
 
@@ -62,12 +67,20 @@ class PlaceLoopFinder:
     Args:
         window: blocks in the window.
         graph: its nodes are those of ``keys`` and then those of the window; their owner adds to both.
+        scale: factor of the graph's variances.
     """
 
     def __init__(
-        self, pair_head: PairHead, search: LoopSearch, block: int, window: int, graph: PoseGraph, keys: KeyFrames
+        self,
+        pair_head: PairHead,
+        search: LoopSearch,
+        block: int,
+        window: int,
+        graph: PoseGraph,
+        keys: KeyFrames,
+        scale: float,
     ) -> None:
-        self._pair_head, self._search, self._block = pair_head, search, block
+        self._pair_head, self._search, self._block, self._scale = pair_head, search, block, scale
         self._graph, self._keys = graph, keys
         keep = window * block + 2 * block + MARGIN
         self._codes = SlidingRows((pair_head.config.code_length,), np.float32, keep)
@@ -119,7 +132,25 @@ class PlaceLoopFinder:
         self._find_places(newest)
         if overlaps:
             self._find_overlaps(newest, 1)
-        return np.arange(known, len(self.loops))
+        new = np.arange(known, len(self.loops))
+        self._limit_drift(new[self.loops.start[new] < window])
+        return new
+
+    def _limit_drift(self, new: np.ndarray) -> None:
+        """Limit how far these loops from key frames may be off.
+
+        The odometry alone would let a pose of long ago lie anywhere; the loops that were closed since say more.
+        """
+        loops, graph = self.loops, self._graph
+        closed = loops[loops.weight > BELIEVED]
+        if len(new) and len(closed):
+            covariance = path_covariances(
+                graph.poses,
+                np.concatenate((graph.edges, closed.pairs)),
+                np.concatenate((graph.step_covariance, np.eye(3) / closed.information[:, None])),
+                loops.pairs[new],
+            )
+            loops.most_drift[new] = _MOST_DRIFT * self._scale * np.diagonal(covariance, axis1=1, axis2=2)
 
     def _find_places(self, node: int) -> None:
         """Loops to earlier frames like that of the newest node.

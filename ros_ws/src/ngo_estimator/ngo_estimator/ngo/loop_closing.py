@@ -26,7 +26,7 @@ from ngo_estimator.ngo.loop_gates import (
 from ngo_estimator.ngo.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
 
 if TYPE_CHECKING:
-    from ngo_estimator.graph.normal_equations import FactorisedInformation, GraphStructure
+    from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
 
 OVERLAPS_AFTER = 2
 """Iterations after which poses are good enough to look for frames that see the same walls."""
@@ -92,7 +92,7 @@ class LoopClosing:
             self._weights, self._information = solution.weights.clip(0.0), solution.information.clip(0.0)
             self._shared = np.where(solution.known, solution.weights >= _LEAST_WEIGHT, loops.valid[0].numpy())
         self._take(loops)
-        self._equations: FactorisedInformation | None = None
+        self._equations: NormalEquations | None = None
         self._begun = False
 
     def _take(self, loops: Loops) -> None:

@@ -16,7 +16,7 @@ from ngo_estimator.loops.loop_closure import Loops
 
 if TYPE_CHECKING:
     from ngo_estimator.graph.block_cholesky import Array
-    from ngo_estimator.graph.normal_equations import FactorisedInformation
+    from ngo_estimator.graph.normal_equations import NormalEquations
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class ClosedLoops:
     loops: Loops
     weights: Tensor
     information: Tensor
-    equations: FactorisedInformation | None
+    equations: NormalEquations | None
 
 
 class Solution(NamedTuple):
@@ -157,7 +157,7 @@ class OptimizedMetaPoses:
         return None if self.closed is None else self.closed.information
 
     @property
-    def equations(self) -> FactorisedInformation | None:
+    def equations(self) -> NormalEquations | None:
         """The normal equations of the last Gauss-Newton step, where no gradient was asked for."""
         return None if self.closed is None else self.closed.equations
 

@@ -10,12 +10,11 @@ import numpy as np
 import torch
 
 from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
-from ngo_estimator.data.state_arrays import require, require_ascending
+from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.planar_motion import all_between, chained
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.graph.pose_graph import PoseGraph
-from ngo_estimator.graph.solved_graph import SolvedGraph
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.loops.place_loop_finder import PlaceLoopFinder
 from ngo_estimator.loops.place_loops import PlaceLoops
@@ -73,8 +72,7 @@ class PlaceBackEnd(BackEnd):
         if optimizer.config.loops:
             assert pair_head is not None
             search = optimizer.config.search
-            self._loops = PlaceLoopFinder(pair_head, search, self._block, window, self.graph, self._keys)
-        self._solved = SolvedGraph.none()
+            self._loops = PlaceLoopFinder(pair_head, search, self._block, window, self.graph, self._keys, self._scale)
         self._network_every, self._anneal_every = network_every, anneal_every
         self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
@@ -157,13 +155,9 @@ class PlaceBackEnd(BackEnd):
             self._loops.recall(first)
 
     def _look_for_loops(self) -> None:
-        """Look for loops of the newest node, and limit how far those from key frames may be off."""
-        if self._loops is None:
-            return
-        new = self._loops.find(self.graph.frames.nodes[-1] - self._solved.frames[-1] <= _FRESH * self._block)
-        if len(self._keys) and len(new):
-            loops = self._loops.loops
-            loops.most_drift[new] = self._solved.most_drift(loops.start[new], len(self._keys), self.graph, self._scale)
+        """Look for loops of the newest node."""
+        if self._loops is not None:
+            self._loops.find(self.graph.unmoved <= _FRESH)
 
     def _make_room(self) -> None:
         """Let the window slide, and some key frames go."""
@@ -262,7 +256,6 @@ class PlaceBackEnd(BackEnd):
         moved = poses[-1] - solution[-1]
         self.graph.move(poses, end + np.outer(moved, moved))
         self._odometry.optimized_std.replace(self._first, result.step_std[0, len(self._keys) :].double().numpy())
-        self._solved = SolvedGraph(self.graph.frames.nodes.copy(), result.equations)
 
     def _shrink(self, solution: np.ndarray) -> np.ndarray:
         """Poses of all nodes ``(nodes, 3)``, whose corrections are shrunk across blind stretches."""
@@ -300,7 +293,7 @@ class PlaceBackEnd(BackEnd):
         return Localiser(PlaceMatcher(self._pair_head, places, self._optimizer.config.search))
 
     SAVED = (
-        "graph", "_keys", "_odometry", "_loops", "_solved", "_annealed", "_shrunk", "_corrections", "_origin_code",
+        "graph", "_keys", "_odometry", "_loops", "_annealed", "_shrunk", "_corrections", "_origin_code",
         "closed",
     )  # fmt: skip
 
@@ -313,15 +306,13 @@ class PlaceBackEnd(BackEnd):
             f"{frames} steps, {blocks} meta-poses and {len(self._keys)} key frames do not belong together",
         )
         require(bool(((joined >= 0) & (joined <= frames)).all()), "loops join frames that are not there")
-        given, solved = self._corrections, self._solved.frames
+        given = self._corrections
         shape = self._optimizer.config.iterations if given.last else 0, given.last - given.first
         require(
             0 <= given.first <= given.last <= blocks
             and given.adjustment.shape[:2] == given.stiffness.shape[:2] == shape,
             f"corrections of the blocks {given.first} to {given.last} are given",
         )
-        require(len(solved) > 0 and solved[-1] <= frames, "an optimisation is of nodes that are not there")
-        require_ascending(solved, "frames", frames + 1)
         require(0 <= self._annealed <= blocks, f"loops were judged at meta-pose {self._annealed} of {blocks}")
 
 
