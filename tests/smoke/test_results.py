@@ -15,7 +15,7 @@ from training.data import worlds
 from training.data.feature_store import open_store
 from training.data.worlds import MazeSize, Table, world_named
 from training.scoring.metrics import trajectory_error
-from training.scoring.table_rows import ROWS, Sources, rows_of
+from training.scoring.table_rows import ROWS, rows_of
 
 STEPS = 160
 PREFIXES = (40, 77, STEPS)
@@ -62,8 +62,7 @@ def test_every_row_has_every_number(made: tuple[Path, dict[str, Any]]) -> None:
 
 def test_the_odometrys_row_is_the_mean_of_its_trajectories(made: tuple[Path, dict[str, Any]]) -> None:
     folder, result = made
-    world = world_named("maze2d")
-    sources = Sources(world, folder / "weights", folder / "runs", folder / "results")
+    sources = toy.sources("maze2d", folder)
     store = open_store(sources.store_folder("validation", "cycles"))
     errors = []
     for relative, truth in zip(store["relative"][:3].astype(np.float64), store["truth"][:3], strict=True):
@@ -99,8 +98,7 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
 
 def test_estimates_of_other_weights_are_not_taken_for_these(made: tuple[Path, dict[str, Any]]) -> None:
     folder, result = made
-    world = world_named("maze2d")
-    sources = Sources(world, folder / "weights", folder / "runs", folder / "results")
+    sources = toy.sources("maze2d", folder)
     rows = folder / "runs" / "maze2d" / "rows"
     old, new = rows / "ngo_5-seed0", rows / "ngo_5-seed1"
     kept = {path.name: path.read_bytes() for path in old.iterdir()}

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 import pytest
 
@@ -29,7 +28,7 @@ from training.data.worlds import World, world_named
 from training.report import attention_map, figures
 from training.report.maze_views import maze_and_start
 from training.scoring.network_odometry import open_odometry
-from training.scoring.table_rows import Sources, rows_of
+from training.scoring.table_rows import rows_of
 
 pytestmark = pytest.mark.long
 
@@ -70,14 +69,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
         for module in (figures, attention_map):
             patch.setattr(module, "maze_and_start", drawn_once)
         patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
-        speed = sources(folder).speed_file
+        speed = toy.sources("maze3d", folder).speed_file
         speed.parent.mkdir(parents=True)
         speed.write_text('{"workers": 1, "local_datapoints_per_s": 1000.0}')
         yield folder, results.main(arguments(folder), toy.scripts("maze3d", folder))
-
-
-def sources(folder: Path) -> Sources:
-    return Sources(world_named("maze3d"), folder / "weights", folder / "runs", folder / "results")
 
 
 def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, Any]]) -> None:
@@ -105,12 +100,12 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
 def test_networks_of_their_own_saw_the_same_trajectories(made: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = made
     for table in TABLES:
-        shared = open_store(sources(folder).store_folder("validation", table))
+        shared = open_store(toy.sources("maze3d", folder).store_folder("validation", table))
         for row in ("local_no_action", "deepvo"):
-            own = open_odometry(sources(folder).of_row(row, 0).store_folder("validation", table))
+            own = open_odometry(toy.sources("maze3d", folder).of_row(row, 0).store_folder("validation", table))
             np.testing.assert_array_equal(own["truth"], shared["truth"])
             assert not np.allclose(own["relative"], shared["relative"])
-    driven = [open_store(sources(folder).store_folder("validation", table))["truth"] for table in TABLES]
+    driven = [open_store(toy.sources("maze3d", folder).store_folder("validation", table))["truth"] for table in TABLES]
     assert all(not np.allclose(a, b) for a, b in itertools.combinations(driven, 2))
 
 
@@ -130,18 +125,6 @@ def test_the_optimizer_learns_from_the_other_driver_and_the_smoother_does_not(
     assert of_optimizers and all(stores == ["train", "train_policy"] for stores in of_optimizers)
 
 
-def test_the_page_shows_tables_and_figures(made: tuple[Path, dict[str, Any]]) -> None:
-    folder, _ = made
-    page = (folder / "docs" / "results_maze3d.md").read_text()
-    for name in TABLES:
-        assert f"## Table `{name}`" in page
-    images = sorted((folder / "docs" / "images").iterdir())
-    assert len(images) >= 4
-    for image in images:
-        assert f"(images/{image.name})" in page
-        assert matplotlib.image.imread(image).std() > 0.01
-
-
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
     networks = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_place, train_smoother)
@@ -155,11 +138,11 @@ def test_odometry_of_another_network_is_not_mixed_in(made: tuple[Path, dict[str,
     from training.scoring.network_odometry import make_odometry
 
     folder, _ = made
-    store = sources(folder).of_row("deepvo", 0).store_folder("validation", "seen")
+    store = toy.sources("maze3d", folder).of_row("deepvo", 0).store_folder("validation", "seen")
     kept = (store / "networks.json").read_text()
     try:
         (store / "networks.json").write_text('["another"]')
         with pytest.raises(RunError, match="made with another network"):
-            make_odometry("deepvo", sources(folder), "validation", "seen", 2)
+            make_odometry("deepvo", toy.sources("maze3d", folder), "validation", "seen", 2)
     finally:
         (store / "networks.json").write_text(kept)

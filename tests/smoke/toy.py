@@ -25,6 +25,7 @@ from training import (
 )
 from training.common.precision import Precision
 from training.data import episodes, streams, worlds
+from training.scoring.table_rows import Sources
 
 PRECISION: Precision = "32-true"
 """With "auto" each training would first measure which one is faster."""
@@ -165,3 +166,8 @@ def results_of(world: Any, folder: Path, **changes: Any) -> results.Arguments:
         docs=folder / "docs",
         **changes,
     )
+
+
+def sources(world: str, folder: Path) -> Sources:
+    """Where ``results_of`` finds and keeps things."""
+    return Sources(worlds.world_named(world), folder / "weights", folder / "runs", folder / "results")
