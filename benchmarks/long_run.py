@@ -35,7 +35,7 @@ from benchmarks.process_use import memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.graph.pose_graph import PoseGraph
-from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
+from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
@@ -199,7 +199,7 @@ def _scans(drive: LidarDrive, odometry: MixtureLidar, core: ScanTrajectory) -> I
 
 def stored_path_mb(core: CorrectedTrajectory) -> float:
     """What of the trajectory has to be kept for every frame."""
-    owners = PoseGraph | OdometryBlocks | ScanLoopSelection
+    owners = PoseGraph | OdometryBlocks | ScanLoopFinder
     parts = (core, core._log, *(part for part in vars(core._back_end).values() if isinstance(part, owners)))
     rows = [value for part in parts for value in vars(part).values() if isinstance(value, GrowingRows)]
     return sum(each.values.nbytes for each in rows) / 2**20

@@ -15,7 +15,6 @@ from mcap.writer import CompressionType, Writer
 from ngo_recordings.definitions import message_definition
 from ngo_recordings.errors import RecordingError
 
-_NS = 1_000_000_000
 # What rosbag2 writes for "no limit".
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 

@@ -14,7 +14,7 @@ from ngo_estimator.geometry.scan_points import key_scan
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
-from ngo_estimator.loops.scan_settings import ScanLoopConfig, WindowConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig, ScanLoopConfig, WindowConfig
 from tests.unit.ngo_estimator.loops.buildings import (
     HALLWAY,
     MOUNTING,
@@ -36,7 +36,7 @@ def found(
     scans: list[KeyScan], poses: np.ndarray, config: ScanLoopConfig | None = None, windows: WindowConfig | None = None
 ) -> ScanLoops:
     """All loops of keys that come one by one, under poses that no loop corrects."""
-    finder = ScanLoopFinder(config or ScanLoopConfig())
+    finder = ScanLoopFinder(ScanGraphConfig(config or ScanLoopConfig()))
     for count in range(1, len(scans) + 1):
         seen = poses[:count]
         # These poses stay as they are, so that their drift goes on through the loops.
@@ -80,7 +80,7 @@ def test_the_same_keys_give_the_same_loops() -> None:
 
 
 def test_a_loop_is_accepted_when_a_neighbour_agrees() -> None:
-    scans, finder = scanned(HALLWAY, TWICE), ScanLoopFinder(ScanLoopConfig(most_per_key=1))
+    scans, finder = scanned(HALLWAY, TWICE), ScanLoopFinder(ScanGraphConfig(ScanLoopConfig(most_per_key=1)))
     for count in range(1, len(scans) + 1):
         fresh = finder.find(scans[:count], TWICE[:count], np.tile((0.5, 0.5, 0.2), (count, 1)))
         assert finder.loops.accepted[fresh].all()
@@ -96,7 +96,7 @@ def test_a_loop_is_accepted_when_a_neighbour_agrees() -> None:
 
 def test_work_and_memory_for_a_key_are_bounded() -> None:
     config = ScanLoopConfig(most_per_key=1, most_submaps=2)
-    scans, finder = scanned(HALLWAY, TWICE), ScanLoopFinder(config)
+    scans, finder = scanned(HALLWAY, TWICE), ScanLoopFinder(ScanGraphConfig(config))
     for count in range(1, len(scans) + 1):
         finder.find(scans[:count], TWICE[:count], np.tile((0.5, 0.5, 0.2), (count, 1)))
         assert len(finder._submaps) <= 2
@@ -166,9 +166,9 @@ def test_scans_that_see_nothing_have_no_loops() -> None:
 def test_wrong_shapes_are_refused() -> None:
     scans = scanned(HALLWAY, TWICE[:2])
     with pytest.raises(ValueError, match="expected \\(keys, 3\\)"):
-        ScanLoopFinder(ScanLoopConfig()).find(scans, TWICE[:3], np.ones((2, 3)))
+        ScanLoopFinder(ScanGraphConfig()).find(scans, TWICE[:3], np.ones((2, 3)))
     with pytest.raises(ValueError, match="narrowest"):
-        ScanLoopFinder(ScanLoopConfig(every=1)).find(scans, TWICE[:2], np.zeros((2, 3)))
+        ScanLoopFinder(ScanGraphConfig(ScanLoopConfig(every=1))).find(scans, TWICE[:2], np.zeros((2, 3)))
 
 
 @pytest.mark.skipif("NGO_LIDAR_LOGS" not in os.environ, reason="NGO_LIDAR_LOGS, the folder of real logs, is not set")

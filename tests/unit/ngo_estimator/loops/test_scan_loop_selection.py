@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ngo_estimator.graph.pose_graph import PoseGraph
-from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
+from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 
@@ -29,19 +29,20 @@ def loop(relative: tuple[float, float, float], agreeing: int) -> ScanLoops:
 
 @pytest.mark.parametrize(("off_m", "redundant", "used"), [(0.0, 1e6, 0), (0.0, 1.0, 1), (5.0, 1e6, 1)])
 def test_a_loop_is_used_where_it_tells_something_new(off_m: float, redundant: float, used: int) -> None:
-    selection, found = ScanLoopSelection(ScanGraphConfig(redundant=redundant)), loop((9.0 + off_m, 0.0, 0.0), 1)
-    believed = selection.believed(np.zeros(1, np.int64), found, straight(10))
+    finder = ScanLoopFinder(ScanGraphConfig(redundant=redundant))
+    believed = finder.believed(finder.add(loop((9.0 + off_m, 0.0, 0.0), 1)), straight(10))
     assert len(believed) == 1
-    assert selection.use(believed, found, straight(10)) == (off_m > 0.0)
-    assert len(selection) == used
+    assert finder.use(believed, straight(10)) == (off_m > 0.0)
+    assert len(finder.used) == used
 
 
 def test_a_doubted_loop_waits_until_enough_loops_agree() -> None:
     config = ScanGraphConfig(agreeing_beyond=5)
-    selection, lost = ScanLoopSelection(config), straight(10)
+    finder, lost = ScanLoopFinder(config), straight(10)
     lost.step_covariance[:] = np.eye(3)
-    nothing = np.zeros(0, np.int64)
-    assert len(selection.believed(np.zeros(1, np.int64), loop((9.0, 0.0, 0.0), 4), lost)) == 0
-    assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 4), lost)) == 0
-    assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 5), lost)) == 1
-    assert len(selection.believed(nothing, loop((9.0, 0.0, 0.0), 5), lost)) == 0
+    fresh, nothing = finder.add(loop((9.0, 0.0, 0.0), 4)), np.zeros(0, np.int64)
+    assert len(finder.believed(fresh, lost)) == 0
+    assert len(finder.believed(nothing, lost)) == 0
+    finder.loops = loop((9.0, 0.0, 0.0), 5)
+    assert len(finder.believed(nothing, lost)) == 1
+    assert len(finder.believed(nothing, lost)) == 0

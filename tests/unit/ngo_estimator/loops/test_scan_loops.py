@@ -6,7 +6,7 @@ import pytest
 from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
-from ngo_estimator.loops.scan_settings import ScanLoopConfig
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 
 
 def some_loops(*pairs: tuple[int, int]) -> ScanLoops:
@@ -24,10 +24,10 @@ def test_loops_come_back_from_their_state() -> None:
 
 
 def test_a_state_with_loops_of_other_keys_is_refused() -> None:
-    finder = ScanLoopFinder(ScanLoopConfig())
+    finder = ScanLoopFinder(ScanGraphConfig())
     finder.loops = some_loops((0, 5))
     with pytest.raises(StateError, match="not among the 0"):
-        restore(ScanLoopFinder(ScanLoopConfig()), state_of(finder))
+        restore(ScanLoopFinder(ScanGraphConfig()), state_of(finder))
 
 
 def test_wrong_shapes_are_refused() -> None:

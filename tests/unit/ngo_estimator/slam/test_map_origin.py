@@ -31,7 +31,7 @@ def test_a_quarter_turn_solved_by_hand() -> None:
 
 
 def test_an_uncertain_heading_widens_across_with_the_distance() -> None:
-    origin = MapOrigin.of_first_pose(np.array([1.0, 1.0, 0.0]), np.diag([0.01, 0.04, 0.09]))
+    origin = MapOrigin.of_pose(np.zeros(3), np.array([1.0, 1.0, 0.0]), np.diag([0.01, 0.04, 0.09]))
     at_given = origin.covariance_of(np.array([1.0, 1.0, 0.0]), np.zeros((3, 3)))
     np.testing.assert_allclose(at_given, np.diag([0.01, 0.04, 0.09]))
     ahead = origin.covariance_of(np.array([11.0, 1.0, 0.0]), np.zeros((3, 3)))

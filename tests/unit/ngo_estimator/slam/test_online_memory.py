@@ -184,8 +184,8 @@ def test_what_is_kept_does_not_grow() -> None:
         core.update(step)
         if count % LAP == 0:
             back_end = core._back_end
-            assert back_end._loops is not None
-            sizes.append((len(back_end._keys), len(back_end._loops.loops), back_end._loops._codes._buffer.size))
+            assert back_end._finder is not None
+            sizes.append((len(back_end._keys), len(back_end._finder.loops), back_end._finder._codes._buffer.size))
     assert max(size[0] for size in sizes) <= 16 + 32
     assert sizes[-1][1] <= 1.3 * sizes[1][1] and sizes[-1][2] == sizes[0][2]
 

@@ -94,7 +94,7 @@ def first_loop(scans: list[KeyScan], config: ScanGraphConfig, step_std: tuple[fl
     return len(scans), 0
 
 
-@pytest.mark.parametrize("name", ["_selection._used.rows", "_selection.doubted"])
+@pytest.mark.parametrize("name", ["_finder._used.rows", "_finder.doubted"])
 def test_a_state_with_loops_that_are_not_there_is_refused(name: str) -> None:
     with pytest.raises(StateError, match="not among the 0"):
         restore(ScanBackEnd(ScanGraphConfig()), {**state_of(driven(np.ones(3))), name: np.array((3,))})

@@ -50,5 +50,10 @@ class LoopRecord:
         """These loops, then the others."""
         return type(self)(*map(np.concatenate, zip(self._columns(), others._columns(), strict=True)))
 
+    def frames(self, nodes: np.ndarray) -> np.ndarray:
+        """The frames that the loops join ``(n, 2)``, of nodes that are the frames ``nodes`` ``(nodes,)``."""
+        joined: np.ndarray = nodes[self.pairs]
+        return joined
+
     def _columns(self) -> list[np.ndarray]:
         return [getattr(self, field.name) for field in dataclasses.fields(self)]

@@ -117,7 +117,6 @@ class PlaceLoopFinder:
         """Place codes ``(n, code_length)`` of the frames after the steps from number ``first`` on, without a copy."""
         return self._codes.slice(first)
 
-    @torch.inference_mode()
     def find(self, fresh: bool) -> np.ndarray:
         """Loops of the newest node; ``fresh``: poses are good enough to say what frames share.
 
@@ -364,17 +363,18 @@ class PlaceLoopFinder:
         self._embeddings.slice(first)[:] = 0.0
         self.loops = self.loops[self._begins[self.loops.end] <= first]
 
-    def drop(self, chosen: np.ndarray) -> None:
-        """Take out for good the loops of a mask ``(n,)``."""
+    def drop(self, chosen: np.ndarray) -> int:
+        """See ``LoopFinder.drop``."""
         self._dropped = np.concatenate((self._dropped, self._begins[self.loops.pairs[chosen]]))
         self.loops = self.loops[~chosen]
+        return int(chosen.sum())
 
     def edges(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
         loops, odometry = self.loops[rows], self._odometry
-        begins, frame = self._begins[loops.pairs], loops.frame + 1
-        in_block = all_between(odometry[begins[:, 0]], odometry[frame])
-        return np.stack((frame, begins[:, 1]), axis=1), all_between(in_block, loops.relative)
+        frames = loops.frames(self._begins)
+        in_block = all_between(odometry[self._begins[loops.start]], odometry[frames[:, 0]])
+        return frames, all_between(in_block, loops.relative)
 
 
 def _at(offsets: _Offsets, which: int) -> np.ndarray:

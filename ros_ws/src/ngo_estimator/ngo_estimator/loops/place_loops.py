@@ -52,6 +52,10 @@ class PlaceLoops(LoopRecord):
         """The later node of each ``(n,)``."""
         return self.pairs[:, 1]
 
+    def frames(self, nodes: np.ndarray) -> np.ndarray:
+        """See ``LoopRecord.frames``; a loop begins at a frame near its earlier node."""
+        return np.stack((self.frame + 1, nodes[self.end]), axis=1)
+
     @classmethod
     def found(
         cls,

@@ -4,6 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -30,12 +31,25 @@ class ClosedLoops(LoopRecord):
     weight: np.ndarray = rows(np.float64)
 
 
+class LoopFinder(Protocol):
+    """Finds loops of each new node, when its back end asks for them, and keeps those that were found."""
+
+    @property
+    def loops(self) -> LoopRecord:
+        """All that are kept, between nodes."""
+
+    def drop(self, chosen: np.ndarray) -> int:
+        """Take out for good the loops of a mask ``(n,)``; returns how many of them the graph used."""
+
+
 class BackEnd(ABC):
     """Follows frames by odometry; a node makes work due: the search for its loops, and an optimisation.
 
     Args:
         graph: owns all poses in ``map``.
     """
+
+    _finder: LoopFinder | None
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
@@ -119,9 +133,18 @@ class BackEnd(ABC):
             self._guarded("an optimisation", self._optimise)
         return removed
 
-    @abstractmethod
     def _drop_loops(self, which: WhichLoops) -> int:
-        """Forget the loops that ``which`` chooses; the next optimisation begins without what it knew of loops."""
+        """Forget the loops that ``which`` chooses; returns how many of them the graph used."""
+        if self._finder is None:
+            return 0
+        removed = self._finder.drop(which(self._finder.loops.frames(self.graph.frames.nodes)))
+        if removed:
+            self._forget_solution()
+        return removed
+
+    @abstractmethod
+    def _forget_solution(self) -> None:
+        """Let the next optimisation begin without what the last one thought of loops."""
 
     @property
     def waiting_loops(self) -> int:

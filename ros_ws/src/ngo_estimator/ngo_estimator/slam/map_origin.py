@@ -21,9 +21,9 @@ class MapOrigin:
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @classmethod
-    def of_first_pose(cls, pose_xyyaw: np.ndarray, covariance: np.ndarray | None = None) -> "MapOrigin":
+    def of_first_pose(cls, pose_xyyaw: np.ndarray) -> "MapOrigin":
         """The first pose of the trajectory is ``pose_xyyaw`` (3,) in ``map``."""
-        return cls.of_pose(np.zeros(3), pose_xyyaw, covariance)
+        return cls.of_pose(np.zeros(3), pose_xyyaw)
 
     @classmethod
     def of_pose(

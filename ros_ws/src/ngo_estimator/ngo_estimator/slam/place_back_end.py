@@ -21,7 +21,7 @@ from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.meta_poses import MetaSteps, OptimizedMetaPoses, Solution
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
-from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, WhichLoops, require_sound
+from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, require_sound
 from ngo_estimator.slam.blind_stretches import shrunk_corrections, summed_variances
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
@@ -50,6 +50,8 @@ class PlaceBackEnd(BackEnd):
     ``anneal_every``-th block all loops are judged from the odometry on; between, only new ones.
     """
 
+    _finder: PlaceLoopFinder | None
+
     def __init__(
         self,
         optimizer: NeuralGraphOptimizer,
@@ -67,12 +69,12 @@ class PlaceBackEnd(BackEnd):
         self._scale = optimizer.config.covariance_scale
         self._log = log  # of the steps as they came
         self._odometry = OdometryBlocks(optimizer, pair_head, window, log, self.graph, self._keys)
-        self._loops: PlaceLoopFinder | None = None
+        self._finder = None
         self._origin_code = np.zeros(0, np.float32)  # none
         if optimizer.config.loops:
             assert pair_head is not None
             search = optimizer.config.search
-            self._loops = PlaceLoopFinder(pair_head, search, self._block, window, self.graph, self._keys, self._scale)
+            self._finder = PlaceLoopFinder(pair_head, search, self._block, window, self.graph, self._keys, self._scale)
         self._network_every, self._anneal_every = network_every, anneal_every
         self._shrunk = False  # whether corrections of the last result were shrunk
         self._annealed = 0  # blocks when all loops were judged last
@@ -108,8 +110,8 @@ class PlaceBackEnd(BackEnd):
                 self._recall()
         self.graph.append(taken.relative.astype(np.float64), np.diag(variance.astype(np.float64)), taken.joins)
         self._odometry.append(taken.relative, variance, step.motion_feature, familiar)
-        if self._loops is not None:
-            self._loops.append(code)
+        if self._finder is not None:
+            self._finder.append(code)
 
     @property
     def _has_new_node(self) -> bool:
@@ -127,10 +129,6 @@ class PlaceBackEnd(BackEnd):
         return int(self.graph.frames.nodes[len(self._keys)]) // self._block
 
     @torch.inference_mode()
-    def work(self, optimize: bool = True) -> bool:
-        """Take in the block that is complete, if there is one, and optimise; see ``BackEnd.work``."""
-        return super().work(optimize)
-
     def _take_in(self) -> bool:
         self._guarded("the registration of steps", self._register)
         self._odometry.complete()
@@ -141,35 +139,35 @@ class PlaceBackEnd(BackEnd):
 
     def _register(self) -> None:
         """Measure the newest block again."""
-        if self._loops is None or self._odometry.registrations == 0:
+        if self._finder is None or self._odometry.registrations == 0:
             return
         first = self._odometry.blocks * self._block
-        before = self._origin_code if first == 0 else self._loops.codes(first - 1)[0]
-        self._odometry.register(self._loops.codes(first), before if len(before) else None)
+        before = self._origin_code if first == 0 else self._finder.codes(first - 1)[0]
+        self._odometry.register(self._finder.codes(first), before if len(before) else None)
 
     @torch.inference_mode()
     def _recall(self) -> None:
         """Take the newest frames back, which were taken for familiar: their loops, and what was registered by them."""
         first = self._odometry.recall()
-        if self._loops is not None:
-            self._loops.recall(first)
+        if self._finder is not None:
+            self._finder.recall(first)
 
     def _look_for_loops(self) -> None:
         """Look for loops of the newest node."""
-        if self._loops is not None:
-            self._loops.find(self.graph.unmoved <= _FRESH)
+        if self._finder is not None:
+            self._finder.find(self.graph.unmoved <= _FRESH)
 
     def _make_room(self) -> None:
         """Let the window slide, and some key frames go."""
         while len(self.graph) - 1 - len(self._keys) > self._window:
             self._keys.add(self._key_frame())
-            if self._loops is not None:
-                self._loops.leave()
+            if self._finder is not None:
+                self._finder.leave()
         if self._keys.crowded:
             keep, keys = np.ones(len(self.graph), bool), len(self._keys)
             keep[:keys] = self._keys.thin(self.graph.poses[:keys], self.graph.relative[:keys])
-            if self._loops is not None:
-                self._loops.thin(keep, keys)
+            if self._finder is not None:
+                self._finder.thin(keep, keys)
             self.graph.let_go(keep)
 
     def _key_frame(self) -> KeyFrame:
@@ -177,11 +175,12 @@ class PlaceBackEnd(BackEnd):
         first = len(self._keys)
         believed = self._odometry.optimized_std.slice(self._first, self._first + 1)
         self.graph.restate(first, all_between(*self.graph.poses[first : first + 2, None]), believed**2)
-        if self._loops is not None:
-            return self._loops.key_frame()
+        if self._finder is not None:
+            return self._finder.key_frame()
         nothing = np.zeros((self._block, 0), np.float32)
         return KeyFrame(nothing, nothing, np.zeros((self._block, 3)))
 
+    @torch.inference_mode()
     def _optimise(self) -> None:
         """Optimise all nodes of the window and the key frames before it."""
         odometry, first, blocks = self._odometry, self._first, self._odometry.blocks
@@ -198,11 +197,11 @@ class PlaceBackEnd(BackEnd):
         if (fixed := odometry.fixed.slice(first)).any():
             steps = replace(steps, fixed=torch.from_numpy(fixed.copy()).unsqueeze(0))
         loops, rows, solution = None, np.zeros(0, np.int64), None
-        if self._loops is not None:
-            loops, rows = self._loops.for_optimizer()
+        if self._finder is not None:
+            loops, rows = self._finder.for_optimizer()
             loops = self._verified(loops)
             if not self._annealing_is_due:
-                known_loops, poses = self._loops.loops[rows], self.graph.poses
+                known_loops, poses = self._finder.loops[rows], self.graph.poses
                 steps_solved = torch.from_numpy(all_between(poses[:-1], poses[1:])).unsqueeze(0)
                 solution = Solution(steps_solved, known_loops.weight, known_loops.information)
         corrections = None if known is None else known.for_blocks(first, blocks)
@@ -246,11 +245,11 @@ class PlaceBackEnd(BackEnd):
 
     def _apply(self, result: OptimizedMetaPoses, rows: np.ndarray, end: np.ndarray) -> None:
         """Take the result; how far the last node is from it adds to its covariance ``end``."""
-        if self._loops is not None and result.loop_weights is not None and result.loop_information is not None:
+        if self._finder is not None and result.loop_weights is not None and result.loop_information is not None:
             weight, information = (of[0].double().numpy() for of in (result.loop_weights, result.loop_information))
             std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
-            self.closed = ClosedLoops(*self._loops.edges(rows), std, weight)
-            self._loops.weigh(rows, weight, information)
+            self.closed = ClosedLoops(*self._finder.edges(rows), std, weight)
+            self._finder.weigh(rows, weight, information)
         solution = chained(result.meta_relative[-1][0].double().numpy())
         poses = self._shrink(solution)
         moved = poses[-1] - solution[-1]
@@ -265,35 +264,24 @@ class PlaceBackEnd(BackEnd):
             return solution
         log = self._log().odometry.values
         odometry = se2.between(log[0], log[self.graph.frames.nodes])
-        loops = PlaceLoops.none() if self._loops is None else self._loops.loops
+        loops = PlaceLoops.none() if self._finder is None else self._finder.loops
         variances = summed_variances(blind, self._blocks_before)
         shrunk = shrunk_corrections(solution, odometry, variances, loops.pairs, loops.weight)
         self._shrunk = bool(np.abs(shrunk - solution).max() > _SHRUNK)
         return shrunk
 
-    def _drop_loops(self, which: WhichLoops) -> int:
-        if self._loops is None:
-            return 0
-        chosen = which(self._loops.edges(np.arange(len(self._loops.loops)))[0])
-        if chosen.any():
-            self._loops.drop(chosen)
-            self._annealed, self._corrections = 0, NetworkCorrections.none()
-        return int(chosen.sum())
-
-    @torch.inference_mode()
-    def remove_loops(self, which: WhichLoops) -> int:
-        """See ``BackEnd.remove_loops``."""
-        return super().remove_loops(which)
+    def _forget_solution(self) -> None:
+        self._annealed, self._corrections = 0, NetworkCorrections.none()
 
     def localiser(self, origin: MapOrigin) -> Localiser:
         """Localises by the frames whose place codes are kept; raises ``ValueError`` where none are."""
-        if self._loops is None or self._pair_head is None:
+        if self._finder is None or self._pair_head is None:
             raise ValueError("the optimizer closes no loops, and keeps no place codes; expected one with loops")
-        places = self._loops.places(origin.poses(self.graph.frame_poses()))
+        places = self._finder.places(origin.poses(self.graph.frame_poses()))
         return Localiser(PlaceMatcher(self._pair_head, places, self._optimizer.config.search))
 
     SAVED = (
-        "graph", "_keys", "_odometry", "_loops", "_annealed", "_shrunk", "_corrections", "_origin_code",
+        "graph", "_keys", "_odometry", "_finder", "_annealed", "_shrunk", "_corrections", "_origin_code",
         "closed",
     )  # fmt: skip
 

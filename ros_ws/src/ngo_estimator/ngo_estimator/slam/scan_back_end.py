@@ -20,12 +20,11 @@ from ngo_estimator.graph.segments import joined_parts, segment_of
 from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
-from ngo_estimator.loops.scan_loop_selection import ScanLoopSelection
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.thinned_loops import without_nodes
 from ngo_estimator.loops.walls_seen_through import profile_rays
-from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, WhichLoops, require_sound
+from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, require_sound
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
@@ -45,13 +44,14 @@ _MOVED_M = 0.5
 class ScanBackEnd(BackEnd):
     """Takes frames, keeps key scans and their loops, and optimises all of them together."""
 
+    _finder: ScanLoopFinder
+
     def __init__(self, config: ScanGraphConfig) -> None:
         self._floor = np.diag((config.step_m**2, config.step_m**2, math.radians(config.step_deg) ** 2))
         super().__init__(PoseGraph(self._floor))
         self.config = config
         self._scans = KeyScanStore()
-        self._finder = ScanLoopFinder(config.loops)
-        self._selection = ScanLoopSelection(config)
+        self._finder = ScanLoopFinder(config)
         self._is_key = False  # whether the newest frame is a node, whose loops nobody has looked for
         self._corrector: Corrector = Robust(least_scale=1.0)
         # Loops when the graph was last solved without a warm start, and the scale of variances that was found.
@@ -139,9 +139,9 @@ class ScanBackEnd(BackEnd):
             windows = distance_windows(self.config.windows, distances)
             fresh = self._finder.find(self._scans, chain.poses, windows, segments=chain.borders)
             self._scans.compact()
-            believed = self._selection.believed(fresh, self._finder.loops, chain)
+            believed = self._finder.believed(fresh, chain)
             if len(believed):
-                surprises = self._selection.use(believed, self._finder.loops, chain)
+                surprises = self._finder.use(believed, chain)
                 waited = self._wait - len(chain) // _KEYS_PER_SURPRISED if surprises else 1
                 self._waiting = max(self._waiting, waited)
             self._parts = joined_parts(chain.segments, joining)
@@ -159,9 +159,9 @@ class ScanBackEnd(BackEnd):
     def _claim(self, loops: ScanLoops) -> None:
         """Take loops by which the robot was found again in its own map; the next optimisation judges them."""
         if len(loops):
-            first = len(self._selection)
-            self._selection.use(self._finder.add(loops), self._finder.loops, self.graph)
-            self._claimed = np.concatenate((self._claimed, np.arange(first, len(self._selection))))
+            first = len(self._finder.used)
+            self._finder.use(self._finder.add(loops), self.graph)
+            self._claimed = np.concatenate((self._claimed, np.arange(first, len(self._finder.used))))
             self._waiting = self._wait + 1
 
     def _part_newest_segment(self) -> None:
@@ -173,7 +173,8 @@ class ScanBackEnd(BackEnd):
     @property
     def _joining_pairs(self) -> np.ndarray:
         """Keys ``(n, 2)`` that loops join: of two segments only where the last optimisation believed the loop."""
-        pairs, weight = self._finder.loops.pairs[self._selection.rows], np.zeros(len(self._selection))
+        pairs = self._finder.loops.pairs[self._finder.used]
+        weight = np.zeros(len(pairs))
         weight[: len(self.closed)] = self.closed.weight
         first, last = segment_of(self.graph.segments, pairs).T
         return pairs[(first == last) | (weight > BELIEVED)]
@@ -197,22 +198,12 @@ class ScanBackEnd(BackEnd):
         leaves = redundant_nodes(chain.poses, chain.borders, part, stays, count - self.config.most_scans)
         if leaves.any():
             thinned = without_nodes(chain.poses, chain.steps, loops, self.closed.weight, leaves)
-            found, rows = self._finder.loops, self._selection.rows
-            # Others may still agree with one that comes, where they are new.
-            newest = (found.pairs[:, 1] >= count - self._newest) & ~leaves[found.pairs].any(1)
-            newest[rows] = False
-            unused = np.flatnonzero(newest)
-            number = np.cumsum(~leaves) - 1
-            kept = replace(thinned.loops, pairs=number[thinned.loops.pairs])
-            others = replace(found[unused], pairs=number[found.pairs[unused]])
-            doubted = len(kept) + np.flatnonzero(np.isin(unused, self._selection.doubted))
             chain.let_go(~leaves, thinned.bridges)
             self._scans.thin(~leaves)
-            self._finder.thin(~leaves, kept.extended(others))
-            self._selection.replace(np.arange(len(kept)), doubted)
+            self._finder.thin(~leaves, thinned.loops, self._newest)
             self._own_map.thin(~leaves)
-            self._loops_from_nothing = min(self._loops_from_nothing, len(kept))
-            self._close(kept, thinned.weights)
+            self._loops_from_nothing = min(self._loops_from_nothing, len(thinned.loops))
+            self._close(self.used_loops, thinned.weights)
 
     @property
     def _newest(self) -> int:
@@ -238,7 +229,7 @@ class ScanBackEnd(BackEnd):
     @property
     def used_loops(self) -> ScanLoops:
         """The loops that the graph needs."""
-        return self._finder.loops[self._selection.rows]
+        return self._finder.loops[self._finder.used]
 
     def measurements(self) -> tuple[RelativePoses, RelativePoses]:
         """The steps from each node to the next, and the loops that the graph needs."""
@@ -246,22 +237,18 @@ class ScanBackEnd(BackEnd):
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self.graph.steps, measured
 
-    def _drop_loops(self, which: WhichLoops) -> int:
-        frames, found = self.graph.frames.nodes, self._finder.loops
-        removed = self._selection.drop(lambda rows: which(frames[found.pairs[rows]]))
-        if removed:
-            self.closed, self._loops_from_nothing = ClosedLoops.none(), 0
-            self._claimed = self._claimed[:0]  # they are numbered by the loops that are used
-        return removed
+    def _forget_solution(self) -> None:
+        self.closed, self._loops_from_nothing = ClosedLoops.none(), 0
+        self._claimed = self._claimed[:0]  # they are numbered by the loops that are used
 
     @property
     def waiting_loops(self) -> int:
         """Loops that wait for an optimisation, or for others that agree."""
-        return len(self._selection) - len(self.closed) + len(self._selection.doubted)
+        return len(self._finder.used) - len(self.closed) + len(self._finder.doubted)
 
     def belief(self) -> np.ndarray:
         """Of the last optimisation in each of ``measurements``' loops ``(n,)``; NaN in those that came since."""
-        return np.concatenate((self.closed.weight, np.full(len(self._selection) - len(self.closed), np.nan)))
+        return np.concatenate((self.closed.weight, np.full(len(self._finder.used) - len(self.closed), np.nan)))
 
     def _optimise(self) -> None:
         self._waiting = 0
@@ -338,7 +325,7 @@ class ScanBackEnd(BackEnd):
     def finish(self) -> bool:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
         self.fault = ""
-        return len(self._selection) > 0 and self._guarded("an optimisation", self._optimise)
+        return len(self._finder.used) > 0 and self._guarded("an optimisation", self._optimise)
 
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans in the map, thinned to about ``most``."""
@@ -348,20 +335,17 @@ class ScanBackEnd(BackEnd):
         return np.concatenate(parts) if parts else np.zeros((0, 2))
 
     SAVED = (
-        "graph", "_scans", "_finder", "_selection", "_own_map", "_parts", "_claimed", "_waiting", "closed",
+        "graph", "_scans", "_finder", "_own_map", "_parts", "_claimed", "_waiting", "closed",
         "_loops_from_nothing", "_scale",
     )  # fmt: skip
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
         require(len(self._scans) == len(self.graph), f"there are not {len(self.graph)} key scans")
-        found = len(self._finder.loops)
-        for rows in (self._selection.rows, self._selection.doubted):
-            require(bool(((rows >= 0) & (rows < found)).all()), f"loops are named that are not among the {found}")
-        joined = self.closed.pairs
+        joined, used = self.closed.pairs, len(self._finder.used)
         require(bool((joined >= 0).all()), "loops join frames that are not there")
         require(
-            len(self.closed) <= len(self._selection) and self._loops_from_nothing >= 0 and self._scale[0] > 0.0,
+            len(self.closed) <= used and self._loops_from_nothing >= 0 and self._scale[0] > 0.0,
             "an optimisation is of loops that are not there",
         )
         parts, claimed = self._parts, self._claimed
@@ -369,7 +353,7 @@ class ScanBackEnd(BackEnd):
             self._own_map.fits(len(self.graph))
             and len(parts) <= len(self.graph.segments)
             and bool(((parts >= 0) & (parts <= np.arange(len(parts)))).all())
-            and bool(((claimed >= 0) & (claimed < len(self._selection))).all()),
+            and bool(((claimed >= 0) & (claimed < used)).all()),
             "key scans are searched, parts of the map named, or loops claimed that are not there",
         )
         require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
