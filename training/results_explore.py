@@ -101,7 +101,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         for kind in arguments.worlds
     }
     result = {
-        "command": f'make results WORLD=explore ARGS="--worlds {" ".join(arguments.worlds)} --count {arguments.count}"',
+        "command": _command(arguments),
         "revision": record["revision"],
         "settings": {name: getattr(arguments, name) for name in ("split", "count", "scale", "most_s")},
         "poses": "true",
@@ -110,6 +110,12 @@ def main(arguments: Arguments) -> dict[str, Any]:
     }
     images = draw_figures(arguments.images, found)
     return arguments.publish("explore", result, explore_page.page(result, images))
+
+
+def _command(arguments: Arguments) -> str:
+    chosen = f"--worlds {' '.join(arguments.worlds)} --count {arguments.count}"
+    rows = "" if arguments.rows == ROWS else f" --rows {' '.join(arguments.rows)}"
+    return f'make results WORLD=explore ARGS="{chosen}{rows}"'
 
 
 def _drives(kind: str, arguments: Arguments) -> Iterator[Drive]:
