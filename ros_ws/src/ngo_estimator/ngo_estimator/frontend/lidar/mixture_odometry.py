@@ -108,6 +108,7 @@ class MixtureOdometry:
         self._key = np.zeros(3)
         self._reckoned = np.zeros(2)  # way and turn since a scan fitted
         self._usual = 0.0
+        self._doubt = self._doubted_key = np.zeros((3, 3))  # that other modes leave: of this scan, of a last key scan
         last = config.icp
         self._last_steps = replace(
             last, annealing_steps=1, first_kernel_m=last.last_kernel_m, first_gate_m=last.last_gate_m
@@ -204,6 +205,7 @@ class MixtureOdometry:
             scan,
         )
         self._pose, self._covariance = pose, covariance
+        self._doubted_key = self._doubt if is_key else np.zeros((3, 3))
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
             self.mixture.filter.begin_at_key()
@@ -212,9 +214,12 @@ class MixtureOdometry:
         return estimate
 
     def _prior(self, share: float) -> Mixture:
-        """The prior of where the place is chosen, without a hypothesis below a ``share``."""
+        """The prior of where the place is chosen, without a hypothesis below a ``share``.
+
+        A key scan is where the next ones count from, but its place among those before it is as doubtful as it was.
+        """
         least = self.config.least, self.config.least
-        return self.mixture.prior(self._pose, self._covariance, None, least, share)
+        return self.mixture.prior(self._pose, self._covariance + self._doubted_key, None, least, share)
 
     def _weight(self, points: Array) -> float:
         """Weight of a log likelihood against a score, which is a mean: of few points it says less, but neighbouring
@@ -261,6 +266,7 @@ class MixtureOdometry:
 
     def _doubted(self, fits: list[_Mode], weight: float) -> _Mode:
         """The first mode with the covariance of all: a score is ``weight`` times a log likelihood."""
+        self._doubt = np.zeros((3, 3))
         modes: list[_Mode] = []
         for fit in fits:
             if not any(self._is_same(fit.pose, mode.pose) for mode in modes):
@@ -275,6 +281,7 @@ class MixtureOdometry:
             away = mode.pose - modes[0].pose
             away[2] = wrap(away[2])
             covariance = covariance + share * np.outer(away, away)
+        self._doubt = covariance - modes[0].found.covariance
         return replace(modes[0], found=replace(modes[0].found, covariance=covariance))
 
     def _is_same(self, a: Array, b: Array) -> bool:
