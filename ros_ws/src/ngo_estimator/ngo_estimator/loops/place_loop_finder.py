@@ -89,7 +89,7 @@ class PlaceLoopFinder:
         # Pairs of frames that stay apart: shared walls are looked for again in the newest blocks.
         self._dropped = np.zeros((0, 2), np.int64)
 
-    SAVED = ("_codes", "_embeddings", "loops")
+    SAVED = ("_codes", "_embeddings", "loops", "_dropped")
 
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
