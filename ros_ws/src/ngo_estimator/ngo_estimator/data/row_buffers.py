@@ -6,7 +6,7 @@ from ngo_estimator.data.state_arrays import Arrays, require, taken, taken_intege
 
 
 class GrowingRows:
-    """All rows that were appended; views that were handed out stay valid, and unchanged but for ``write``."""
+    """All rows that were appended; their owner may write into ``values``."""
 
     def __init__(self, shape: tuple[int, ...], dtype: type) -> None:
         self._buffer: np.ndarray = np.zeros((256, *shape), dtype)

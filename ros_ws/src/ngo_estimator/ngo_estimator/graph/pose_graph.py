@@ -169,7 +169,8 @@ class PoseGraph:
         return RelativePoses.of_covariances(self.edges, self.relative, self.published_covariance)
 
     def restate(self, first: int, relative: np.ndarray, variance: np.ndarray) -> None:
-        """Have other steps ``(n, 3)``, whose errors are independent, from the node ``first`` on."""
+        """Have other steps ``(n, 3)`` from the node ``first`` on; their components err independently, with ``variance``
+        ``(n, 3)``."""
         rows, covariance = slice(first, first + len(relative)), variance[:, :, None] * np.eye(3)
         self.relative[rows] = relative
         self.step_covariance[rows] = self.published_covariance[rows] = covariance
