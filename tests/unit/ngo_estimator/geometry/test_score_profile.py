@@ -56,6 +56,15 @@ def test_smooth_walls_tell_nothing_of_the_way_along_them(off: float) -> None:
     assert held.covariance[0, 0] > 0.95 * found.covariance[0, 0]
 
 
+@pytest.mark.parametrize("deviation", [1.0, 5.0])
+def test_a_place_is_no_surer_than_the_offsets_are_close(deviation: float) -> None:
+    """An end wall leaves one offset alone: it is 12.5 cm from the next ones."""
+    end = np.stack((np.full(60, 3.0), np.arange(-1.5, 1.5, 0.05)), -1)
+    found = registered(0.0, deviation)
+    held = held_along(found, field_of(end), end, unknown=0.1, noise=0.5, weight=0.001)
+    assert 0.03 < math.sqrt(held.covariance[0, 0]) < 0.15 and abs(held.pose[0]) < 0.06
+
+
 def test_what_is_known_already_stays_as_it_is() -> None:
     found = registered(0.04, 0.05)
     assert held_along(found, field_of(corridor(True)), corridor(True), **SETTINGS) is found

@@ -17,7 +17,10 @@ _OPEN_M = 0.1
 """Deviation of a position below which lines and prior tell enough."""
 
 _OFFSETS = np.linspace(-2.5, 2.5, 41)
-"""Where the score is asked, in deviations of the position, but at most 1 m."""
+"""Where the score is asked, in deviations of the position, or in metres where that is over 1 m."""
+
+_ROUNDING = (_OFFSETS[1] - _OFFSETS[0]) ** 2 / 12.0
+"""Variance of a place that is known to the nearest offset, in the same."""
 
 
 def held_along(
@@ -39,13 +42,16 @@ def held_along(
     if variance < _OPEN_M**2:
         return found
     moves = covariance[:, :2] @ direction / variance  # of the pose, for each metre along the direction
-    offsets = _OFFSETS * min(math.sqrt(variance), 1.0)
+    unit = min(math.sqrt(variance), 1.0)
+    offsets = _OFFSETS * unit
     scores = field.scores(points, found.pose + offsets[:, None] * moves, unknown)
     prior = -0.5 * offsets**2 / variance
     before, after = np.exp(prior), np.exp(np.minimum((scores - scores.max()) / weight + noise, 0.0) + prior)
     before, after = before / before.sum(), after / after.sum()
     offset = float(after @ offsets)
-    gain = max(1.0 / float(after @ (offsets - offset) ** 2) - 1.0 / float(before @ offsets**2), 0.0)
+    rounding = _ROUNDING * unit**2
+    left = float(after @ (offsets - offset) ** 2) + rounding
+    gain = max(1.0 / left - 1.0 / (float(before @ offsets**2) + rounding), 0.0)
     pose, along = found.pose + offset * moves, np.append(direction, 0.0)
     pose[2] = wrap(pose[2])
     shrunk = gain * variance**2 / (1.0 + gain * variance)

@@ -39,7 +39,7 @@ class LoopFinder(Protocol):
         """All that are kept, between nodes."""
 
     def drop(self, chosen: np.ndarray) -> int:
-        """Take out for good the loops of a mask ``(n,)``; returns how many of them the graph used."""
+        """Take out for good the loops of a mask ``(n,)``; returns how many of them the graph had."""
 
 
 class BackEnd(ABC):

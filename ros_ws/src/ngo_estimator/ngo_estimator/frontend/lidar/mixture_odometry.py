@@ -175,6 +175,7 @@ class MixtureOdometry:
             return scan, found
         prior, weight = self._prior(self.config.least_share), self._weight(few.points)
         refound = self._sharpened(other, few, self._fit(few, ANY, found.pose, prior, weight))
+        refound = _widened(refound, self._doubt)
         return (other, refound) if refound.score >= found.score else (scan, found)
 
     def _accepted(
@@ -205,7 +206,7 @@ class MixtureOdometry:
             scan,
         )
         self._pose, self._covariance = pose, covariance
-        self._doubted_key = self._doubt if is_key else np.zeros((3, 3))
+        self._doubted_key = self._doubt if is_key and not segment else np.zeros((3, 3))
         if is_key:
             self._key, self._covariance = pose, np.zeros((3, 3))
             self.mixture.filter.begin_at_key()
@@ -276,13 +277,11 @@ class MixtureOdometry:
         prior = self._prior(0.0)
         logs = np.array([mode.score / weight + prior.log(mode.pose) for mode in modes])
         likelihoods = np.exp(np.minimum(logs - logs[0], 0.0))
-        covariance = modes[0].found.covariance
         for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
             away = mode.pose - modes[0].pose
             away[2] = wrap(away[2])
-            covariance = covariance + share * np.outer(away, away)
-        self._doubt = covariance - modes[0].found.covariance
-        return replace(modes[0], found=replace(modes[0].found, covariance=covariance))
+            self._doubt = self._doubt + share * np.outer(away, away)
+        return _widened(modes[0], self._doubt)
 
     def _is_same(self, a: Array, b: Array) -> bool:
         return bool(_near(a, b, self.config.same_m, self.config.same_rad))
@@ -336,6 +335,11 @@ class MixtureOdometry:
         self, scan: KeyScan | _Points, start: Array, mean: Array, information: Array, config: IcpConfig
     ) -> Registration:
         return icp(self._submap.lines, scan.points, scan.normals, start, (mean, information), config, _OPEN_SHARE)
+
+
+def _widened(mode: _Mode, doubt: Array) -> _Mode:
+    """A mode with ``doubt`` ``(3, 3)`` in its covariance."""
+    return replace(mode, found=replace(mode.found, covariance=mode.found.covariance + doubt))
 
 
 @njit(cache=True)
