@@ -233,33 +233,38 @@ def _pool(fine: Field, coarse: Field, step: int) -> None:
 
 
 @njit(cache=True)
-def _score(field: Field, points: Array, pose: Array, corner: Array, cell: float, unknown: int) -> float:
+def _seen_at(field: Field, points: Array, pose: Array, corner: Array, cell: float, unknown: int) -> tuple[int, int]:
+    """Sum of the cells at points ``(n, 2)`` whose frame has the pose ``(3,)``, and how many were never seen."""
     rows, columns = field.shape
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    total = 0
+    total, unseen = 0, 0
     for k in range(len(points)):
         x = cos * points[k, 0] - sin * points[k, 1] + pose[0] - corner[0]
         y = sin * points[k, 0] + cos * points[k, 1] + pose[1] - corner[1]
         row, column = math.floor(y / cell), math.floor(x / cell)
-        total += field[row, column] if 0 <= row < rows and 0 <= column < columns else unknown
-    return total / (255.0 * len(points))
+        value = field[row, column] if 0 <= row < rows and 0 <= column < columns else unknown
+        if value == unknown:
+            unseen += 1
+        else:
+            total += value
+    return total, unseen
+
+
+@njit(cache=True)
+def _score(field: Field, points: Array, pose: Array, corner: Array, cell: float, unknown: int) -> float:
+    total, unseen = _seen_at(field, points, pose, corner, cell, unknown)
+    return (total + unseen * unknown) / (255.0 * len(points))
 
 
 @njit(cache=True)
 def _scores(
     field: Field, points: Array, poses: Array, corner: Array, cell: float, code: int, unknown: float
 ) -> Array:  # fmt: skip
-    rows, columns = field.shape
-    result = np.zeros(len(poses))
+    result = np.empty(len(poses))
     for i in range(len(poses)):
-        cos, sin = math.cos(poses[i, 2]), math.sin(poses[i, 2])
-        for k in range(len(points)):
-            x = cos * points[k, 0] - sin * points[k, 1] + poses[i, 0] - corner[0]
-            y = sin * points[k, 0] + cos * points[k, 1] + poses[i, 1] - corner[1]
-            row, column = math.floor(y / cell), math.floor(x / cell)
-            value = field[row, column] if 0 <= row < rows and 0 <= column < columns else code
-            result[i] += unknown if value == code else value / 255.0
-    return result / len(points)
+        total, unseen = _seen_at(field, points, poses[i], corner, cell, code)
+        result[i] = (total / 255.0 + unseen * unknown) / len(points)
+    return result
 
 
 @njit(cache=True)

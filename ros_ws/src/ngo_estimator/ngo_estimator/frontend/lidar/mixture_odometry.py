@@ -327,8 +327,8 @@ class MixtureOdometry:
         squared = squared_deviations(mode.pose, mean, inverted(covariance + walls))
         information = inverted(covariance) * min(1.0, _FAR / max(squared, 1e-9))
         found = self._icp(scan, mode.pose, mean, information, self._last_steps)
-        noise = self.config.noise, self.config.prior_weight * self._fewer(few.points)
-        found = held_along(found, self._submap.field, few.points, self._usual, *noise)
+        weight = self.config.prior_weight * self._fewer(few.points)
+        found = held_along(found, self._submap.field, few.points, self._usual, self.config.noise, weight)
         return _Mode(found, likeliest, self._submap.field.score(few.points, found.pose), mode.total)
 
     def _icp(
