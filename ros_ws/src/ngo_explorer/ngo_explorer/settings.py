@@ -13,7 +13,7 @@ class ExplorerConfig(Settings):
 
     rule: str = setting(
         "tour",
-        "Chooses the next frontier. tour: the first of a tour over all of them; random; nearest: shortest path; "
+        "Chooses the next frontier. tour: the first of a tour over the nearest ones; random; nearest: shortest path; "
         "explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area a metre; d_optimality: "
         "of the predicted pose graph.",
         choices=RULES,
