@@ -74,13 +74,13 @@ class OwnMap:
         # Key scans of looks: the last one that agreed with the map where the pose is sure, and those against it since.
         self._agreed, self._astray = 0, np.zeros(0, np.int64)
 
-    def follow(self, chain: PoseGraph) -> None:
+    def follow(self, graph: PoseGraph) -> None:
         """Take the step to the newest key scan; nobody knows it where that begins a segment."""
-        if chain.segments[-1] == len(chain) - 1:
+        if graph.segments[-1] == len(graph) - 1:
             self._forget_looks()
             self._trial = self._against = 0
         else:
-            self._window.move(chain.relative[-1], chain.step_covariance[-1])
+            self._window.move(graph.relative[-1], graph.step_covariance[-1])
 
     def fits(self, keys: int) -> bool:
         """Whether all key scans that it names are among the first so many."""
@@ -91,7 +91,7 @@ class OwnMap:
         self.looks = self.looks[:0]
 
     def look(
-        self, scans: Sequence[KeyScan], views: KeyScanViews, chain: PoseGraph, windows: np.ndarray, parts: np.ndarray
+        self, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph, windows: np.ndarray, parts: np.ndarray
     ) -> ScanLoops:
         """Loops of the last key scans, where it is beyond doubt that they are right; mostly none.
 
@@ -100,16 +100,16 @@ class OwnMap:
             windows: half widths of the search around each, as seen from the newest ``(keys, 3)``.
             parts: the part of the map that each segment is in ``(segments,)``.
         """
-        config, newest = self._config.loops, len(chain) - 1
+        config, newest = self._config.loops, len(graph) - 1
         first = newest + 1 - config.source_keys
         far = np.flatnonzero(windows[:, 0] >= self._config.windows.most_m)
-        if first < chain.segments[-1] or len(far) < config.submap_keys:
+        if first < graph.segments[-1] or len(far) < config.submap_keys:
             return ScanLoops.none()
-        self._lay_out(far, parts[segment_of(chain.segments, far)], chain.poses)
+        self._lay_out(far, parts[segment_of(graph.segments, far)], graph.poses)
         matcher = self._matcher_of(scans, views)
         if matcher is None:
             return ScanLoops.none()
-        source = laid_together(scans[first:], views.profiles[first:], chain.poses[first:])
+        source = laid_together(scans[first:], views.profiles[first:], graph.poses[first:])
         self._window.add(matcher.search(source))
         self.looks = np.append(self.looks, newest)[-self._claims.window :]
         hypotheses, place_m = self._window.hypotheses(), matcher.place_m
@@ -122,34 +122,34 @@ class OwnMap:
             return ScanLoops.none()
         agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
         pose, _ = fused(hypotheses.where(agree), modes[0].pose_xyyaw)
-        evidence = self._evidence(pose, scans, views, chain)
+        evidence = self._evidence(pose, scans, views, graph)
         if evidence.walls < _LEAST_WALLS or evidence.through > _MOST_THROUGH:
             return ScanLoops.none()
         loops = self._loops(agree, self.looks[hypotheses.look], modes[0].support)
         self._forget_looks()
-        if (loops.pairs[:, 0] < chain.segments[-1]).any():
+        if (loops.pairs[:, 0] < graph.segments[-1]).any():
             self._trial, self._against = _TRIAL_LOOKS, 0
         return loops
 
     def _evidence(
-        self, pose: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews, chain: PoseGraph
+        self, pose: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph
     ) -> PlaceEvidence:
         """How the last stretch of the way agrees with the searched key scans, where the newest one is at a pose."""
-        stretch = last_stretch(chain.poses, int(chain.segments[-1]))
-        at = se2.compose(pose, se2.between(chain.poses[-1], chain.poses[stretch]))
+        stretch = last_stretch(graph.poses, int(graph.segments[-1]))
+        at = se2.compose(pose, se2.between(graph.poses[-1], graph.poses[stretch]))
         return evidence_of(scans, views, (stretch, at), (self._keys, self._poses), count_walls=True)
 
-    def contradicted(self, scans: Sequence[KeyScan], views: KeyScanViews, chain: PoseGraph, parts: np.ndarray) -> bool:
+    def contradicted(self, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph, parts: np.ndarray) -> bool:
         """Whether the key scans since the newest segment was joined show that it lies elsewhere.
 
         Two places may be alike for as far as the robot went; what it sees next is alike in one place alone.
         """
-        first, newest = int(chain.segments[-1]), len(chain) - 1
-        others = np.flatnonzero(parts[segment_of(chain.segments, np.arange(first))] == parts[-1])
+        first, newest = int(graph.segments[-1]), len(graph) - 1
+        others = np.flatnonzero(parts[segment_of(graph.segments, np.arange(first))] == parts[-1])
         if self._trial == 0 or not len(others):
             return False
         last = np.arange(newest + 1 - self._config.loops.source_keys, newest + 1)
-        found = evidence_of(scans, views, (last, chain.poses[last]), (others, chain.poses[others]))
+        found = evidence_of(scans, views, (last, graph.poses[last]), (others, graph.poses[others]))
         if found.said:
             self._trial -= 1
             self._against = self._against + 1 if found.through > _MOST_THROUGH else 0
@@ -163,7 +163,7 @@ class OwnMap:
         self,
         scans: Sequence[KeyScan],
         views: KeyScanViews,
-        chain: PoseGraph,
+        graph: PoseGraph,
         windows: np.ndarray,
         has_loops: bool,
     ) -> int | None:
@@ -172,17 +172,17 @@ class OwnMap:
         Where the graph is sure of the pose, scans that look through the walls there say that a step was wrong.
         ``has_loops``: whether the newest key scan has one.
         """
-        newest, config, border = len(chain) - 1, self._config.loops, chain.borders[-1]
+        newest, config, border = len(graph) - 1, self._config.loops, graph.borders[-1]
         if has_loops:
             self._agreed, self._astray = newest, self._astray[:0]
         last = np.arange(newest + 1 - config.source_keys, newest + 1)
         if has_loops or last[0] < border:
             return None
-        way = np.cumsum(np.hypot(*np.diff(chain.poses[::-1, :2], axis=0).T))[::-1]  # to the newest, of all others
+        way = np.cumsum(np.hypot(*np.diff(graph.poses[::-1, :2], axis=0).T))[::-1]  # to the newest, of all others
         old = np.flatnonzero((windows[:newest, 0] <= _SURE_M) & (way > config.least_gap_m))
         if not len(old):
             return None
-        found = evidence_of(scans, views, (last, chain.poses[last]), (old, chain.poses[old]), _HELD_AGAINST)
+        found = evidence_of(scans, views, (last, graph.poses[last]), (old, graph.poses[old]), _HELD_AGAINST)
         if found.said and found.mean <= _HERE:
             self._agreed, self._astray = newest, self._astray[:0]
         elif found.seen >= _LEAST_SEEN and found.overlap >= _LEAST_OVERLAP and found.mean > _ELSEWHERE:

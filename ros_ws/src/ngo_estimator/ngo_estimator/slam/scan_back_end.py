@@ -134,26 +134,26 @@ class ScanBackEnd(BackEnd):
     def _look_for_loops(self) -> None:
         """Ask for loops of the newest key."""
         if (len(self.graph) - 1) % self.config.loops.every == 0:
-            chain, joining = self.graph, self._joining_pairs
-            distances = graph_distances(chain.poses, joining, len(self.graph) - 1, chain.segments)
+            graph, joining = self.graph, self._joining_pairs
+            distances = graph_distances(graph.poses, joining, len(self.graph) - 1, graph.segments)
             windows = distance_windows(self.config.windows, distances)
-            fresh = self._finder.find(self._scans, chain.poses, windows, segments=chain.borders)
+            fresh = self._finder.find(self._scans, graph.poses, windows, segments=graph.borders)
             self._scans.compact()
-            believed = self._finder.believed(fresh, chain)
+            believed = self._finder.believed(fresh, graph)
             if len(believed):
-                surprises = self._finder.use(believed, chain)
-                waited = self._wait - len(chain) // _KEYS_PER_SURPRISED if surprises else 1
+                surprises = self._finder.use(believed, graph)
+                waited = self._wait - len(graph) // _KEYS_PER_SURPRISED if surprises else 1
                 self._waiting = max(self._waiting, waited)
-            self._parts = joined_parts(chain.segments, joining)
-            if self._own_map.contradicted(self._scans, self._finder.views, chain, self._parts):
+            self._parts = joined_parts(graph.segments, joining)
+            if self._own_map.contradicted(self._scans, self._finder.views, graph, self._parts):
                 self._part_newest_segment()
                 return
-            astray = self._own_map.astray(self._scans, self._finder.views, chain, windows, len(fresh) > 0)
+            astray = self._own_map.astray(self._scans, self._finder.views, graph, windows, len(fresh) > 0)
             if astray is not None:
-                chain.part_at(astray)
+                graph.part_at(astray)
                 self._part_newest_segment()
                 return
-            self._claim(self._own_map.look(self._scans, self._finder.views, chain, windows, self._parts))
+            self._claim(self._own_map.look(self._scans, self._finder.views, graph, windows, self._parts))
         self._waiting += self._waiting > 0
 
     def _claim(self, loops: ScanLoops) -> None:
@@ -191,14 +191,14 @@ class ScanBackEnd(BackEnd):
 
     def _thin(self) -> None:
         """Let go of key scans whose places newer ones show; what their edges said goes to their neighbours."""
-        chain, loops, count = self.graph, self.used_loops, len(self.graph)
+        graph, loops, count = self.graph, self.used_loops, len(self.graph)
         stays = np.arange(count) >= count - self._newest
-        stays[chain.ends_of_segments] = stays[self._own_map.looks] = True
-        part = self._parts[segment_of(chain.segments, np.arange(count))]
-        leaves = redundant_nodes(chain.poses, chain.borders, part, stays, count - self.config.most_scans)
+        stays[graph.ends_of_segments] = stays[self._own_map.looks] = True
+        part = self._parts[segment_of(graph.segments, np.arange(count))]
+        leaves = redundant_nodes(graph.poses, graph.borders, part, stays, count - self.config.most_scans)
         if leaves.any():
-            thinned = without_nodes(chain.poses, chain.steps, loops, self.closed.weight, leaves)
-            chain.let_go(~leaves, thinned.bridges)
+            thinned = without_nodes(graph.poses, graph.steps, loops, self.closed.weight, leaves)
+            graph.let_go(~leaves, thinned.bridges)
             self._scans.thin(~leaves)
             self._finder.thin(~leaves, thinned.loops, self._newest)
             self._own_map.thin(~leaves)
@@ -218,9 +218,9 @@ class ScanBackEnd(BackEnd):
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
-        scans, chain = self._scans[:], self.graph
-        poses = origin.poses(chain.poses.copy())
-        return ScanMatcher(scans, poses, self._finder.views, self.config.loops, borders=chain.borders)
+        scans, graph = self._scans[:], self.graph
+        poses = origin.poses(graph.poses.copy())
+        return ScanMatcher(scans, poses, self._finder.views, self.config.loops, borders=graph.borders)
 
     def localiser(self, origin: MapOrigin) -> Localiser:
         """Localises in the key scans as they are; raises ``ValueError`` where none has a point."""
