@@ -9,6 +9,7 @@ import torch
 
 from tests.fuzz import files, nodes
 from tests.fuzz.outcomes import Outcomes
+from tests.ros.processes import own_node, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -41,6 +42,15 @@ def test_messages(name: str) -> None:
 def test_services_in_every_state() -> None:
     torch.set_num_threads(1)
     assert_clean(nodes.run_services(SERVICES, random.Random(0)), SERVICES)
+
+
+def test_a_destroyed_node_leaves_the_graph(tmp_path: Path) -> None:
+    """Its state machine holds it otherwise until Python collects what refers to itself."""
+    with own_node("watcher") as watcher:
+        with nodes.NODES["ngo_node"](tmp_path) as (node, _):
+            wait_until(lambda: set(watcher.get_node_names()) == {"watcher", "ngo_node"}, "ngo_node")
+        wait_until(lambda: watcher.get_node_names() == ["watcher"], "the end of ngo_node")
+    del node  # which lived until here
 
 
 @pytest.mark.parametrize(

@@ -70,3 +70,8 @@ class ManagedNode(LifecycleNode):
                 self.get_logger().error(" ".join(str(error).split()) or repr(error))
             return _FAILURE
         return _SUCCESS
+
+    def destroy_node(self) -> None:
+        """End the node: rclpy leaves its state machine, whose services would keep it in the graph."""
+        self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
