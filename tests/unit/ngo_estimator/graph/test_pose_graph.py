@@ -90,3 +90,40 @@ def test_parts_that_do_not_belong_together_are_refused(damage: Callable[[Arrays]
     state = state_of(straight())
     with pytest.raises(StateError, match=r"there are not|not there|moved"):
         restore(PoseGraph(FLOOR), {**state, **damage(state)})
+
+
+def test_a_stream_that_goes_on_finds_all_frames_where_they_were() -> None:
+    """Two odometries in turn give each stream what it would have alone, and no frame of the other moves."""
+    alone, both = straight(), straight()
+    both.begin_stream(5)
+    both.open_segment()
+    both.append(np.array((0.0, 3.0, 1.0)), COVARIANCE, joins=True)
+    both.add_node()
+    both.append(STEP, COVARIANCE)
+    assert both.segments.tolist() == both.streams.tolist() == [0, 3] and both.stream_ends.tolist() == [2, 3]
+    frames, newest = both.frame_poses(), both.newest()
+    nodes, order = both.go_on_with(0)
+    assert nodes.tolist() == [3, 0, 1, 2] and order.tolist() == [5, 6, 0, 1, 2, 3, 4]
+    assert both.ranks.tolist() == [5, 0] and both.rank_of_frames.tolist() == [5, 5, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(both.frame_poses(), frames[order], atol=1e-12)
+    for graph in (alone, both):
+        graph.append(STEP, COVARIANCE)
+        graph.add_node()
+    for found, expected in zip((*both.newest(), both.newest_of(5)[1]), (*alone.newest(), newest[1]), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(both.step_covariance[1:], alone.step_covariance)
+    both.go_on_with(5)
+    np.testing.assert_allclose(both.newest()[0], newest[0], atol=1e-12)
+    assert both.segments.tolist() == both.streams.tolist() == [0, 4]
+
+
+def test_each_stream_has_the_covariance_of_its_end() -> None:
+    both = straight()
+    both.begin_stream(1)
+    both.open_segment()
+    both.append(STEP, COVARIANCE, joins=True)
+    both.add_node()
+    both.move(both.poses.copy(), 2.0 * FLOOR, FLOOR)
+    np.testing.assert_array_equal(both.newest()[1], FLOOR)
+    both.go_on_with(0)
+    np.testing.assert_array_equal(both.end, 2.0 * FLOOR)

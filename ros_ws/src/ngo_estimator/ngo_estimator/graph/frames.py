@@ -93,6 +93,15 @@ class Frames:
         self._joins.set(self.joins[~own[self.joins]])
         self._nodes.set(nodes)
 
+    def reorder(self, order: np.ndarray, nodes: np.ndarray) -> None:
+        """Have the frames ``order`` ``(frames,)`` and the nodes ``nodes`` ``(nodes,)``, both by their old numbers, in
+        this order: stretches of which each begins with a node, and with another odometry."""
+        number = np.argsort(order)
+        joins = np.union1d(number[self.joins], number[:1])
+        self._joins.set(joins[joins > 0])
+        self._nodes.set(number[self.nodes[nodes]])
+        self._odometry.set(self.odometry[order])
+
     def check_state(self) -> None:
         """Raise ``StateError`` about restored arrays that do not belong together."""
         frames, nodes, joins = len(self), self.nodes, self._joins.values

@@ -2,6 +2,9 @@
 
 A meta-pose is a node by count, a key scan one by motion. Node 0 is the first frame, the origin of ``map``. Frames
 between nodes hang between them (``frames``), and the newest ones follow the last node by odometry.
+
+Several odometries may go on at once: each is a stream, and its nodes are a stretch of the chain that begins a segment.
+The stream whose frame comes next is the last stretch (``go_on_with``), so that the newest node is the last one.
 """
 
 import math
@@ -11,10 +14,11 @@ import numpy as np
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import require, require_ascending
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_motion import compose, propagated
+from ngo_estimator.geometry.planar_motion import between, compose, propagated
 from ngo_estimator.graph.frames import Frames
 from ngo_estimator.graph.marginalisation import NeighbourTree
 from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.graph.sparsification import largest_variances
 
 OPEN = np.diag((1e4, 1e4, math.pi**2))
@@ -53,6 +57,8 @@ class PoseGraph:
         self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
         self._end = np.zeros((3, 3))  # covariance of the last node in the map
         self._before = np.zeros((0, 3))  # poses of the first nodes before the last ``move``, which knew no others
+        self._ranks, self._begins = np.zeros(1, np.int64), np.zeros(1, np.int64)  # of the streams: their first frames
+        self._waiting: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}  # by rank, of the streams but the last
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -66,6 +72,68 @@ class PoseGraph:
     def end(self) -> np.ndarray:
         """Covariance ``(3, 3)`` of the last node."""
         return self._end
+
+    @property
+    def ranks(self) -> np.ndarray:
+        """The rank of each stream ``(streams,)``, by which it is named, in the order of their nodes."""
+        return self._ranks
+
+    @property
+    def streams(self) -> np.ndarray:
+        """The nodes ``(streams,)`` with which the streams begin."""
+        return np.searchsorted(self.frames.nodes, self._begins)
+
+    @property
+    def stream_ends(self) -> np.ndarray:
+        """The last node of each stream ``(streams,)``."""
+        return np.append(self.streams[1:] - 1, len(self) - 1)
+
+    @property
+    def rank_of_frames(self) -> np.ndarray:
+        """The rank of each frame's stream ``(frames,)``."""
+        return np.repeat(self._ranks, np.diff(np.append(self._begins, len(self.frames))))
+
+    def stream_of(self, nodes: np.ndarray) -> np.ndarray:
+        """The number of the stream in which each node is, an array of the shape of ``nodes``."""
+        return segment_of(self.streams, nodes)
+
+    def name_stream(self, rank: int) -> None:
+        """Give the only stream another rank than 0."""
+        self._ranks = np.array((rank,))
+
+    def begin_stream(self, rank: int) -> None:
+        """Begin another stream with the next frame, which is to be a node, and to begin a segment."""
+        self._waiting[int(self._ranks[-1])] = self._since, self._end, self._opens
+        self._since, self._end, self._opens = np.zeros((3, 3)), np.zeros((3, 3)), 0
+        self._ranks, self._begins = np.append(self._ranks, rank), np.append(self._begins, len(self.frames))
+
+    def go_on_with(self, rank: int) -> tuple[np.ndarray, np.ndarray]:
+        """Put a stream's nodes and frames behind all others.
+
+        Returns:
+            The old numbers of the nodes ``(nodes,)`` and of the frames ``(frames,)`` in their new order.
+        """
+        stream = int(np.flatnonzero(self._ranks == rank)[0])
+        order, frames = _to_end(self.streams, stream, len(self)), _to_end(self._begins, stream, len(self.frames))
+        number, last = np.argsort(order), int(self._ranks[-1])
+        self._begins = np.sort(np.argsort(frames)[self._begins])
+        self._ranks = np.append(np.delete(self._ranks, stream), rank)
+        self.frames.reorder(frames, order)
+        self._poses.set(self.poses[order])
+        # Of the step to each node; nobody measured those to the first of a stream.
+        for rows, first in (
+            (self._steps, np.zeros(3)),
+            (self._step_covariance, OPEN),
+            (self._published_covariance, OPEN),
+            (self._step_variance, largest_variances(OPEN[None])[0]),
+        ):
+            rows.set(np.concatenate((np.asarray(first)[None], rows.values))[order][1:])
+        self._segments.set(np.sort(number[self.segments]))
+        self._bridged.set(np.sort(number[self._bridged.values]))
+        self._before = np.zeros((0, 3))
+        self._waiting[last] = self._since, self._end, self._opens
+        self._since, self._end, self._opens = self._waiting.pop(rank)
+        return order, frames
 
     @property
     def largest_move_m(self) -> float:
@@ -114,6 +182,8 @@ class PoseGraph:
         self._end = propagated(self._end, pose, since, published)
         self._poses.append(pose)
         self.frames.add_node()
+        if len(self) - 1 == self.streams[-1]:  # its map begins here
+            self._end = np.zeros((3, 3))
         self._steps.append(since)
         self._step_covariance.append(covariance)
         self._published_covariance.append(published)
@@ -207,11 +277,14 @@ class PoseGraph:
         self.frames.part_at(int(self.frames.nodes[node]))
         self._end = self._end + OPEN
 
-    def move(self, poses: np.ndarray, end: np.ndarray) -> None:
-        """Put the nodes at other poses ``(nodes, 3)``; the last one has the covariance ``end``."""
+    def move(self, poses: np.ndarray, *ends: np.ndarray) -> None:
+        """Put the nodes at other poses ``(nodes, 3)``; the last one of each stream has the covariance ``ends``."""
         self._before = self.poses.copy()
         self.poses[:] = poses
-        self._end = end
+        *others, self._end = ends
+        for rank, end in zip(self._ranks[:-1].tolist(), others, strict=True):
+            since, _, opens = self._waiting[rank]
+            self._waiting[rank] = since, end, opens
 
     def let_go(self, keep: np.ndarray, bridges: NeighbourTree | None = None) -> None:
         """Let go of the nodes that are not among ``keep`` ``(nodes,)``; the first and the last are. No frame moves.
@@ -249,6 +322,17 @@ class PoseGraph:
         pose = compose(self.poses[-1], since)
         return pose, propagated(self._end, pose, since, self._since)
 
+    def newest_of(self, rank: int) -> tuple[np.ndarray, np.ndarray]:
+        """The same of the newest frame of a stream."""
+        stream = int(np.flatnonzero(self._ranks == rank)[0])
+        if stream == len(self._ranks) - 1:
+            return self.newest()
+        node, odometry = self.stream_ends[stream], self.frames.odometry
+        since = between(odometry[self.frames.nodes[node]], odometry[self._begins[stream + 1] - 1])
+        since_covariance, end, _ = self._waiting[rank]
+        pose = compose(self.poses[node], since)
+        return pose, propagated(end, pose, since, since_covariance)
+
     def node_poses(self, before: bool = False) -> np.ndarray:
         """Poses of all nodes ``(nodes, 3)``, as they are or as they were before the last ``move``."""
         nodes: np.ndarray = self.poses.copy()
@@ -278,6 +362,13 @@ class PoseGraph:
         require_ascending(self.segments, "_segments", nodes)
         require_ascending(self._bridged.values, "_bridged", nodes)
         require(len(self.segments) > 0 and self.segments[0] == 0, "no segment begins at the first node")
+
+
+def _to_end(begins: np.ndarray, which: int, count: int) -> np.ndarray:
+    """Old numbers of ``count`` rows in their new order: those of one of the stretches that ``begins`` come last."""
+    first, after = np.append(begins, count)[which : which + 2]
+    rows = np.arange(count)
+    return np.concatenate((rows[:first], rows[after:], rows[first:after]))
 
 
 def _summed(poses: np.ndarray, covariance: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,3 +27,19 @@ def joined_parts(segments: np.ndarray, pairs: np.ndarray) -> np.ndarray:
             low, high = sorted((int(part[a]), int(part[b])))
             part[part == high] = low
     return part
+
+
+def anchors(segments: np.ndarray, parts: np.ndarray, ranks: np.ndarray) -> np.ndarray:
+    """The node ``(s,)`` that is the origin of the part of the map in which each segment is.
+
+    It is the first node of the segment of the lowest rank, of those of one rank the first.
+
+    Args:
+        segments: the first node of each segment ``(s,)``; parts: as ``joined_parts`` gives them.
+        ranks: of each segment ``(s,)``.
+    """
+    order = np.lexsort((segments, ranks))
+    _, first, which = np.unique(parts[order], return_index=True, return_inverse=True)
+    found = np.empty_like(segments)
+    found[order] = segments[order[first[which]]]
+    return found

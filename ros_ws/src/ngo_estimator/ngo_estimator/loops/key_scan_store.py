@@ -97,6 +97,11 @@ class KeyScanStore(Sequence[KeyScan]):
             self._scans[k] = _with(scan, points=points, normals=normals, angles=_NOTHING, ranges=_NOTHING)
         self._compact = len(self._scans)
 
+    def reorder(self, order: np.ndarray) -> None:
+        """Have the key scans ``order`` ``(keys,)``, by their old numbers, in this order, and all of them compact."""
+        self.compact()
+        self._scans = [self._scans[key] for key in order.tolist()]
+
     def thin(self, keep: np.ndarray) -> None:
         """Let go of the key scans that are not among ``keep`` ``(keys,)``."""
         self._scans = [scan for scan, stays in zip(self._scans, keep.tolist(), strict=True) if stays]

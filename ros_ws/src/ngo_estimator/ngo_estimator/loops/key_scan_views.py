@@ -37,9 +37,12 @@ class KeyScanViews:
 
     def thin(self, keep: np.ndarray) -> None:
         """Drop what is kept of the key scans that are not among ``keep`` ``(keys,)``."""
-        stays = np.flatnonzero(keep[: len(self)])
-        self._profiles = [self._profiles[key] for key in stays]
-        self._middles.set(self._middles.values[stays])
+        self.reorder(np.flatnonzero(keep[: len(self)]))
+
+    def reorder(self, keys: np.ndarray) -> None:
+        """Have those of the key scans ``keys`` ``(n,)``, by their old numbers, in this order."""
+        self._profiles = [self._profiles[key] for key in keys.tolist()]
+        self._middles.set(self._middles.values[keys])
 
     def of_map(self, scans: Sequence[KeyScan]) -> "KeyScanViews":
         """Those of all key scans of a map, of which these are the first."""

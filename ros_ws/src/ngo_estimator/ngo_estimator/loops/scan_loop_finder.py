@@ -47,6 +47,7 @@ class ScanLoopFinder:
         poses: np.ndarray,
         windows: np.ndarray,
         segments: np.ndarray | None = None,
+        begin: int = 0,
     ) -> np.ndarray:
         """Loops of the last key, under the present poses.
 
@@ -55,6 +56,7 @@ class ScanLoopFinder:
             poses: of all keys in the map ``(keys, 3)``.
             windows: half widths of the search around each key's pose, as seen from the last ``(keys, 3)`` (m, m, rad).
             segments: keys from which on scans do not lie together with those before; None: all do.
+            begin: the key from which on keys are counted: of some no loops are looked for.
 
         Returns:
             Which of ``loops`` ``(n,)`` this call made acceptable, the last key's and earlier ones with which they
@@ -65,9 +67,8 @@ class ScanLoopFinder:
             raise ValueError(
                 f"poses, windows have the shapes {poses.shape}, {windows.shape} for {count} scans; expected (keys, 3)"
             )
-        for scan in scans[len(self.views) :]:
-            self.views.append(scan)
-        if (count - 1) % config.every:
+        self._see(scans)
+        if (count - 1 - begin) % config.every:
             return np.zeros(0, np.int64)
         if not (windows > 0.0).all():
             raise ValueError(f"the narrowest of the windows is {windows.min()}; expected positive half widths")
@@ -83,6 +84,18 @@ class ScanLoopFinder:
         self.loops = with_agreement(config, loops, len(self.loops), poses)
         fresh: np.ndarray = np.flatnonzero(self.loops.accepted & ~loops.accepted)
         return fresh
+
+    def _see(self, scans: Sequence[KeyScan]) -> None:
+        for scan in scans[len(self.views) :]:
+            self.views.append(scan)
+
+    def reorder(self, scans: Sequence[KeyScan], order: np.ndarray) -> None:
+        """Take that the key scans, ``scans`` as they were, have the order ``order`` ``(keys,)`` of old numbers now."""
+        self._see(scans)
+        number = np.argsort(order)
+        self.views.reorder(order)
+        self.loops = replace(self.loops, pairs=number[self.loops.pairs])
+        self._submaps.renumber(number)
 
     def add(self, loops: ScanLoops) -> np.ndarray:
         """Take loops that were found and judged elsewhere; returns which of ``loops`` they are."""
@@ -138,7 +151,8 @@ class ScanLoopFinder:
         turn = windows.deviations * np.sqrt(covariance[:, 2, 2])
         searched = (metres <= windows.most_m) & (turn <= math.radians(windows.most_deg))
         believed = searched | (loops.agreeing >= config.agreeing_beyond)
-        may_grow = loops.pairs[:, 1] >= len(graph) - 1 - config.loops.neighbour_keys
+        later = loops.pairs[:, 1]
+        may_grow = later >= graph.stream_ends[graph.stream_of(later)] - config.loops.neighbour_keys
         self.doubted = rows[~believed & may_grow]
         return rows[believed]
 

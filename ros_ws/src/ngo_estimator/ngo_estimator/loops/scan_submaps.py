@@ -3,7 +3,7 @@
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,6 +71,13 @@ class ScanSubmaps:
         if len(self._submaps) > self._config.most_submaps:
             self._submaps.popitem(last=False)
         return submap
+
+    def renumber(self, number: np.ndarray) -> None:
+        """Take that each key scan has another number ``(keys,)`` now; those of a submap follow each other as before."""
+        self._submaps = OrderedDict(
+            (int(number[place]), replace(submap, first=int(number[submap.first])))
+            for place, submap in self._submaps.items()
+        )
 
     def _made(self, first: int, local: np.ndarray, together: PlacedScans) -> Submap:
         lines = line_map_of_points(together.points, together.normals)

@@ -202,6 +202,11 @@ class OwnMap:
         self._agreed = int(number[self._agreed])
         self.map_changed()
 
+    def renumber(self, number: np.ndarray) -> None:
+        """Take that each key scan has another number ``(keys,)`` now."""
+        self._keys, self.looks, self._astray = number[self._keys], number[self.looks], number[self._astray]
+        self._agreed = int(number[self._agreed])
+
     def map_changed(self) -> None:
         """Lay out the map anew at the next look: scans are gone, or many poses were moved."""
         self._stale = 1

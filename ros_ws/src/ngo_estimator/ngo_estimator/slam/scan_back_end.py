@@ -1,4 +1,4 @@
-"""The back end of a lidar: a graph of key scans, verified loops, warm starts."""
+"""The back end of a lidar, or of several robots with one each: a graph of key scans, verified loops, warm starts."""
 
 import math
 from dataclasses import replace
@@ -12,11 +12,12 @@ from ngo_estimator.geometry.key_scan import no_scan
 from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
+from ngo_estimator.graph.normal_equations import NormalEquations
 from ngo_estimator.graph.pose_graph import OPEN, PoseGraph
 from ngo_estimator.graph.redundant_nodes import redundant_nodes
 from ngo_estimator.graph.relative_poses import BELIEVED, RelativePoses
 from ngo_estimator.graph.robust import Robust
-from ngo_estimator.graph.segments import joined_parts, segment_of
+from ngo_estimator.graph.segments import anchors, joined_parts, segment_of
 from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
@@ -57,6 +58,7 @@ class ScanBackEnd(BackEnd):
         # Loops when the graph was last solved without a warm start, and the scale of variances that was found.
         self._loops_from_nothing, self._scale = 0, np.ones(1)
         self._own_map = OwnMap(config)
+        self._other_maps: dict[int, OwnMap] = {}  # by rank, of the streams but the last
         self._parts = np.zeros(0, np.int64)  # the part of the map that each segment is in, when that was asked last
         self._claimed = np.zeros(0, np.int64)  # used loops by which the robot was found since the last optimisation
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
@@ -133,11 +135,12 @@ class ScanBackEnd(BackEnd):
 
     def _look_for_loops(self) -> None:
         """Ask for loops of the newest key."""
-        if (len(self.graph) - 1) % self.config.loops.every == 0:
+        begin = int(self.graph.streams[-1])
+        if (len(self.graph) - 1 - begin) % self.config.loops.every == 0:
             graph, joining = self.graph, self._joining_pairs
             distances = graph_distances(graph.poses, joining, len(self.graph) - 1, graph.segments)
             windows = distance_windows(self.config.windows, distances)
-            fresh = self._finder.find(self._scans, graph.poses, windows, segments=graph.borders)
+            fresh = self._finder.find(self._scans, graph.poses, windows, segments=graph.borders, begin=begin)
             self._scans.compact()
             believed = self._finder.believed(fresh, graph)
             if len(believed):
@@ -176,8 +179,55 @@ class ScanBackEnd(BackEnd):
         pairs = self._finder.loops.pairs[self._finder.used]
         weight = np.zeros(len(pairs))
         weight[: len(self.closed)] = self.closed.weight
+        return self._joining(pairs, weight)
+
+    def _joining(self, pairs: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Those of the keys ``(n, 2)`` that loops of this weight ``(n,)`` join."""
         first, last = segment_of(self.graph.segments, pairs).T
         return pairs[(first == last) | (weight > BELIEVED)]
+
+    def begin_stream(self, rank: int) -> None:
+        """Begin another stream of steps with the next one, which begins a segment; all work is done."""
+        self._other_maps[int(self.graph.ranks[-1])] = self._own_map
+        self._own_map = OwnMap(self.config)
+        self.graph.begin_stream(rank)
+
+    def go_on_with(self, rank: int) -> np.ndarray:
+        """Let the next step go on with another stream; all work is done.
+
+        Returns:
+            The old numbers of all frames ``(frames,)`` in their new order.
+        """
+        self._other_maps[int(self.graph.ranks[-1])] = self._own_map
+        self._own_map = self._other_maps.pop(rank)
+        order, frames = self.graph.go_on_with(rank)
+        number = np.argsort(order)
+        self._finder.reorder(self._scans, order)
+        self._scans.reorder(order)
+        for own_map in self._own_maps:
+            own_map.renumber(number)
+        self.closed = replace(self.closed, pairs=np.argsort(frames)[self.closed.pairs])
+        self._parts = joined_parts(self.graph.segments, self._joining_pairs)
+        return frames
+
+    @property
+    def _own_maps(self) -> tuple[OwnMap, ...]:
+        return *self._other_maps.values(), self._own_map
+
+    def places(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The part of the map of each of some nodes ``(n,)``, and the node ``(n,)`` at which that part begins."""
+        segments = self.graph.segments
+        if len(self._parts) != len(segments):
+            self._parts = joined_parts(segments, self._joining_pairs)
+        own = segment_of(segments, nodes)
+        return self._parts[own], self._anchors(self._parts)[own]
+
+    def _anchors(self, parts: np.ndarray) -> np.ndarray:
+        """The node ``(s,)`` at which the part of the map begins that each segment is in; of one stream the first."""
+        graph = self.graph
+        if len(graph.ranks) == 1:
+            return np.zeros_like(parts)
+        return anchors(graph.segments, parts, graph.ranks[graph.stream_of(graph.segments)])
 
     @property
     def lost_since(self) -> int | None:
@@ -192,8 +242,11 @@ class ScanBackEnd(BackEnd):
     def _thin(self) -> None:
         """Let go of key scans whose places newer ones show; what their edges said goes to their neighbours."""
         graph, loops, count = self.graph, self.used_loops, len(self.graph)
-        stays = np.arange(count) >= count - self._newest
-        stays[graph.ends_of_segments] = stays[self._own_map.looks] = True
+        nodes = np.arange(count)
+        stays = nodes > graph.stream_ends[graph.stream_of(nodes)] - self._newest
+        stays[graph.ends_of_segments] = True
+        for own_map in self._own_maps:
+            stays[own_map.looks] = True
         part = self._parts[segment_of(graph.segments, np.arange(count))]
         leaves = redundant_nodes(graph.poses, graph.borders, part, stays, count - self.config.most_scans)
         if leaves.any():
@@ -201,7 +254,8 @@ class ScanBackEnd(BackEnd):
             graph.let_go(~leaves, thinned.bridges)
             self._scans.thin(~leaves)
             self._finder.thin(~leaves, thinned.loops, self._newest)
-            self._own_map.thin(~leaves)
+            for own_map in self._own_maps:
+                own_map.thin(~leaves)
             self._loops_from_nothing = min(self._loops_from_nothing, len(thinned.loops))
             self._close(self.used_loops, thinned.weights)
 
@@ -261,14 +315,17 @@ class ScanBackEnd(BackEnd):
                 solution = None
         if solution is None:
             solution = self._corrected(self.graph.poses)
-        end = self._end_covariance(solution) if len(self.graph) > 1 else self.graph.end
-        require_sound(solution.poses, end)
+        parts = joined_parts(self.graph.segments, self._joining(loops.pairs, solution.loop_weights))
+        ends = self._end_covariances(solution, parts) if len(self.graph) > 1 else [self.graph.end]
+        for end in ends:
+            require_sound(solution.poses, end if end.any() else np.eye(3))  # none where the map begins
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
-        self.graph.move(solution.poses, end)
+        self.graph.move(solution.poses, *ends)
         self._close(loops, solution.loop_weights)
-        self._parts = joined_parts(self.graph.segments, self._joining_pairs)
+        self._parts = parts
         if self.graph.largest_move_m > _MOVED_M:
-            self._own_map.map_changed()
+            for own_map in self._own_maps:
+                own_map.map_changed()
         if len(self.graph) > self.config.most_scans + self.config.most_scans // 10:
             self._thin()
 
@@ -299,18 +356,23 @@ class ScanBackEnd(BackEnd):
         scale, before = float(self._scale[0]), self._loops_from_nothing
         return CorrectedGraph(problem, problem.poses, self.closed.weight, sound, 0.0, scale, loops_from_nothing=before)
 
-    def _end_covariance(self, solution: CorrectedGraph) -> np.ndarray:
-        """Covariance ``(3, 3)`` of the last node, with the steps as they are published.
+    def _end_covariances(self, solution: CorrectedGraph, parts: np.ndarray) -> list[np.ndarray]:
+        """Covariance ``(3, 3)`` of the last node of each stream, seen from where its part of the map begins, with the
+        steps as they are published.
 
         Neighbouring scans err together, so that small residuals do not say that covariances are stated too large. An
         edge that fits badly says less.
         """
         steps, loops = self.graph.published_steps, solution.problem.loops
-        parts = (
+        edges = (
             (steps, _soft_weights(solution.problem.steps, solution.poses, self.config.kernel)),
             (loops, solution.loop_weights * _soft_weights(loops, solution.poses, self.config.kernel)),
         )
-        return normal_equations(solution.poses, *parts).covariance([len(self.graph) - 1])
+        equations = normal_equations(solution.poses, *edges)
+        ends = self.graph.stream_ends
+        begins = self._anchors(parts)[segment_of(self.graph.segments, ends)]
+        pairs = zip(begins.tolist(), ends.tolist(), strict=True)
+        return [_seen_from(equations, solution.poses, begin, end) for begin, end in pairs]
 
     @property
     def unfinished(self) -> bool:
@@ -357,6 +419,23 @@ class ScanBackEnd(BackEnd):
             "key scans are searched, parts of the map named, or loops claimed that are not there",
         )
         require(self._waiting >= 0, f"an optimisation waits for {self._waiting} key scans")
+
+
+def _seen_from(equations: NormalEquations, poses: np.ndarray, begin: int, end: int) -> np.ndarray:
+    """Covariance ``(3, 3)`` of a node's pose, along the axes of the map, where the node ``begin`` is known."""
+    if begin == end:
+        return np.zeros((3, 3))
+    if 0 in (begin, end):
+        joint = np.zeros((6, 6))
+        row = 3 * (begin == 0)
+        joint[row : row + 3, row : row + 3] = equations.covariance([max(begin, end)])
+    else:
+        joint = equations.covariance((begin, end))
+    x, y = poses[end, :2] - poses[begin, :2]
+    # An error of the first moves and turns the other.
+    jacobian = np.concatenate((-np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0))), np.eye(3)), axis=1)
+    covariance: np.ndarray = jacobian @ joint @ jacobian.T
+    return covariance
 
 
 def _soft_weights(edges: RelativePoses, poses: np.ndarray, kernel: float) -> np.ndarray:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
-from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.data.relative_step import KeyScanStep, RejectedStep, RelativeStep
+from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.graph.pose_graph import OPEN
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
@@ -55,6 +56,38 @@ class ScanTrajectory(CorrectedTrajectory):
         """
         return self._join_at(replace(self._back_end.checked(step), segment=True), np.zeros(3), OPEN)
 
+    def begin_stream(self, step: RelativeStep, rank: int) -> TrajectoryUpdate:
+        """Take the first step of another odometry, which goes on beside those before; nobody knows where it is.
+
+        The steps that follow are of this stream, which is named by its ``rank``, until ``go_on_with`` is called.
+
+        Raises:
+            RejectedStep: as of ``update``; neither the step nor its beginning has a key scan.
+        """
+        checked = self._back_end.checked(step)
+        if self._log.steps == 0:
+            self.reset()
+            self._back_end.graph.name_stream(rank)
+            return self.update(step)
+        begin = first_frame(checked) or checked
+        if not self.may_join(begin):
+            raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
+        self._work()
+        present = int(self._back_end.graph.ranks[-1])
+        self._back_end.begin_stream(rank)
+        self._log.begin_stream(present)
+        update = self._join_at(replace(begin, segment=True), np.zeros(3), OPEN)
+        return update if begin is checked else self.update(step)
+
+    def go_on_with(self, rank: int) -> None:
+        """Let the next step go on with another stream."""
+        self._work()
+        present = int(self._back_end.graph.ranks[-1])
+        if rank != present:
+            frames = self._back_end.go_on_with(rank)
+            self._log.go_on_with(rank, present, frames)
+            self._online.set(self._online.values[frames])
+
     def walls(self, most: int) -> np.ndarray:
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
         return self._back_end.walls(most)
@@ -74,3 +107,17 @@ class ScanTrajectory(CorrectedTrajectory):
 
     def _new_back_end(self) -> ScanBackEnd:
         return ScanBackEnd(self._config)
+
+
+def first_frame(step: RelativeStep) -> RelativeStep | None:
+    """A step that ends at the frame where an odometry begins, of its first ``step``; None where no scan shows that."""
+    scan = step.origin_scan
+    if scan is None:
+        return None
+    begin_ns = step.from_stamp_ns
+    key = KeyScanStep(scan, begin_ns, np.zeros(3), OPEN)
+    odom = compose(step.odom_xyyaw, between(step.relative_xyyaw, np.zeros(3)))
+    return replace(
+        step, stamp_ns=begin_ns, from_stamp_ns=begin_ns - 1, relative_xyyaw=np.zeros(3), covariance=OPEN,
+        odom_xyyaw=odom, key=key, origin_scan=None, robot_odom_xyyaw=None,
+    )  # fmt: skip

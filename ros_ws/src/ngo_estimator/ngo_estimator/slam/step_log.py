@@ -43,6 +43,8 @@ class StepLog:
 
     def reset(self) -> None:
         """Forget everything: the next step begins a new trajectory."""
+        self._waiting: dict[int, tuple[int, np.ndarray]] = {}  # by rank, of the streams but the last
+        self._fresh = False  # whether a stream begins with the next step
         self.stamps_ns = GrowingRows((), np.int64)
         self.odometry = GrowingRows((3,), np.float64)
         """Poses of all frames in the ``odom`` of the first; that of a later odometry is laid behind it."""
@@ -63,11 +65,15 @@ class StepLog:
         return pose
 
     def is_restart(self, step: RelativeStep) -> bool:
-        """Whether a step comes from a source that started anew since the last one."""
+        """Whether a step comes from a source that started anew since the last one, or that went impossibly far."""
         if self.steps == 0:
             return False
         last = int(self.stamps_ns.values[-1])
-        return step.stamp_ns <= last - RESTART_AFTER_NS or step.origin_stamp_ns != self._origin_stamp_ns
+        if step.stamp_ns <= last - RESTART_AFTER_NS or step.origin_stamp_ns != self._origin_stamp_ns:
+            return True
+        # It would be so at every step to come.
+        over_gap = step.stamp_ns > last != step.from_stamp_ns
+        return over_gap and bool(np.abs(self._over_gap(step, last)[0]).max() > LARGEST_VALUE)
 
     def take(self, step: RelativeStep) -> TakenStep:
         """Take the next step, which has been checked.
@@ -89,10 +95,8 @@ class StepLog:
                 kind = DuplicateStep if step.stamp_ns == last else LateStep
                 raise kind(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
             elif step.from_stamp_ns != last:
+                gap = True
                 relative, covariance = self._over_gap(step, last)
-                gap = bool(np.abs(relative).max() <= LARGEST_VALUE)
-                if not gap:  # it would be so at every step to come
-                    restarted, relative, covariance = True, step.relative_xyyaw, step.covariance
         if restarted:
             self.reset()
         begins = self.steps == 0
@@ -113,14 +117,30 @@ class StepLog:
         self.check_later(step)
         laid = compose(self.last_odom, relative)
         self._moved = compose(laid, inverse(step.odom_xyyaw))
-        self._origin_stamp_ns = step.origin_stamp_ns
+        self._origin_stamp_ns, self._fresh = step.origin_stamp_ns, False
         self._append(step.stamp_ns, laid, covariance)
         return TakenStep(relative, covariance, begins=False, restarted=False, gap=False, joins=True)
+
+    def begin_stream(self, present: int) -> None:
+        """Let the next step, which ``join`` takes, begin another stream than that of the rank ``present``."""
+        self._waiting[present], self._fresh = (self._origin_stamp_ns, self._moved), True
+
+    def go_on_with(self, rank: int, present: int, order: np.ndarray) -> None:
+        """Go on with another stream than that of the rank ``present``.
+
+        ``order`` ``(frames,)`` are the old numbers of all frames in their new order.
+        """
+        self._waiting[present] = self._origin_stamp_ns, self._moved
+        self._origin_stamp_ns, self._moved = self._waiting.pop(rank)
+        self.stamps_ns.set(self.stamps_ns.values[order])
+        self.odometry.set(self.odometry.values[order])
+        unknown = np.full((1, 3), LARGEST_ODOMETRY, np.float32)
+        self.odometry_std.set(np.concatenate((unknown, self.odometry_std.values))[order][1:])
 
     def check_later(self, step: RelativeStep) -> None:
         """Raise ``LateStep`` if a step of another odometry is not newer than the last one."""
         last = int(self.stamps_ns.values[-1])
-        if step.stamp_ns <= last:
+        if step.stamp_ns <= last and not self._fresh:
             raise LateStep(
                 f"step to {step.stamp_ns} ns is of another odometry, and the loaded trajectory ends at {last} ns; "
                 "expected later stamps"

@@ -1,0 +1,227 @@
+"""Several robots in one map: each has a stream of steps, and all of them one graph (no ROS here).
+
+A stream is what one start of a robot's odometry gives. The first robot's map is the map of all. Another robot, or one
+that starts anew, begins a segment that nobody has measured: it has a map of its own until the search in the own map
+finds where it is, as for a robot that was carried.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, DuplicateStep, LateStep, RelativeStep
+from ngo_estimator.geometry.planar_covariance import bounded
+from ngo_estimator.geometry.planar_motion import between, compose, propagated, turned_covariance
+from ngo_estimator.geometry.se2 import between as between_all
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
+
+_MOST_WAITING = 100
+"""Steps without a key scan that wait until their robot's next key scan, at most."""
+
+
+@dataclass(frozen=True)
+class FleetUpdate:
+    """What a step of one robot changed.
+
+    ``update`` has the robot's pose in its map. ``map_of`` is the robot whose own map that is, None where it is the one
+    of all. ``begins``: the robot's odometry began with this step.
+    """
+
+    update: TrajectoryUpdate
+    map_of: str | None
+    begins: bool
+
+
+@dataclass
+class _Stream:
+    """Of one start of a robot's odometry: where it is, and steps that the graph does not have yet."""
+
+    rank: int
+    origin_stamp_ns: int
+    stamp_ns: int
+    odom_xyyaw: np.ndarray  # of the newest frame in the graph
+    waiting: list[RelativeStep] = field(default_factory=list)
+
+
+class Fleet:
+    """Takes the steps of several robots into one trajectory, in the order in which they come.
+
+    A robot's steps are in their order. Those of different robots may come late, their clocks may differ, and a robot
+    may be silent for as long as it likes.
+
+    Args:
+        core: the trajectory, without a frame.
+        robots: their names; the first one's map is the map of all.
+    """
+
+    def __init__(self, core: ScanTrajectory, robots: Sequence[str]) -> None:
+        if len(set(robots)) != len(robots) or not robots:
+            raise ValueError(f"robots are {list(robots)}; expected one or more different names")
+        self.core, self.robots = core, tuple(robots)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.core.reset()
+        self._streams: dict[str, _Stream] = {}
+        self._starts: dict[str, list[int]] = {robot: [] for robot in self.robots}  # ranks of all its streams
+
+    def update(self, robot: str, step: RelativeStep, optimize: bool = True) -> FleetUpdate:
+        """Take the next step of a robot.
+
+        A step without a key scan waits for one if another robot was the last to have one: it is answered by odometry.
+
+        Raises:
+            RejectedStep: as of ``ScanTrajectory.update``; a robot begins without a key scan.
+        """
+        stream, begins = self._streams.get(robot), False
+        step = self.core.back_end.checked(step)
+        if stream is None or _restarted(stream, step):
+            update, begins = self._begin(robot, step), True
+        else:
+            _check_later(stream, step)
+            update = self._go_on(stream, step, optimize)
+        return FleetUpdate(self._placed(robot, step, update), self.map_of(robot), begins)
+
+    def _begin(self, robot: str, step: RelativeStep) -> TrajectoryUpdate:
+        before = self._streams.get(robot)
+        if before is not None:
+            self._take_waiting(before)
+        rank = self._new_rank(robot)
+        update = self.core.begin_stream(step, rank)
+        self._starts[robot].append(rank)
+        self._streams[robot] = _Stream(rank, step.origin_stamp_ns, step.stamp_ns, step.odom_xyyaw)
+        return update
+
+    def _new_rank(self, robot: str) -> int:
+        """That of the first robot's first stream is the lowest."""
+        count = len(self.robots)
+        return self.robots.index(robot) if not self._starts[robot] else count + sum(map(len, self._starts.values()))
+
+    def _go_on(self, stream: _Stream, step: RelativeStep, optimize: bool) -> TrajectoryUpdate:
+        is_last = int(self.core.back_end.graph.ranks[-1]) == stream.rank
+        stream.stamp_ns = step.stamp_ns
+        if not is_last and step.key is None and len(stream.waiting) < _MOST_WAITING:
+            stream.waiting.append(step)
+            return replace(self.core.newest(), optimized=False, largest_move_m=0.0)
+        self._take_waiting(stream)
+        stream.odom_xyyaw = step.odom_xyyaw
+        return self.core.update(step, optimize)
+
+    def _take_waiting(self, stream: _Stream) -> None:
+        """Take the steps of a robot that wait, and let its next one follow them."""
+        self.core.go_on_with(stream.rank)
+        for step in stream.waiting:
+            self.core.update(step)
+            stream.odom_xyyaw = step.odom_xyyaw
+        stream.waiting.clear()
+
+    def correct(self) -> bool:
+        """Do the work that the newest step made due; returns whether poses have changed."""
+        update = self.core.correct()
+        return update is not None and update.optimized
+
+    def finish(self) -> bool:
+        """Optimise what is left, when no more steps come; returns whether poses have changed."""
+        return self.core.finish() is not None
+
+    def map_of(self, robot: str) -> str | None:
+        """The robot whose own map this robot is in, the first of those that are there; None: in the map of all."""
+        parts, begins = self._places()
+        graph = self.core.back_end.graph
+        own = list(self._streams).index(robot)
+        if graph.ranks[graph.stream_of(begins[own])] == 0:
+            return None
+        there = [name for name, part in zip(self._streams, parts, strict=True) if part == parts[own]]
+        return min(there, key=self.robots.index)
+
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """The part of the map in which each robot is, and where that begins; in the order of ``_streams``."""
+        graph = self.core.back_end.graph
+        ends = dict(zip(graph.ranks.tolist(), graph.stream_ends.tolist(), strict=True))
+        return self.core.back_end.places(np.array([ends[stream.rank] for stream in self._streams.values()]))
+
+    def _begin_pose(self, robot: str) -> np.ndarray:
+        """Where the robot's map begins in the graph ``(3,)``."""
+        begins = self._places()[1]
+        pose: np.ndarray = self.core.back_end.graph.poses[begins[list(self._streams).index(robot)]]
+        return pose
+
+    def _placed(self, robot: str, step: RelativeStep, update: TrajectoryUpdate) -> TrajectoryUpdate:
+        """What an update says, with the robot's newest pose in its map."""
+        pose, covariance = self.pose(robot)
+        map_from_odom = compose(pose, between(step.tf_odom_xyyaw, np.zeros(3)))
+        return replace(
+            update,
+            stamp_ns=step.stamp_ns,
+            pose_xyyaw=pose,
+            covariance=0.5 * (covariance + covariance.T),
+            map_from_odom_xyyaw=map_from_odom,
+            restarted=False,
+            lost_since_ns=None,
+        )
+
+    def pose(self, robot: str) -> tuple[np.ndarray, np.ndarray]:
+        """A robot's newest pose ``(3,)`` in its map, and its covariance ``(3, 3)`` there."""
+        stream, begin = self._streams[robot], self._begin_pose(robot)
+        pose, covariance = self.core.back_end.graph.newest_of(stream.rank)
+        odom = stream.odom_xyyaw
+        for step in stream.waiting:
+            since = between(odom, step.odom_xyyaw)
+            covariance = propagated(covariance, compose(pose, since), since, bounded(step.covariance))
+            pose, odom = compose(pose, since), step.odom_xyyaw
+        return between(begin, pose), turned_covariance(-float(begin[2]), covariance)
+
+    def trajectory(self, robot: str) -> Trajectory | None:
+        """The frames of a robot that are in the map in which it is now, in that map; None before its first step.
+
+        Where its clock went back, the frames from there on alone.
+        """
+        whole = self.core.trajectory() if robot in self._streams else None
+        if whole is None:
+            return None
+        back_end = self.core.back_end
+        graph, nodes = back_end.graph, back_end.graph.frames.nodes
+        node = np.searchsorted(nodes, np.arange(len(whole.stamps_ns)), side="right") - 1
+        parts = back_end.places(node)[0]
+        here = self._places()[0][list(self._streams).index(robot)]
+        ranks = graph.rank_of_frames
+        rows: list[np.ndarray] = []
+        for rank in reversed(self._starts[robot]):
+            stream = np.flatnonzero((ranks == rank) & (parts == here))
+            if rows and len(stream) and whole.stamps_ns[stream[-1]] >= whole.stamps_ns[rows[0][0]]:
+                break
+            rows[:0] = [stream] if len(stream) else []
+        return _part_of(whole, np.concatenate(rows), self._begin_pose(robot))
+
+
+def _restarted(stream: _Stream, step: RelativeStep) -> bool:
+    return step.origin_stamp_ns != stream.origin_stamp_ns or step.stamp_ns <= stream.stamp_ns - RESTART_AFTER_NS
+
+
+def _check_later(stream: _Stream, step: RelativeStep) -> None:
+    if step.stamp_ns <= stream.stamp_ns:
+        kind = DuplicateStep if step.stamp_ns == stream.stamp_ns else LateStep
+        raise kind(f"step to {step.stamp_ns} ns came when the robot was at {stream.stamp_ns} ns already")
+
+
+def _part_of(whole: Trajectory, frames: np.ndarray, begin: np.ndarray) -> Trajectory:
+    """The trajectory of some frames ``(n,)``, poses seen from ``begin`` ``(3,)``, and the loops among them."""
+    number = np.full(len(whole.stamps_ns), -1)
+    number[frames] = np.arange(len(frames))
+    loops = number[whole.loops]
+    own = (loops >= 0).all(1)
+    return Trajectory(
+        whole.stamps_ns[frames],
+        between_all(begin, whole.poses_xyyaw[frames]),
+        whole.odometry_xyyaw[frames],
+        whole.online_xyyaw[frames],
+        whole.moved_m[frames],
+        whole.odometry_std[frames[1:] - 1],
+        loops[own],
+        whole.loop_weights[own],
+        whole.loop_relative_xyyaw[own],
+        whole.loop_std[own],
+    )
