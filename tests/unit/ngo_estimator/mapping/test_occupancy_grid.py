@@ -114,3 +114,16 @@ def test_walls_of_a_corridor_fill_a_row_of_cells_each() -> None:
     grid.add([scan] * len(poses), poses)
     found = grid.cells(OccupancyConfig()).trinary(0.25, 0.65).cropped()
     assert (found.values[:, 20:60] == 100).sum(axis=1).tolist() == [40] + 19 * [0] + [40]
+
+
+def test_the_sum_of_grids_is_the_grid_of_all_scans() -> None:
+    scans, poses = random_scans(12, 3)
+    whole, parts = OccupancyGrid(0.1), [OccupancyGrid(0.1) for _ in range(3)]
+    whole.add(scans, poses)
+    for k, part in enumerate(parts[:2]):  # the third has no scan
+        part.add(scans[k::2], poses[k::2])
+    found, expected = (grid.cells(OccupancyConfig()) for grid in (OccupancyGrid.summed(parts), whole))
+    np.testing.assert_array_equal(found.values, expected.values)
+    np.testing.assert_array_equal(found.origin_xy, expected.origin_xy)
+    with pytest.raises(ValueError, match="expected one side"):
+        OccupancyGrid.summed([whole, OccupancyGrid(0.2)])

@@ -195,3 +195,22 @@ def test_a_restored_map_of_another_trajectory_is_left_out() -> None:
     take(again, range(20, 24), origin_ns=2)
     again.update(stamps(4, first=20), path(0.0, 24)[20:])
     assert (len(again), again.waiting) == (4, 0)
+
+
+def test_scans_that_are_withdrawn_leave_the_map_and_wait_for_their_poses() -> None:
+    scan_map = ScanMap(EVERY)
+    take(scan_map, range(30))
+    scan_map.update(stamps(30), path(0.01, 30))
+    assert scan_map.withdraw(stamps(10, first=20)) and not scan_map.withdraw(stamps(10, first=20))
+    assert (len(scan_map), scan_map.waiting) == (20, 10)
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(20)), path(0.01)))
+    scan_map.update(stamps(30), path(0.01, 30))
+    np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(30)), path(0.01)))
+
+
+def test_maps_of_several_robots_make_one() -> None:
+    maps = [ScanMap(EVERY), ScanMap(EVERY)]
+    for one, frames in zip(maps, (range(20), range(20, 40)), strict=True):
+        take(one, frames)
+        one.update(stamps(40), path(0.01, 40))
+    np.testing.assert_array_equal(maps[0].cells(maps[1:]).cropped().values, from_scratch(list(range(40)), path(0.01)))

@@ -31,6 +31,20 @@ def test_the_file_lists_every_parameter_with_its_default_and_description(name: s
     assert comments == [described(entry) for entry in fields(KINDS[name])]
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"robots": ["red", "red"]}, "list of different names"),
+        ({"robots": ["1st"]}, "list of different names"),
+        ({"robots": ["red"], "state": "monday"}, "with a state"),
+    ],
+)
+def test_robots_have_different_names_and_no_saved_state(given: dict[str, object], says: str) -> None:
+    for kind in (NgoNodeSettings, MapNodeSettings):
+        with pytest.raises(BadParameter, match=says):
+            make_settings(kind, given)
+
+
 @pytest.mark.parametrize("path", sorted(SRC.glob("*/config/*.yaml")), ids=lambda path: path.name)
 def test_every_file_is_accepted_in_any_namespace(path: Path) -> None:
     for name, content in yaml.safe_load(path.read_text()).items():

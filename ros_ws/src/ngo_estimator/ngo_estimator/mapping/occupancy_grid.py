@@ -114,6 +114,22 @@ class OccupancyGrid:
         values = _percent(self._hits, self._passes, config.hit, config.passed)
         return OccupancyMap(values, self.resolution_m, (self._low.astype(np.float64) - 0.5) * self.resolution_m)
 
+    @classmethod
+    def summed(cls, grids: Sequence["OccupancyGrid"]) -> "OccupancyGrid":
+        """The counts of several grids together; raises ``ValueError`` where their cells differ, ``MapTooLarge``."""
+        sides = {grid.resolution_m for grid in grids}
+        if len(sides) != 1:
+            raise ValueError(f"the grids have cells of {sorted(sides)} m; expected one side")
+        whole = cls(sides.pop())
+        known = [grid for grid in grids if grid._hits.size]
+        for grid in known:
+            whole._cover(np.stack((grid._low, grid._low + grid._hits.shape[::-1] - 1)).astype(np.float64))
+        for grid in known:
+            (column, row), (rows, columns) = (grid._low - whole._low).tolist(), grid._hits.shape
+            for name in ("_hits", "_passes"):
+                getattr(whole, name)[row : row + rows, column : column + columns] += getattr(grid, name)
+        return whole
+
     def _render(self, scans: Sequence[RangeScan], poses: Array, sign: int) -> None:
         if not len(scans):
             return

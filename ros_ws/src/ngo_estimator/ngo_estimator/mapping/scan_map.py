@@ -3,7 +3,7 @@
 import math
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -202,8 +202,12 @@ class ScanMap:
                 resolution_m = max(error.coarser, 2.0) * self._grid.resolution_m
                 if resolution_m > _COARSEST * self.config.resolution_m:
                     return str(error)
-                self._grid = OccupancyGrid(resolution_m)
-                self._grid.add(self._scans, self._poses)
+                self.redraw(resolution_m)
+
+    def redraw(self, resolution_m: float) -> None:
+        """Draw all scans anew in cells of another side (m); raises ``MapTooLarge``."""
+        self._grid = OccupancyGrid(resolution_m)
+        self._grid.add(self._scans, self._poses)
 
     def _moved_most_first(self, now: Array) -> np.ndarray:
         """Slots of the scans that have moved, by their poses now ``(scans, 3)``."""
@@ -213,9 +217,13 @@ class ScanMap:
         order = np.argsort(-moved_m, kind="stable")
         return order[: np.count_nonzero(moved_m > self.config.moved_cells * self._grid.resolution_m)]
 
-    def cells(self) -> OccupancyMap:
-        """The probabilities of the map's cells."""
-        return self._grid.cells(self.config.occupancy)
+    def cells(self, others: Sequence["ScanMap"] = ()) -> OccupancyMap:
+        """The probabilities of the map's cells, by the scans of other maps of the same frame as well.
+
+        Raises ``MapTooLarge`` for maps that lie too far apart.
+        """
+        grid = OccupancyGrid.summed([self._grid, *(other._grid for other in others)]) if others else self._grid
+        return grid.cells(self.config.occupancy)
 
     def _begin_anew_for(self, stamps_ns: np.ndarray) -> bool:
         """Forget the map of another trajectory than this one; returns whether there was one."""
@@ -262,6 +270,21 @@ class ScanMap:
         self._grid.remove([self._scans[slot] for slot in np.flatnonzero(gone)], self._poses[gone])
         self._scans = [scan for scan, leaves in zip(self._scans, gone, strict=True) if not leaves]
         self._stamps, self._poses, self._reach = self._stamps[~gone], self._poses[~gone], self._reach[~gone]
+
+    def withdraw(self, stamps_ns: np.ndarray) -> bool:
+        """Let the scans of these stamps ``(n,)`` wait for their poses again; returns whether there were any."""
+        gone = np.isin(self._stamps, stamps_ns)
+        for slot in np.flatnonzero(gone).tolist():
+            stamp = int(self._stamps[slot])
+            self._waiting[stamp] = self._map_run, self._scans[slot]
+        if gone.any():
+            stay = set(self._stamps[~gone].tolist())
+            for place in self._places.values():
+                kept = [stamp for stamp in place if stamp in stay]
+                place.clear()
+                place.extend(kept)
+            self._remove(gone)
+        return bool(gone.any())
 
     def _move(self, slots: np.ndarray, poses: Array) -> None:
         scans = [self._scans[slot] for slot in slots]

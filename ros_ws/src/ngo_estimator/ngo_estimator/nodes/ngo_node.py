@@ -27,6 +27,7 @@ from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.managed_node import ManagedNode
 from ngo_estimator.nodes.pose_publisher import PosePublisher
 from ngo_estimator.nodes.pose_search import PoseSearch
+from ngo_estimator.nodes.robot_fleet import RobotFleet
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
@@ -59,6 +60,8 @@ class NgoNode(ManagedNode):
     With ``mode`` localization the trajectory is the one that was saved and stays so: it is the map in which the robot's
     pose is looked for. A session that goes on from another start is such a map until the robot is found.
 
+    With ``robots`` there are several streams of relative poses, and one trajectory (``RobotFleet``).
+
     A managed node: configured it has its networks, its topics and its services, active it takes relative poses.
     """
 
@@ -68,6 +71,7 @@ class NgoNode(ManagedNode):
         self._live = LiveSettings(self, NgoNodeSettings)
         self._live.on_change(self._on_settings)
         self._inputs: list[Input] = []
+        self._fleet: RobotFleet | None = None
         self._configured = False
         if not self._settings.autostart:
             name = self.get_fully_qualified_name()
@@ -85,6 +89,12 @@ class NgoNode(ManagedNode):
 
     def _configure(self) -> None:
         settings, built = self._settings, self._built
+        if settings.robots:
+            self._live.lock()
+            built.callback(self._live.lock, False)
+            self._fleet = RobotFleet(self, settings, built)
+            built.callback(setattr, self, "_fleet", None)
+            return
         # Imported here because torch takes seconds: a bad parameter is said at once.
         from ngo_estimator.slam.map_origin import MapOrigin
         from ngo_estimator.slam.session import Session
@@ -136,6 +146,9 @@ class NgoNode(ManagedNode):
 
     def _listen(self) -> None:
         settings, listening = self._settings, self._listening
+        if self._fleet is not None:
+            self._fleet.listen(listening)
+            return
         with checked_overrides():
             steps = Input(
                 self,
@@ -403,6 +416,8 @@ class NgoNode(ManagedNode):
         return response
 
     def _on_settings(self, settings: NgoNodeSettings) -> None:
+        if self._fleet is not None:
+            self._fleet.change(settings)
         if not self._configured:
             return
         self._status.set_period(settings.diagnostics_period_s)

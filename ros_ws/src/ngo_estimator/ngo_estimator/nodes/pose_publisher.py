@@ -41,9 +41,15 @@ class PosePublisher:
         topics = settings()
         self._pose = publisher(PoseWithCovarianceStamped, topics.pose_topic)
         self._tf = publisher(TFMessage, topics.tf_topic) if topics.publish_tf else None
-        map_frame, odom_frame = topics.framed(topics.map_frame), topics.framed(topics.odom_frame)
-        self._pose_writer = PoseWriter(map_frame, serialize_message)
-        self._tf_writer = TransformsWriter([(map_frame, odom_frame)], serialize_message)
+        self._odom_frame = topics.framed(topics.odom_frame)
+        self.use_map(topics.framed(topics.map_frame))
+
+    def use_map(self, frame: str) -> None:
+        """Publish in another map's frame from now on."""
+        self.map_frame = frame
+        self._pose_writer = PoseWriter(frame, serialize_message)
+        self._tf_writer = TransformsWriter([(frame, self._odom_frame)], serialize_message)
+        self.smoothing.reset()
 
     def publish(
         self,

@@ -14,6 +14,28 @@ _TRANSPORTS = ("raw", "compressed")
 _TWISTS = ("TwistStamped", "Twist", "Odometry")
 
 
+_ROBOT_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
+
+
+def _robots(description: str) -> tuple[str, ...]:
+    """A field that holds names of robots."""
+    names: tuple[str, ...] = setting(
+        (),
+        description,
+        allowed="a list of different names, each of a letter and then letters, digits and _",
+        check=lambda value: (
+            all(isinstance(name, str) and _ROBOT_NAME.fullmatch(name) for name in value)
+            and len(set(value)) == len(value)
+        ),
+    )
+    return names
+
+
+def of_robot(robot: str, topic_name: str) -> str:
+    """The name of a robot's topic: that of one robot alone, in the robot's namespace."""
+    return f"{robot}/{topic_name.removeprefix('/')}"
+
+
 @dataclass(frozen=True)
 class StepSettings(FramedSettings):
     """Parameters of every node that publishes or takes relative poses."""
@@ -162,6 +184,10 @@ class NgoNodeSettings(EstimatorSettings):
         maximum=100,
     )
     map_frame: str = frame("map", "Frame of the corrected trajectory, which may jump.")
+    robots: tuple[str, ...] = _robots(
+        "Namespaces of several robots with a lidar each, which are mapped together: the topics of each are there, and "
+        "its frames have the name and / in front. Empty: one robot."
+    )
     initial_pose: tuple[float, float, float] = pose(
         (0.0, 0.0, 0.0),
         "Pose of a trajectory's first frame in map_frame; a change holds from the next trajectory on.",
@@ -228,6 +254,10 @@ class NgoNodeSettings(EstimatorSettings):
         super().__post_init__()
         if self.map_frame == self.odom_frame:
             raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
+        if self.robots and (self.mode != "mapping" or self.state):
+            raise BadParameter(
+                f"parameter 'robots' is {list(self.robots)}; allowed: none with mode localization, or with a state"
+            )
         for name, value in (("mode", "localization"), ("state_mode", "relocalise")):
             if getattr(self, name) == value and not self.state:
                 raise BadParameter(
@@ -255,6 +285,10 @@ class MapNodeSettings(StepSettings):
         0.5, "Least time between two maps, s.", minimum=0.05, maximum=3600.0, live=True
     )
     map_frame: str = frame("map", "Frame of the map, that of trajectory_topic.")
+    robots: tuple[str, ...] = _robots(
+        "Namespaces of several robots, as ngo_node has them: the map shows what those in map_frame saw. Empty: one "
+        "robot."
+    )
     trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory, from ngo_node.")
     map_topic: str = topic("map", "Map; changes of a part of it go to a topic of this name with _updates behind it.")
     save_directory: str = setting(
@@ -263,3 +297,8 @@ class MapNodeSettings(StepSettings):
         "directory of the node.",
     )
     state: str = setting("", "Folder of the scans of a saved map, relative to save_directory; empty: none.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.robots and self.state:
+            raise BadParameter(f"parameter 'robots' is {list(self.robots)}; allowed: none with a state")

@@ -42,8 +42,7 @@ class TrajectoryPublishers:
         """Publish the trajectory of ``snapshot()`` on the three topics of ``settings``."""
         self._node = node
         self._snapshot = snapshot
-        self._frame_id = settings.framed(settings.map_frame)
-        self._writer, self._loop_writer = PathWriter(self._frame_id), LoopMarkerWriter(self._frame_id)
+        self.use_map(settings.framed(settings.map_frame))
         self._path = self._create(Path, settings.path_topic)
         self._trajectory = self._create(Trajectory, settings.trajectory_topic)
         self._loops = self._create(MarkerArray, settings.loops_topic)
@@ -52,6 +51,11 @@ class TrajectoryPublishers:
         """How many paths were published."""
         self._timer: Timer | None = None
         self.set_rate(settings.path_rate_hz)
+
+    def use_map(self, frame: str) -> None:
+        """Publish in a map's frame from now on."""
+        self._frame_id = frame
+        self._writer, self._loop_writer = PathWriter(frame), LoopMarkerWriter(frame)
 
     def close(self) -> None:
         """Publish no more."""

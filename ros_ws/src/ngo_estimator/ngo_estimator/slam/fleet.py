@@ -127,6 +127,12 @@ class Fleet:
         """Optimise what is left, when no more steps come; returns whether poses have changed."""
         return self.core.finish() is not None
 
+    def again(self, robot: str, last: FleetUpdate) -> FleetUpdate:
+        """A robot's ``last`` update as it would be now."""
+        pose, covariance = self.pose(robot)
+        odom = compose(between(last.update.map_from_odom_xyyaw, np.zeros(3)), last.update.pose_xyyaw)
+        return FleetUpdate(self._at(last.update, pose, covariance, odom), self.map_of(robot), begins=False)
+
     def map_of(self, robot: str) -> str | None:
         """The robot whose own map this robot is in, the first of those that are there; None: in the map of all."""
         parts, begins = self._places()
@@ -151,11 +157,15 @@ class Fleet:
 
     def _placed(self, robot: str, step: RelativeStep, update: TrajectoryUpdate) -> TrajectoryUpdate:
         """What an update says, with the robot's newest pose in its map."""
-        pose, covariance = self.pose(robot)
-        map_from_odom = compose(pose, between(step.tf_odom_xyyaw, np.zeros(3)))
+        at = self._at(update, *self.pose(robot), step.tf_odom_xyyaw)
+        return replace(at, stamp_ns=step.stamp_ns)
+
+    @staticmethod
+    def _at(update: TrajectoryUpdate, pose: np.ndarray, covariance: np.ndarray, odom: np.ndarray) -> TrajectoryUpdate:
+        """An update with another pose, whose robot is at ``odom`` ``(3,)`` on TF."""
+        map_from_odom = compose(pose, between(odom, np.zeros(3)))
         return replace(
             update,
-            stamp_ns=step.stamp_ns,
             pose_xyyaw=pose,
             covariance=0.5 * (covariance + covariance.T),
             map_from_odom_xyyaw=map_from_odom,

@@ -1,0 +1,77 @@
+"""Two robots and one ngo_node over DDS: each has its own map until they meet, then there is one map."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from ngo_msgs.msg import RelativePose
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from tf2_msgs.msg import TFMessage
+
+from ngo_estimator.nodes.messages import relative_pose_message
+from ngo_estimator.slam.fleet import Fleet
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from tests.golden.drives import WEIGHTS
+from tests.unit.ngo_estimator.slam.test_fleet import robots
+
+from .processes import Diagnostics, NodeProcess, Probe
+
+pytestmark = pytest.mark.processes
+
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NAMES = ("red", "blue")
+MOST = 45
+"""Relative poses of each robot until they have met, at most."""
+
+
+@contextmanager
+def nodes(probe: Probe) -> Iterator[None]:
+    both = {"world": "scan", "robots": list(NAMES)}
+    with (
+        NodeProcess("ngo_estimator", "ngo_node", both),
+        NodeProcess("ngo_estimator", "ngo_map", {**both, "map_update_interval": 0.05, "diagnostics_period_s": 0.2}),
+    ):
+        probe.meet("/ngo_node", "/ngo_map")
+        yield
+
+
+def frames(message: TFMessage) -> tuple[str, str]:
+    (transform,) = message.transforms
+    return transform.header.frame_id, transform.child_frame_id
+
+
+def test_robots_that_meet_are_in_one_map_frame_and_on_one_map() -> None:
+    core = Fleet(ScanTrajectory.load(WEIGHTS / "scan", "scan", iterations_per_step=1), NAMES)  # as ngo_node by default
+    with Probe() as probe:
+        poses = {name: probe.collect(PoseWithCovarianceStamped, f"/{name}/ngo/pose", 1000) for name in NAMES}
+        transforms = probe.collect(TFMessage, "/tf", 1000)
+        diagnostics = Diagnostics(probe)
+        maps = probe.collect(OccupancyGrid, "/map", LATCHED)
+        steps = {name: probe.node.create_publisher(RelativePose, f"/{name}/relative_pose", 2000) for name in NAMES}
+        with nodes(probe):
+            probe.spin_until(
+                lambda: all(publisher.get_subscription_count() == 2 for publisher in steps.values()), "both nodes"
+            )
+            for k in range(MOST):
+                for name in NAMES:
+                    step = robots()[name][k]
+                    steps[name].publish(relative_pose_message(step, "base_link"))
+                    probe.spin_until(lambda name=name, k=k: len(poses[name]) > k, "the pose of a step")  # type: ignore[misc]
+                    expected = core.update(name, step)
+                    core.correct()
+                    frame = "map" if expected.map_of is None else f"{expected.map_of}/map"
+                    assert poses[name][k].header.frame_id == frame
+                    at = poses[name][k].pose.pose.position
+                    np.testing.assert_allclose((at.x, at.y), expected.update.pose_xyyaw[:2], atol=1e-4)
+                if frame == "map":  # of both
+                    break
+            assert poses["blue"][0].header.frame_id == "blue/map" and poses["blue"][-1].header.frame_id == "map"
+            expected_frames = {("map", "red/odom"), ("blue/map", "blue/odom"), ("map", "blue/odom")}
+            probe.spin_until(lambda: set(map(frames, transforms)) == expected_frames, "the transforms of both")
+            # What blue saw before is on the map as well.
+            diagnostics.wait_for_value("/ngo_map", "scans that wait for their poses", lambda value: value == "0")
+            assert maps[-1].header.frame_id == "map"
+            assert int(diagnostics.values("/ngo_map")["scans in the map"]) > 1.5 * k
