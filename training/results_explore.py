@@ -3,13 +3,16 @@
     python -m training.results --world explore
     python -m training.results --world explore --worlds mazes --count 20 --rows explore_lite ours
     python -m training.results --world explore --worlds plans --plans FOLDER
+    python -m training.results --world explore --worlds good_wheels no_wheels --buildings 2 --rows nearest ours
 
-The robot explores in this process, at true poses, with the same map, follower and limits in all rows. FOLDER holds maps
-of a map server as NAME.yaml. What is measured is kept in ``runs/``. The command writes
-``training/results/explore.json``, ``docs/results_explore.md`` and ``docs/images/results_explore_*.png``.
+The robot explores in this process, with the same map, follower and limits in all rows. In mazes, buildings and plans it
+knows its true poses. In good_wheels, slipping_wheels and no_wheels it is in buildings, and its poses and its map are
+those of the lidar's estimators. FOLDER holds maps of a map server as NAME.yaml. What is measured is kept in ``runs/``.
+The command writes ``training/results/explore.json``, ``docs/results_explore.md`` and
+``docs/images/results_explore_*.png``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,16 +38,29 @@ from ngo_sim.maze2d import Maze2DConfig
 from training.common import records
 from training.data import explored_worlds
 from training.data.building_drives import BUILDING_TEST_SEEDS
-from training.data.explored_worlds import Building, ExploredWorld, Maze
+from training.data.explored_worlds import WHEELS, Building, ExploredWorld, Maze
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS
 from training.report import explore_page
 from training.report.explore_figures import draw_figures
 from training.report.folders import Folders
-from training.scoring import exploring, known_tour
+from training.scoring import exploring, known_tour, own_poses
 from training.scoring.exploring import Explored, Seen, drive_known_tour, explore
 from training.scoring.map_errors import intersections
+from training.scoring.own_poses import OwnPoses
 from training.scoring.statistics import mean_interval
-from training.scoring.table import Drive, Measured, Numbers, Row, Table, column, intervals, measure, pairs, samples
+from training.scoring.table import (
+    Drive,
+    Measured,
+    Numbers,
+    Row,
+    Table,
+    column,
+    folder_digest,
+    intervals,
+    measure,
+    pairs,
+    samples,
+)
 
 ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours")
 BASE = "explore_lite"
@@ -54,20 +70,25 @@ _BUILDING_SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SE
 _MAZE_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
 
+Kind = Literal["mazes", "buildings", "plans", "good_wheels", "slipping_wheels", "no_wheels"]
+
+
 @dataclass(frozen=True)
 class Arguments(Folders):
     """Settings of the table."""
 
     world: Literal["explore"] = "explore"
     """World to measure in."""
-    worlds: tuple[Literal["mazes", "buildings", "plans"], ...] = ("mazes", "buildings")
-    """Kinds of places: 2D mazes, drawn buildings, floor plans from files."""
+    worlds: tuple[Kind, ...] = ("mazes", "buildings")
+    """Kinds of places: 2D mazes, drawn buildings, floor plans from files, and buildings with poses of its own."""
     plans: Path | None = None
     """Folder of floor plans, for the kind plans."""
     rows: tuple[str, ...] = ROWS
     """Rules to measure; explore_lite is always measured."""
     count: int = 10
-    """Places of each kind; of plans all are taken."""
+    """Mazes."""
+    buildings: int = 4
+    """Buildings of each kind; of plans all are taken."""
     scale: float = 0.5
     """Factor on the length of the corridors of drawn buildings."""
     most_s: float = 7200.0
@@ -80,8 +101,11 @@ class Arguments(Folders):
             raise ValueError(f"rows has {', '.join(unknown)}; expected among {', '.join(ROWS)}")
         if "plans" in self.worlds and self.plans is None:
             raise ValueError("the kind plans needs --plans, which is not given")
-        if self.count < 2 or not self.most_s > 0.0:
-            raise ValueError(f"count, most_s are {self.count}, {self.most_s}; expected at least 2, and a time")
+        if min(self.count, self.buildings) < 2 or not self.most_s > 0.0:
+            raise ValueError(
+                f"count, buildings, most_s are {self.count}, {self.buildings}, {self.most_s}; expected at least 2, and "
+                "a time"
+            )
 
 
 @dataclass(frozen=True)
@@ -95,27 +119,37 @@ class Place:
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     record = records.record("results", arguments)
-    rows = {name: _row(name, arguments) for name in ROWS if name in (*arguments.rows, BASE)}
-    found: dict[str, Table] = {
-        kind: measure([(drive, rows) for drive in _drives(kind, arguments)], arguments.runs / "explore" / kind, kind)
-        for kind in arguments.worlds
-    }
+    names = [name for name in ROWS if name in (*arguments.rows, BASE)]
+    found: dict[str, Table] = {kind: _table(kind, names, arguments) for kind in arguments.worlds}
     result = {
         "command": _command(arguments),
         "revision": record["revision"],
-        "settings": {name: getattr(arguments, name) for name in ("split", "count", "scale", "most_s")},
-        "poses": "true",
-        "tables": {kind: {row: _numbers(table, row) for row in rows} for kind, table in found.items()},
-        "paired": {kind: {row: _paired(table, row) for row in rows if row != BASE} for kind, table in found.items()},
+        "settings": {name: getattr(arguments, name) for name in ("split", "scale", "most_s")},
+        "places": {kind: len(table) for kind, table in found.items()},
+        "poses": {kind: "own" if kind in WHEELS else "true" for kind in found},
+        "tables": {
+            kind: {row: _numbers(table, row) for row in names if column(table, row)} for kind, table in found.items()
+        },
+        "paired": {
+            kind: {row: _paired(table, row) for row in names if row != BASE and column(table, row)}
+            for kind, table in found.items()
+        },
     }
     images = draw_figures(arguments.images, found)
     return arguments.publish("explore", result, explore_page.page(result, images))
 
 
 def _command(arguments: Arguments) -> str:
-    chosen = f"--worlds {' '.join(arguments.worlds)} --count {arguments.count}"
+    chosen = f"--worlds {' '.join(arguments.worlds)} --count {arguments.count} --buildings {arguments.buildings}"
     rows = "" if arguments.rows == ROWS else f" --rows {' '.join(arguments.rows)}"
     return f'make results WORLD=explore ARGS="{chosen}{rows}"'
+
+
+def _table(kind: Kind, names: Sequence[str], arguments: Arguments) -> Table:
+    """A robot with poses of its own has no tour on the known map: nobody drives that without knowing where he is."""
+    rows = {name: _row(name, kind, arguments) for name in names if kind not in WHEELS or name != "known_tour"}
+    plan = [(drive, rows) for drive in _drives(kind, arguments)]
+    return measure(plan, arguments.runs / "explore" / kind, kind)
 
 
 def _drives(kind: str, arguments: Arguments) -> Iterator[Drive]:
@@ -127,10 +161,11 @@ def _places(kind: str, arguments: Arguments) -> Iterator[tuple[str, str, Callabl
     if kind == "mazes":
         for seed in _MAZE_SEEDS[arguments.split][: arguments.count]:
             yield f"maze_{seed}", f"maze {seed}", partial(Maze, seed, Maze2DConfig())
-    elif kind == "buildings":
-        plan = FloorPlanConfig(scale=arguments.scale, people=0)
-        for seed in _BUILDING_SEEDS[arguments.split][: arguments.count]:
-            yield f"building_{seed}_{arguments.scale:g}", f"building {seed} {plan}", partial(Building, seed, plan)
+    elif kind != "plans":
+        plan, wheels = FloorPlanConfig(scale=arguments.scale, people=0), WHEELS.get(kind)
+        for seed in _BUILDING_SEEDS[arguments.split][: arguments.buildings]:
+            make = partial(Building, seed, plan, wheels=wheels)
+            yield f"building_{seed}_{arguments.scale:g}", f"building {seed} {plan} {wheels}", make
     else:
         assert arguments.plans is not None
         for path in sorted(arguments.plans.glob("*.yaml")):
@@ -142,17 +177,24 @@ def _place(make: Callable[[], ExploredWorld]) -> Place:
     return Place(make, Seen(make()))
 
 
-def _row(name: str, arguments: Arguments) -> Row:
-    return Row(partial(_measure, name=name, most_s=arguments.most_s), f"{name} {arguments.most_s}", _CODE)
+def _row(name: str, kind: Kind, arguments: Arguments) -> Row:
+    identity = f"{name} {arguments.most_s}"
+    if kind not in WHEELS:
+        return Row(partial(_measure, name=name, most_s=arguments.most_s), identity, _CODE)
+    weights = records.WEIGHTS / "scan"
+    make = partial(_measure, name=name, most_s=arguments.most_s, estimator=partial(OwnPoses, weights))
+    return Row(make, f"{identity} {folder_digest(weights)}", (*_CODE, own_poses))
 
 
-def _measure(place: Place, name: str, most_s: float) -> Measured:
+def _measure(
+    place: Place, name: str, most_s: float, estimator: Callable[[np.ndarray], OwnPoses] | None = None
+) -> Measured:
     world = place.make()
     config = ExplorerConfig(rule="tour" if name in ("ours", "known_tour") else name, radius_m=world.radius_m)
     if name == "known_tour":
         run = drive_known_tour(world, place.seen, config, DriveConfig(), most_s)
     else:
-        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s)
+        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s, estimator=estimator)
     return Measured.of(
         scores(run, place.seen),
         path_m=run.path_m,
@@ -168,6 +210,7 @@ def scores(run: Explored, seen: Seen) -> dict[str, float]:
     """The metrics of one exploration; a path that never reached 95 % has no length."""
     free, occupied = intersections(run.found, seen.map)
     found: dict[str, float] = {
+        **run.errors,
         "ended_early": float(run.ended and run.coverage[-1] < 0.98),
         "ended": float(run.ended),
         "coverage": float(run.coverage[-1]),
@@ -184,8 +227,7 @@ def scores(run: Explored, seen: Seen) -> dict[str, float]:
 
 def _numbers(table: Table, row: str) -> Numbers:
     """``{mean, ci95}`` by metric; ``ate_m`` is empty at true poses."""
-    found = intervals(samples(column(table, row)))
-    return {**found, "ate_m": {"mean": None, "ci95": None}}
+    return {"ate_m": {"mean": None, "ci95": None}, **intervals(samples(column(table, row)))}
 
 
 def _paired(table: Table, row: str) -> dict[str, Any]:

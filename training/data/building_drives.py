@@ -11,6 +11,7 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from ngo_sim.building2d import Building2d, BuildingDrive
 from ngo_sim.floor_plans import FloorPlanConfig
+from ngo_sim.lidar import ScannerConfig
 from ngo_sim.wheels import WheelsConfig
 from training.data.lidar_drives import LidarDrive, TruePoses, simulated_stamps_ns
 
@@ -87,22 +88,26 @@ def two_buildings(seeds: tuple[int, int], length_m: float, most_scans: int = 100
 def lidar_drive(drive: BuildingDrive, name: str, identity: str) -> LidarDrive:
     """What a robot measured on a drive, as a recording has it."""
     scanner = drive.scanner
-    increment = scanner.increment_rad * (1.0 + scanner.increment_error)
     stamps_ns = simulated_stamps_ns(drive.stamps_s)
     scans = tuple(
-        LidarScan(
-            stamp_ns,
-            float(scanner.angles_rad[0]),
-            increment,
-            ranges,
-            scanner.range_min_m,
-            scanner.range_max_m,
-            scanner.time_increment_s,
-            _FRAME,
-        )
+        measured_scan(scanner, stamp_ns, ranges)
         for stamp_ns, ranges in zip(stamps_ns.tolist(), drive.ranges_m, strict=True)
     )
     wheels = tuple(map(WheelPose, simulated_stamps_ns(drive.wheel_stamps_s).tolist(), drive.wheel_poses_xyyaw))
     pose = np.array((scanner.laser_x_m, scanner.laser_y_m, math.radians(scanner.laser_yaw_deg)))
     truth = TruePoses(stamps_ns, drive.true_poses_xyyaw)
     return LidarDrive(name, identity, scans, wheels, Mounting(pose, scanner.upside_down), truth)
+
+
+def measured_scan(scanner: ScannerConfig, stamp_ns: int, ranges: np.ndarray) -> LidarScan:
+    """The ranges ``(rays,)`` of a simulated scanner as its driver publishes them."""
+    return LidarScan(
+        stamp_ns,
+        float(scanner.angles_rad[0]),
+        scanner.increment_rad * (1.0 + scanner.increment_error),
+        ranges,
+        scanner.range_min_m,
+        scanner.range_max_m,
+        scanner.time_increment_s,
+        _FRAME,
+    )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from ngo_estimator.mapping.range_scan import RangeScan, range_scan
+from ngo_recordings.scan_stream import LidarScan, WheelPose
 from ngo_sim.building2d import Building2d
 from ngo_sim.building_drivers import BuildingDriverConfig
 from ngo_sim.floor_plans import FloorPlan, FloorPlanConfig
@@ -17,20 +19,35 @@ from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.raycast import cast_rays
 from ngo_sim.routes import CELL_M, RouteMap
 from ngo_sim.simulation import Simulation
+from ngo_sim.wheels import WheelsConfig
+from training.data.building_drives import measured_scan
+from training.data.lidar_drives import simulated_stamps_ns
 
 _APART_M = 0.4  # between two places that say what can be seen
 _RAYS = 720
 _RANGE_M = 12.0  # of the robot's lidar
 
+WHEELS = {
+    "good_wheels": WheelsConfig(left_bias=0.002, right_bias=-0.001, wheel_noise=0.005),
+    "slipping_wheels": WheelsConfig(left_bias=0.03, right_bias=0.028, wheel_noise=0.01, slips_per_km=60.0),
+    "no_wheels": None,
+}
+"""Wheels of a robot that estimates its poses, by how good they are; None: its lidar is all that it has."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Where a robot is and what it sees: true pose ``(3,)``, the rays, and whether something stopped it on the way."""
+    """Where a robot is and what it sees: true pose ``(3,)``, the rays, and whether something stopped it on the way.
+
+    ``stamp_ns`` and ``records`` are of what an estimator hears: wheels, where the robot has any, and the scan.
+    """
 
     time_s: float
     pose_xyyaw: np.ndarray
     scan: RangeScan
     blocked: bool
+    stamp_ns: int = 0
+    records: Sequence[LidarScan | WheelPose] = ()
 
 
 class ExploredWorld(Protocol):
@@ -49,16 +66,19 @@ class ExploredWorld(Protocol):
 
 
 class Building:
-    """A building of a seed; a robot with a lidar of 270 degrees and 12 m."""
+    """A building of a seed; a robot with a lidar of 270 degrees and 12 m, and with ``wheels`` if it tells of any."""
 
     range_m = _RANGE_M
 
-    def __init__(self, seed: int, plan: FloorPlanConfig, speed_mps: float = 1.0) -> None:
+    def __init__(
+        self, seed: int, plan: FloorPlanConfig, speed_mps: float = 1.0, wheels: WheelsConfig | None = None
+    ) -> None:
         self._driver = BuildingDriverConfig(driver="cmd_vel", speed_mps=speed_mps, acceleration_mps2=1.0)
         self.radius_m = self._driver.radius_m
         self._scanner = ScannerConfig(range_max_m=_RANGE_M, rays=360)
         self._angles = self._scanner.base_angles_rad()
-        self._building = Building2d(plan, self._scanner, driver=self._driver)
+        self._has_wheels = wheels is not None
+        self._building = Building2d(plan, self._scanner, wheels or WheelsConfig(), self._driver)
         self._building.reset(seed)
 
     @property
@@ -72,7 +92,10 @@ class Building:
         frame = self._building.step()
         # Of rays without a return nothing is known: glass, a dropout, or nothing within the range.
         scan = range_scan(self._angles, frame.ranges_m.astype(np.float64), np.zeros(3), _RANGE_M)
-        return Sight(frame.stamp_s, frame.true_pose_xyyaw, scan, self._building.blocked)
+        stamp_ns, wheels_ns = simulated_stamps_ns(np.array((frame.stamp_s, frame.wheel_stamp_s))).tolist()
+        wheels = [WheelPose(wheels_ns, frame.wheel_pose_xyyaw)] if self._has_wheels else []
+        records: list[LidarScan | WheelPose] = [*wheels, measured_scan(self._scanner, stamp_ns, frame.ranges_m)]
+        return Sight(frame.stamp_s, frame.true_pose_xyyaw, scan, self._building.blocked, stamp_ns, records)
 
     def exact_scans(self) -> tuple[list[RangeScan], np.ndarray]:
         """Exact scans all over where the robot can go; doors that it cannot rely on are shut, and glass is a wall."""

@@ -13,6 +13,8 @@ _COLUMNS = (
     Column("coverage", "Seen at the end, %", number, 100.0),
     Column("ended_early", "Ended under 98 %, %", number, 100.0),
     Column("iou", "IoU of the map", number),
+    Column("ate_m", "ATE, m", number),
+    Column("within", "Within three deviations, %", number, 100.0),
     Column("collisions", "Collisions a km", number),
     Column("decision_ms", "Decision, 99 %, ms", number),
 )
@@ -28,15 +30,29 @@ _ROWS = {
 _INTRODUCTION = """# Results: exploration
 
 Written by `{command}`
-at revision {revision}. {count} places of each kind, {split} seeds, one run each; drawn buildings have corridors of
-{scale:g} of the usual length. The robot drives at **true poses**: no row says anything about the error of
-the estimator. Robot, map, path follower and limits are the same in all rows; explore_lite's has its own
+at revision {revision}. Seeds of {split}, one run a place and rule; drawn buildings have corridors of {scale:g} of the
+usual length. Robot, map, path follower and limits are the same in all rows; explore_lite's has its own
 smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places; few places make them too narrow.
 
-Coverage counts the free cells that exact rays see from all places where the robot can go. The ratio is the geometric
+Coverage counts the free cells that exact rays see from all places where the robot can go; what a robot has seen is
+entered at its true poses. The ratio is the geometric
 mean over the places where both rules came to 95 %. The tour on the known map is searched for (insertion, 2-opt, or-opt,
 large neighbourhoods); the shortest one may be a little shorter.
-IoU is the mean of free and occupied cells beside those exact rays. Decisions are timed as processor time."""
+IoU is the mean of free and occupied cells of the robot's own map beside those exact rays. Decisions are timed as
+processor time."""
+_KINDS = {
+    "mazes": "Mazes",
+    "buildings": "Buildings",
+    "plans": "Floor plans",
+    "good_wheels": "Buildings, good wheels",
+    "slipping_wheels": "Buildings, slipping wheels",
+    "no_wheels": "Buildings, no wheels",
+}
+_POSES = {
+    "true": "The robot knows its **true poses**: no row says anything about the error of the estimator.",
+    "own": "Poses and map are **those of the lidar's estimators**. ATE is of the whole trajectory at the end, after "
+    "the best rigid alignment. A pose is within three deviations by its covariance when it was the newest.",
+}
 
 
 def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
@@ -47,5 +63,8 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         for row, numbers in rows.items():
             ratio = result["paired"][kind].get(row, {}).get("path_to_95_ratio")
             shown[_ROWS[row]] = {**numbers, "ratio": ratio} if ratio else numbers
-        parts += [f"## {kind.capitalize()}", table(shown, _COLUMNS, "Rule")]
+        poses = result["poses"][kind]
+        columns = [column for column in _COLUMNS if poses == "own" or column.key not in ("ate_m", "within")]
+        parts += [f"## {_KINDS[kind]}", f"{result['places'][kind]} places. {_POSES[poses]}"]
+        parts += [table(shown, columns, "Rule")]
     return whole([*parts, *figures(images)])

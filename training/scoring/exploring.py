@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -14,7 +16,8 @@ from ngo_explorer.known_map import KnownMap
 from ngo_explorer.path_follower import DRIVING, PathFollower
 from ngo_explorer.pilot import DONE, Pilot
 from ngo_explorer.settings import DriveConfig, ExplorerConfig
-from training.data.explored_worlds import ExploredWorld
+from training.data.explored_worlds import ExploredWorld, Sight
+from training.data.lidar_drives import TruePoses
 from training.scoring.known_tour import known_tour
 
 RESOLUTION_M = 0.05
@@ -28,7 +31,8 @@ class Explored:
     """One exploration of n maps.
 
     ``path_m``, ``coverage`` and ``time_s`` ``(n,)``: length of the path, share seen of what can be seen, and time.
-    ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself.
+    ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself. ``found`` is its own map, and
+    ``errors`` are those of its own poses, by the metric's key.
     """
 
     path_m: np.ndarray
@@ -39,11 +43,30 @@ class Explored:
     collisions: int
     ended: bool
     found: OccupancyMap
+    errors: dict[str, float] = field(default_factory=dict)
 
     def path_to(self, coverage: float) -> float:
         """Path until so much was seen, m; infinite where it never was."""
         reached = np.flatnonzero(self.coverage >= coverage)
         return float(self.path_m[reached[0]]) if len(reached) else math.inf
+
+
+class Estimator(Protocol):
+    """Who tells a robot its pose ``(3,)`` and its map, in the frame of the world."""
+
+    pose_xyyaw: np.ndarray
+
+    def take(self, sight: Sight) -> None:
+        """Take what was measured."""
+        ...
+
+    def cells(self) -> OccupancyMap:
+        """The map so far."""
+        ...
+
+    def errors(self, truth: TruePoses) -> dict[str, float]:
+        """How wrong the poses are, by the metric's key."""
+        ...
 
 
 class Seen:
@@ -54,7 +77,7 @@ class Seen:
         grid = OccupancyGrid(RESOLUTION_M)
         for begin in range(0, len(scans), 200):
             grid.add(scans[begin : begin + 200], poses[begin : begin + 200])
-        self.map = grid.cells(_OCCUPANCY).trinary(_OCCUPANCY.free, _OCCUPANCY.occupied)
+        self.map = _trinary(grid.cells(_OCCUPANCY))
         self._free = self.map.values == 0
         self._count = int(np.count_nonzero(self._free))
 
@@ -75,10 +98,20 @@ class Seen:
 
 
 def explore(
-    world: ExploredWorld, seen: Seen, config: ExplorerConfig, drive: DriveConfig, seed: int = 0, most_s: float = 3600.0
+    world: ExploredWorld,
+    seen: Seen,
+    config: ExplorerConfig,
+    drive: DriveConfig,
+    seed: int = 0,
+    most_s: float = 3600.0,
+    estimator: Callable[[np.ndarray], Estimator] | None = None,
 ) -> Explored:
-    """Explore a world at true poses until the robot says that nothing is left, or for most_s of simulated time."""
-    run = _Run(world, seen)
+    """Explore a world until the robot says that nothing is left, or for most_s of simulated time.
+
+    estimator: begins one at the first pose; None: the robot knows its true poses. What it has seen is counted at true
+    poses always.
+    """
+    run = _Run(world, seen, estimator)
     exploration = Exploration(config, seed=seed)
     run.drive(exploration, PathFollower(drive, run.need_m(config)), most_s)
     return run.explored()
@@ -104,14 +137,24 @@ def drive_known_tour(
 class _Run:
     """A robot on its way, its map and what is written down of both."""
 
-    def __init__(self, world: ExploredWorld, seen: Seen) -> None:
+    def __init__(
+        self, world: ExploredWorld, seen: Seen, estimator: Callable[[np.ndarray], Estimator] | None = None
+    ) -> None:
         self._world, self._seen, self._grid = world, seen, OccupancyGrid(RESOLUTION_M)
         self.sight = world.step(0.0, 0.0)
+        self._estimator = None if estimator is None else estimator(self.sight.pose_xyyaw)
+        self._stamps_ns = list[int]()
+        self._hear()
         self._rows: list[tuple[float, float, float]] = []
         self._poses, self._decisions_ms = [self.sight.pose_xyyaw], list[float]()
         self._entered: np.ndarray | None = None
         self._mapped_s, self._path_m, self._collisions, self._touched, self._ended = -math.inf, 0.0, 0, False, False
-        self.found = self._grid.cells(_OCCUPANCY)
+        self.found = self._own_map()
+
+    @property
+    def pose_xyyaw(self) -> np.ndarray:
+        """Where the robot believes to be."""
+        return self.sight.pose_xyyaw if self._estimator is None else self._estimator.pose_xyyaw
 
     def need_m(self, config: ExplorerConfig) -> float:
         """Clearance that the robot's middle needs."""
@@ -125,10 +168,10 @@ class _Run:
             mapped, decided, begun_s = self.look(), pilot.decided, time.process_time()
             if mapped or exploration.known.empty:
                 exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
-            pilot.step(self.sight.pose_xyyaw, self.sight.time_s)
+            pilot.step(self.pose_xyyaw, self.sight.time_s)
             if pilot.decided > decided:
                 self._decisions_ms.append(1e3 * (time.process_time() - begun_s))
-            self.move(*follower.step(exploration.known, self.sight.pose_xyyaw, self.sight.time_s))
+            self.move(*follower.step(exploration.known, self.pose_xyyaw, self.sight.time_s))
         self._ended = pilot.state == DONE
 
     def look(self) -> bool:
@@ -140,9 +183,18 @@ class _Run:
         if sight.time_s - self._mapped_s < _MAP_EVERY_S - 1e-6:
             return False
         self._mapped_s = sight.time_s
-        self.found = self._grid.cells(_OCCUPANCY).trinary(_OCCUPANCY.free, _OCCUPANCY.occupied)
-        self._rows.append((self._path_m, self._seen.coverage(self.found), sight.time_s))
+        self.found = self._own_map()
+        seen = self.found if self._estimator is None else _trinary(self._grid.cells(_OCCUPANCY))
+        self._rows.append((self._path_m, self._seen.coverage(seen), sight.time_s))
         return True
+
+    def _own_map(self) -> OccupancyMap:
+        return _trinary(self._grid.cells(_OCCUPANCY) if self._estimator is None else self._estimator.cells())
+
+    def _hear(self) -> None:
+        if self._estimator is not None:
+            self._estimator.take(self.sight)
+            self._stamps_ns.append(self.sight.stamp_ns)
 
     def move(self, speed_mps: float, turn_rate_rps: float) -> None:
         """Drive for a period."""
@@ -151,12 +203,20 @@ class _Run:
         self._collisions += self.sight.blocked and not self._touched
         self._touched = self.sight.blocked
         self._poses.append(self.sight.pose_xyyaw)
+        self._hear()
 
     def explored(self) -> Explored:
         """What came of it."""
         path, coverage, times = np.array(self._rows).T
         poses, decisions = np.array(self._poses), np.array(self._decisions_ms)
-        return Explored(path, coverage, times, poses, decisions, self._collisions, self._ended, self.found)
+        errors: dict[str, float] = {}
+        if self._estimator is not None:
+            errors = self._estimator.errors(TruePoses(np.array(self._stamps_ns), poses))
+        return Explored(path, coverage, times, poses, decisions, self._collisions, self._ended, self.found, errors)
+
+
+def _trinary(found: OccupancyMap) -> OccupancyMap:
+    return found.trinary(_OCCUPANCY.free, _OCCUPANCY.occupied)
 
 
 def _moved(before: np.ndarray, now: np.ndarray) -> bool:
