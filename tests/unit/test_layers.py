@@ -30,6 +30,7 @@ LAYERS = {
         {"errors"},
         {
             "bounds",
+            "calibration",
             "carmen_lines",
             "carmen_poses",
             "carmen_stamps",

@@ -23,7 +23,13 @@ PYTHON = [name for name, folder in SOURCES.items() if (folder / "setup.py").exis
 # Programs of the repository, which are not installed: requirements/ has what they import.
 PROGRAMS = ("training", "benchmarks", "demo", "tests", "tools", "scripts")
 # Modules whose distribution has another name.
-DISTRIBUTIONS = {"PIL": "pillow", "yaml": "pyyaml", "mcap_ros2": "mcap-ros2-support", "rerun": "rerun-sdk"}
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "yaml": "pyyaml",
+    "mcap_ros2": "mcap-ros2-support",
+    "rerun": "rerun-sdk",
+    "cv2": "opencv-python-headless",
+}
 OWN = {*PYTHON, *PROGRAMS, "ros2_stand_in"}
 ROS = ("rclpy", "ament_index_python", "launch", "launch_ros")
 VERSION = "0.1.0"
@@ -87,7 +93,9 @@ def test_a_package_declares_what_it_imports_and_no_more(name: str, monkeypatch: 
     assert declared_for_ros(folder) == of_ros | ros_packages_in_launch_files(folder) - forwarded - {name}
     of_pip = {module if module in SOURCES else distribution(module) for module in imported if not is_of_ros(module)}
     declared = setup_of(folder, monkeypatch)
-    view, networks = (set(declared["extras_require"].get(extra, [])) for extra in ("view", "networks"))
+    extras = declared["extras_require"]
+    view = set(extras.get("view", []))
+    networks = {*extras.get("networks", []), *extras.get("camera", [])}  # which a robot with a lidar does not need
     assert set(declared.get("install_requires", [])) == of_pip - view - networks
     assert view <= of_pip & required("view.txt") - required("lidar.txt", "runtime.txt", "test.txt")
     assert networks <= of_pip & required("runtime.txt")

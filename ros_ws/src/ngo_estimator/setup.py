@@ -36,8 +36,13 @@ setup(
     maintainer_email="maintainers@ngo.invalid",
     description="Local odometry and the Neural Graph Optimizer, and the nodes that run them.",
     license="Apache-2.0",
-    # A lidar needs no networks.
-    extras_require={"networks": ["torch"], "test": ["pytest"], "view": ["rerun-sdk"]},
+    # A lidar needs no networks and no pictures.
+    extras_require={
+        "networks": ["torch"],
+        "camera": ["opencv-python-headless"],
+        "test": ["pytest"],
+        "view": ["rerun-sdk"],
+    },
     entry_points={
         "console_scripts": [
             "join_sessions = ngo_estimator.nodes.join_sessions:main",

@@ -64,10 +64,24 @@ class Mounting:
 def find_mounting(recording: Recording, topics: RecordingTopics, frame: str | None = None) -> Mounting | None:
     """Where the scanner of a frame (None: of topics.image) sits on the robot; None where no transform says it.
 
+    See `find_pose` for what counts.
+
+    Raises:
+        RecordingError: a message that cannot be read.
+    """
+    found = find_pose(recording, topics, frame)
+    return None if found is None else _mounting(*found)
+
+
+def find_pose(
+    recording: Recording, topics: RecordingTopics, frame: str | None = None
+) -> tuple[str, str, Pose, str] | None:
+    """The robot's frame, that of a sensor (None: of topics.image), the sensor's pose there, and which topics say it.
+
     Chains of transforms are composed. Those of /tf_static count; where they do not join the two frames, the first
     transforms of /tf (10 min of it) are taken, without those that move the robot itself. The robot's frame is the child
     of the wheel odometry, else base_link, base_footprint or base, with the robot's prefix where it has one. Topics of
-    transforms in another robot's namespace are left out.
+    transforms in another robot's namespace are left out. None where no transform says it.
 
     Raises:
         RecordingError: a message that cannot be read.
@@ -79,8 +93,8 @@ def find_mounting(recording: Recording, topics: RecordingTopics, frame: str | No
     static = [name for name in names if name.endswith("static")]
     for _, each in _transforms(recording, static):
         tree.take((each,), static=True)
-    if (found := _lookup(tree, bases, scan_frame, ", ".join(static))) is not None:
-        return found
+    if (found := _lookup(tree, bases, scan_frame)) is not None:
+        return found[0], scan_frame, found[1], ", ".join(static)
     moving = [name for name in names if name not in static]
     known = set(tree.frames())
     start_ns: int | None = None
@@ -93,17 +107,18 @@ def find_mounting(recording: Recording, topics: RecordingTopics, frame: str | No
             continue
         known.add(child)
         tree.take((each,), static=True)
-        if (found := _lookup(tree, bases, scan_frame, ", ".join(moving))) is not None:
-            return found
+        if (found := _lookup(tree, bases, scan_frame)) is not None:
+            return found[0], scan_frame, found[1], ", ".join(moving)
     # A scanner whose frame is the robot's own needs no transform.
     if scan_frame in bases[:1]:
-        return Mounting(scan_frame, scan_frame, np.zeros(3), False, 0.0, 0.0, "the scan's own frame")
+        return scan_frame, scan_frame, Pose(np.zeros(3), Rotation.identity()), "the scan's own frame"
     return None
 
 
 def mounting_in(tree: TransformBuffer, base: str, scan_frame: str, source: str = "/tf_static") -> Mounting | None:
     """Where `scan_frame` sits on `base`, by what is known last; None where no transforms join the two."""
-    return _lookup(tree, [base], scan_frame, source)
+    found = _lookup(tree, [base], scan_frame)
+    return None if found is None else _mounting(found[0], scan_frame, found[1], source)
 
 
 def _scan_frame(recording: Recording, topics: RecordingTopics) -> str:
@@ -126,7 +141,8 @@ def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, A
             yield message.log_time_ns, each
 
 
-def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str, source: str) -> Mounting | None:
+def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str) -> tuple[str, Pose] | None:
+    """The first of the robot's frames that the sensor's is joined to, and its pose there."""
     for name in bases:
         base = tree.like(name, scan_frame)
         if base is None or any(
@@ -134,12 +150,12 @@ def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str, source: st
         ):
             continue
         if (pose := tree.newest_lookup(base, scan_frame)) is not None:
-            pose = pose @ _OPTICAL_FROM_BODY if is_optical(scan_frame) else pose
-            return _mounting(base, scan_frame, pose, source)
+            return base, pose
     return None
 
 
 def _mounting(base: str, scan_frame: str, pose: Pose, source: str) -> Mounting:
+    pose = pose @ _OPTICAL_FROM_BODY if is_optical(scan_frame) else pose
     up = float(pose.rotation.as_matrix()[2, 2])
     planar, left_out = pose.planar()
     tilt = math.acos(min(1.0, abs(up)))

@@ -18,7 +18,7 @@ from ngo_recordings.space_scan import scan_reader
 from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
-__all__ = ["BAD_SCAN", "BAD_WHEELS", "LidarScan", "WheelPose", "scan_stream"]
+__all__ = ["BAD_SCAN", "BAD_WHEELS", "LidarScan", "WheelPose", "scan_stream", "wheel_poses"]
 
 BAD_SCAN = "damaged scan"
 BAD_WHEELS = "wheel pose that is no number"
@@ -103,6 +103,22 @@ def scan_stream(
             yield heapq.heappop(waiting)[-1]
     while waiting:
         yield heapq.heappop(waiting)[-1]
+
+
+def wheel_poses(recording: Recording, topics: RecordingTopics, skipped: Counter[str]) -> Iterator[WheelPose]:
+    """Poses of topics.wheels in the order in which they were recorded; none where there are no wheels.
+
+    Args:
+        skipped: counts poses that are no numbers (BAD_WHEELS).
+    """
+    if topics.wheels is None:
+        return
+    wheels = _Wheels(recording, topics.wheels, topics.image)
+    for message in recording.messages(wheels.names):
+        try:
+            yield from wheels.read(message, skipped)
+        except (AttributeError, RecordingError):
+            skipped[BAD_WHEELS] += 1
 
 
 class _Wheels:

@@ -149,14 +149,16 @@ class RecordingTopics:
         return (self.image, *self.more_scans)
 
 
-def choose_topics(recording: Recording, given: TopicArguments | None = None) -> RecordingTopics:
+def choose_topics(
+    recording: Recording, given: TopicArguments | None = None, with_wheels: bool = False
+) -> RecordingTopics:
     """What is given, and for the rest what the types and names of the recording's topics make clear.
 
     Not given, the image is the only colour or grey Image, else the only CompressedImage, else `choose_scan`; the action
     is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped; the
-    ground truth an Odometry or pose topic whose name says so. Where the image is of scans, the wheels are the first
-    of `wheel_candidates`, if it is the only one or its name says so; where there is none, the transform from odom to
-    the robot. Nothing else is guessed.
+    ground truth an Odometry or pose topic whose name says so. Where the image is of scans, or with_wheels, the wheels
+    are the first of `wheel_candidates`, if it is the only one or its name says so; where there is none, the transform
+    from odom to the robot. Nothing else is guessed.
 
     Raises:
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
@@ -181,7 +183,7 @@ def choose_topics(recording: Recording, given: TopicArguments | None = None) -> 
         tolerance_s=given.tolerance_s,
         interpolation_s=given.interpolation_s,
         twist_tolerance_s=given.twist_tolerance_s,
-        wheels=_choose_wheels(recording, given.wheels, image, truth, bool(scans)),
+        wheels=_choose_wheels(recording, given.wheels, image, truth, bool(scans) or with_wheels),
         more_scans=tuple(name for name in more if name is not None),
     )
 

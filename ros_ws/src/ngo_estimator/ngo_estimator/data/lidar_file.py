@@ -35,6 +35,17 @@ def require_torch() -> None:
         ) from error
 
 
+def require_opencv() -> None:
+    """Raise ``ValueError`` where OpenCV is not installed, which a camera without weights needs."""
+    try:
+        import_module("cv2")
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            "world camera needs OpenCV, which is not installed: run make venv FOR=all, or pip install "
+            "opencv-python-headless"
+        ) from error
+
+
 def read_lidar_file(
     weights: Path, section: str, kind: type[Config], world: str | None = None, gone: Mapping[str, str] | None = None
 ) -> Config:

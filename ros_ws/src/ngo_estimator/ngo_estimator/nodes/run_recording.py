@@ -30,26 +30,29 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ngo_common.files import folder_whole
-from ngo_estimator.data.lidar_file import is_lidar, require_torch
+from ngo_estimator.data.lidar_file import is_lidar, require_opencv, require_torch
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.nodes.command import run_command
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
-from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
+from ngo_recordings.calibration import CAMERA_INFO_TYPE
+from ngo_recordings.images import CLOUD_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, SCAN_TYPE
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, choose_topics
 
 if TYPE_CHECKING:
     from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
+    from ngo_estimator.offline.camera_run import CameraRun
     from ngo_estimator.offline.lidar_run import LidarRun
     from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
     from ngo_estimator.offline.recording_run import RecordingRun
 
-    Started = tuple[str, RecordingTopics, RecordingRun | LidarRun, Iterator[RecordedStep | RecordedRun]]
+    AnyRun = RecordingRun | LidarRun | CameraRun
+    Started = tuple[str, RecordingTopics, AnyRun, Iterator[RecordedStep | RecordedRun]]
 
 NAME = "run_recording"
-LIDAR_WORLD = "scan"
+LIDAR_WORLD, CAMERA_WORLD = "scan", "camera"
 _OBJECTS_BETWEEN_COLLECTIONS = 100_000
 """New objects after which Python looks for cycles among them; its 700 cost imports and messages a twentieth."""
 _SCANS_AT_ONCE = 500
@@ -65,7 +68,8 @@ class Arguments:
     out: Path
     """Folder for the results, new or empty."""
     world: str | None = None
-    """World whose weights are used: maze2d, maze3d, doom or scan (any 2D lidar), the default for laser scans."""
+    """World whose weights are used: maze2d, maze3d or doom. Without weights: scan (any 2D lidar), the default for laser
+    scans, and camera (any calibrated camera with the robot's odometry), the default for pictures with a CameraInfo."""
     weights: Path | None = None
     """Folder of weights of your own, instead of those of a world."""
     topics: tyro.conf.OmitArgPrefixes[TopicArguments] = field(default_factory=TopicArguments)
@@ -99,11 +103,21 @@ class Arguments:
         if not self.recordings:
             raise ValueError("no recording was given; expected .mcap files, rosbag2 folders, .bag, .log or .clf files")
         if self.world is not None and self.weights is not None:
-            raise ValueError("expected either --world (maze2d, maze3d, doom or scan) or --weights FOLDER, not both")
+            raise ValueError(
+                "expected either --world (maze2d, maze3d, doom, scan or camera) or --weights FOLDER, not both"
+            )
         if self.out.exists() and not self.out.is_dir():
             raise ValueError(f"{self.out} is a file; expected a folder for the results")
         if self.out.is_dir() and any(self.out.iterdir()) and not self.overwrite:
             raise ValueError(f"{self.out} is not empty; give a new folder, or --overwrite")
+
+    def uses_camera(self, recording: Recording) -> bool:
+        """Whether pictures are tracked without weights: as world says, or for pictures with a CameraInfo, no scans."""
+        if self.world is not None or self.weights is not None:
+            return self.world == CAMERA_WORLD
+        filled = {info.type_name for info in recording.topics.values() if info.count}
+        pictures, scans = filled & {IMAGE_TYPE, COMPRESSED_TYPE}, filled & {SCAN_TYPE, CLOUD_TYPE}
+        return bool(pictures) and not scans and CAMERA_INFO_TYPE in filled
 
     def weights_folder(self, recording: Recording) -> Path:
         """The folder with the weights; raises ``ValueError`` where there is none, or none was named for images."""
@@ -111,7 +125,10 @@ class Arguments:
         world = self.world
         if world is None and self.weights is None:
             if not any(info.type_name in (SCAN_TYPE, CLOUD_TYPE) and info.count for info in recording.topics.values()):
-                raise ValueError("expected --world (but scan) or --weights FOLDER: there are no laser scans")
+                raise ValueError(
+                    "expected --world (but scan) or --weights FOLDER: there are no laser scans, and no CameraInfo with "
+                    "pictures, which need neither"
+                )
             world = LIDAR_WORLD
         folder = self.weights if self.weights is not None else shipped / str(world)
         if not folder.is_dir():
@@ -147,15 +164,19 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
 def _run(arguments: Arguments, out: Path, console: Console) -> dict[str, Any]:
     """Run both estimators, write into ``out``, and return the content of run.json."""
     with open_recording(arguments.recordings) as recording:
-        folder = arguments.weights_folder(recording)
-        core: RecordingRun | LidarRun
-        if is_lidar(folder):
+        core: AnyRun
+        source: ScanSource | None = None
+        if arguments.uses_camera(recording):
+            world, topics, core, events = _camera(arguments, recording, console)
+        elif is_lidar(folder := arguments.weights_folder(recording)):
+            source = scan_source(folder)
             world, topics, core, events = _lidar(arguments, folder, recording, console)
         else:
+            source = scan_source(folder)
             world, topics, core, events = _networks(arguments, folder, recording, console)
         import_module("ngo_estimator.nodes.recorded_output")  # with matplotlib: no work on frames
         began_s = time.monotonic()
-        trajectories = _write(arguments, out, recording, topics, core, events, scan_source(folder), console)
+        trajectories = _write(arguments, out, recording, topics, core, events, source, console)
     took_s = time.monotonic() - began_s
     if not trajectories:
         why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
@@ -183,7 +204,7 @@ def _write(
     out: Path,
     recording: Recording,
     topics: RecordingTopics,
-    core: "RecordingRun | LidarRun",
+    core: "AnyRun",
     events: "Iterator[RecordedStep | RecordedRun]",
     source: ScanSource | None,
     console: Console,
@@ -309,6 +330,56 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     return LIDAR_WORLD, topics, core, core.run(records, truth)
 
 
+def _camera(arguments: Arguments, recording: Recording, console: Console) -> "Started":
+    """Features of a calibrated camera's pictures, with the robot's odometry."""
+    require_opencv()
+    import cv2
+
+    from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+    from ngo_estimator.geometry.camera_model import CameraModel, camera_mounting, tilted
+    from ngo_estimator.offline.camera_run import CameraRun
+    from ngo_estimator.slam.picture_trajectory import PictureTrajectory
+    from ngo_recordings.calibration import calibration_of, info_topics
+    from ngo_recordings.frames import frames as frames_of
+    from ngo_recordings.mounting import find_pose
+    from ngo_recordings.scan_stream import wheel_poses
+
+    cv2.setNumThreads(1)
+    topics = choose_topics(recording, replace(arguments.topics, action="none", twist="none"), with_wheels=True)
+    named = info_topics(topics.image)
+    info = next((name for name in named if name in recording.topics and recording.topics[name].count), None)
+    if info is None:
+        raise ValueError(
+            f"no CameraInfo is on {' or '.join(named)}: {CAMERA_WORLD} needs the calibration of {topics.image}"
+        )
+    if topics.wheels is None:
+        raise ValueError(
+            f"no odometry of the robot was found: {CAMERA_WORLD} takes the scale of the motion from it; name "
+            "it (--wheels)"
+        )
+    seen = calibration_of(recording.first(info).value, info, topics.image)
+    mounted = find_pose(recording, topics, seen.frame_id or None)
+    if mounted is None:
+        base_from_camera, where = (
+            tilted(0.0, 0.0),
+            "no transform says where: taken to be the robot's own, looking ahead",
+        )
+    else:
+        base, frame, pose, source = mounted
+        base_from_camera = camera_mounting(pose.position, pose.rotation.as_matrix())
+        where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
+    model = CameraModel(seen.width, seen.height, seen.matrix, seen.distortion, seen.coefficients, base_from_camera)
+    odometry = PictureOdometry(model)
+    console.print(f"using {_words(topics)}, calibration {info}", soft_wrap=True, highlight=False)
+    console.print(
+        f"camera: {seen.width} x {seen.height}, {model.description}; {where}", soft_wrap=True, highlight=False
+    )
+    core = CameraRun(odometry, PictureTrajectory(iterations_per_step=arguments.iterations_per_step))
+    wheels = sorted(wheel_poses(recording, topics, core.rejected), key=lambda each: each.stamp_ns)
+    frames = frames_of(recording, topics, core.rejected, (seen.height, seen.width))
+    return CAMERA_WORLD, topics, core, core.run(frames, wheels)
+
+
 def _for_weights(recording: Recording, given: TopicArguments, local: "LocalOdometry") -> TopicArguments:
     """The arguments, with the only laser scan for weights of scans, and without inputs that the weights do not take."""
     if given.image is None and local.image_format.is_scan:
@@ -348,11 +419,11 @@ def _plain(value: object) -> str | float | None:
     return value if value is None or isinstance(value, float) else str(value)
 
 
-def _rejected(core: "RecordingRun | LidarRun") -> list[tuple[str, int]]:
+def _rejected(core: "AnyRun") -> list[tuple[str, int]]:
     return [(reason, count) for reason, count in core.rejected.items() if count]
 
 
-def _losses(core: "RecordingRun | LidarRun", images: int) -> list[str]:
+def _losses(core: "AnyRun", images: int) -> list[str]:
     """A line for each reason why images were not used, and one about gaps."""
     lines = []
     for reason, count in _rejected(core):

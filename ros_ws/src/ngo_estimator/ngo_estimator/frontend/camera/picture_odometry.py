@@ -1,0 +1,146 @@
+"""A calibrated camera's frames and the robot's odometry to relative steps, with key pictures for loops."""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
+from ngo_estimator.frontend.camera.camera_config import CameraConfig
+from ngo_estimator.frontend.camera.descriptors import Describer, Sift
+from ngo_estimator.frontend.camera.feature_tracks import Grey
+from ngo_estimator.frontend.camera.tracked_odometry import TrackedOdometry
+from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
+from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame
+from ngo_estimator.geometry.camera_model import CameraModel
+from ngo_estimator.geometry.key_picture import KeyPicture
+from ngo_estimator.geometry.planar_motion import between
+
+LEAST_WIDTH = 160
+"""Pixels that a picture needs across: in smaller ones too few features are found again."""
+
+_MOST_WAITING = 64
+_NOTHING = np.zeros(0, np.float32)
+
+
+def require_usable(model: CameraModel) -> None:
+    """Raise ``ValueError`` about a camera whose pictures are too small."""
+    if model.width < LEAST_WIDTH:
+        raise ValueError(
+            f"pictures are {model.width} x {model.height}; expected a width of {LEAST_WIDTH} or more: weights that are "
+            "trained on such pictures take smaller ones"
+        )
+
+
+class PictureOdometry:
+    """Takes pictures and poses of the robot's odometry by their stamps, and hands on a step for each picture.
+
+    A picture waits for the odometry at its stamp. The first one is the origin.
+    """
+
+    def __init__(
+        self, model: CameraModel, config: CameraConfig | None = None, describer: Describer | None = None
+    ) -> None:
+        require_usable(model)
+        self.model, self._config = model, config or CameraConfig()
+        self._describer = describer or Sift(self._config.features)
+        self._odometry = TrackedOdometry(model, self._config)
+        self.restarts = 0
+        """How often stamps jumped back, so that the odometry began anew."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next picture."""
+        self._wheels = StampedWheels()
+        self._waiting: deque[tuple[int, Grey]] = deque()
+        self._odometry.reset()
+        self._last_ns: int | None = None
+        self._newest_ns: int | None = None
+        self._origin_ns = 0
+        self._given = np.zeros(3)  # the wheels' pose at the last picture
+        self._key_pose = np.zeros(3)
+        self._origin_code: np.ndarray | None = None
+        self.has_wheels = False
+        """Whether odometry of the robot came."""
+        self.frames = self.by_wheels = 0
+        """Frames with a step, and those whose picture told too little: the robot's odometry alone counts there."""
+
+    def add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
+        """Take a pose ``(3,)`` of the robot's odometry, in its own frame."""
+        if not np.isfinite(pose_xyyaw).all():
+            raise ValueError("robot odometry has values that are not finite")
+        self.has_wheels = True
+        self._wheels.add(stamp_ns, pose_xyyaw)
+
+    def add_picture(self, stamp_ns: int, picture: np.ndarray) -> None:
+        """Take a picture ``(height, width, channels)`` uint8, grey or red, green and blue.
+
+        Raises:
+            RejectedFrame: it is not newer than the last one, or of another size than the calibration.
+        """
+        if self._newest_ns is not None and stamp_ns <= self._newest_ns:
+            if stamp_ns <= self._newest_ns - RESTART_AFTER_NS:
+                self.reset()
+                self.restarts += 1
+            else:
+                kind = DuplicateFrame if stamp_ns == self._newest_ns else LateFrame
+                raise kind(f"picture of {stamp_ns} ns came after one of {self._newest_ns} ns")
+        if picture.shape[:2] != (self.model.height, self.model.width) or picture.dtype != np.uint8:
+            height, width = picture.shape[:2]
+            raise RejectedFrame(
+                f"the picture is {width} x {height} of {picture.dtype}; expected {self.model.width} x "
+                f"{self.model.height} of uint8, as the calibration says"
+            )
+        self._newest_ns = stamp_ns
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting.popleft()
+        self._waiting.append((stamp_ns, _grey(picture)))
+
+    @property
+    def waiting(self) -> int:
+        """Pictures that wait for odometry."""
+        return len(self._waiting)
+
+    def ready(self, at_end: bool = False) -> Iterator[RelativeStep]:
+        """The steps of pictures whose odometry is known; at the end, of all that lie within it."""
+        while self._waiting:
+            stamp_ns, grey = self._waiting[0]
+            if not self.has_wheels or (self._wheels.newest_ns < stamp_ns and not at_end):
+                return
+            self._waiting.popleft()
+            given = self._wheels.pose_at(stamp_ns * 1e-9)
+            if given is not None and (step := self._step(stamp_ns, grey, given)) is not None:
+                yield step
+
+    def _step(self, stamp_ns: int, grey: Grey, given: np.ndarray) -> RelativeStep | None:
+        odometry, last_ns = self._odometry, self._last_ns
+        relative, covariance = odometry.add(grey, between(self._given, given))
+        self._last_ns, self._given = stamp_ns, given
+        if last_ns is None:
+            self._origin_ns, self._origin_code = stamp_ns, self._key_code(grey)
+            return None
+        self.frames += 1
+        self.by_wheels += odometry.inliers < self._config.least_inliers
+        moved = between(self._key_pose, odometry.pose)
+        is_key = math.hypot(moved[0], moved[1]) > self._config.key_m or abs(moved[2]) > self._config.key_rad
+        origin, self._origin_code = self._origin_code, None
+        return RelativeStep(
+            stamp_ns, last_ns, relative, covariance, self._origin_ns, odometry.pose.copy(), _NOTHING,
+            self._key_code(grey) if is_key else _NOTHING, from_place_code=origin, robot_odom_xyyaw=given.copy(),
+        )  # fmt: skip
+
+    def _key_code(self, grey: Grey) -> np.ndarray:
+        self._key_pose = self._odometry.pose.copy()
+        pixels, descriptors = self._describer.describe(grey)
+        most = self._config.features
+        rays = self.model.rays(pixels[:most])
+        return KeyPicture(self.model.centre, self.model.pixel_rad, rays, descriptors[:most]).packed()
+
+
+def _grey(picture: np.ndarray) -> Grey:
+    if picture.ndim == 2 or picture.shape[2] == 1:
+        return np.ascontiguousarray(picture.reshape(picture.shape[:2]))
+    weights = np.array((77, 150, 29), np.uint16)  # of 256, as Rec. 601 has them
+    grey: Grey = ((picture.astype(np.uint16) @ weights) >> 8).astype(np.uint8)
+    return grey

@@ -1,0 +1,251 @@
+"""Odometry of a calibrated camera on a robot whose motion is given roughly, as by wheels: no training.
+
+Corners are followed from picture to picture. Each has a range, which grows sure while the robot moves. A picture's pose
+is fitted to all of them at once, with the given motion as a prior (``geometry/view_pose.py``): heading and direction of
+motion come from the picture, and the scale from the given motion, which ranges remember. Where pictures tell nothing,
+the given motion counts alone.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ngo_estimator.frontend.camera.camera_config import CameraConfig
+from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.camera_model import CameraModel
+from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance, wrap
+from ngo_estimator.geometry.planar_views import ransac
+from ngo_estimator.geometry.view_pose import (
+    INVERSE,
+    UNKNOWN_STD,
+    RangedRays,
+    ViewPose,
+    base_vectors,
+    camera_at,
+    fit_view,
+    measured_ranges,
+    unmeasured,
+)
+
+Array = np.ndarray
+
+_NEAREST = 1e-3
+"""Share of its range to which a point may come near."""
+
+_AGREEING = 0.5
+"""Where fewer corners than this agree with the given motion, another one is looked for."""
+
+_RANSAC_SAMPLES, _RANSAC_PX = 60, 2.0
+_MOST_SURPRISE = 4.0
+"""Deviations of the given motion beyond which a fit is taken to have failed."""
+
+_HELD = 100.0
+
+_VARIANCES = np.array((1e-8, 1e-8, 1e-9))
+
+
+class TrackedOdometry:
+    """Poses of frames from pictures and the given motion between them."""
+
+    def __init__(self, model: CameraModel, config: CameraConfig) -> None:
+        self._model, self._config = model, config
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew with the next picture."""
+        self.pose = np.zeros(3)
+        """Of the newest frame ``(3,)``, in ``odom``."""
+        self.inliers = 0
+        """Corners that agreed with the newest pose."""
+        self._centre_now = self._model.centre.copy()  # of the camera, as the floor rises
+        self._grey: Grey | None = None
+        self._pixels = np.zeros((0, 2))
+        self._points = RangedRays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+        self._begin_step()
+
+    def _begin_step(self) -> None:
+        """Measure from the newest frame on."""
+        self._centre = self._centre_now
+        self._from = self.pose
+        self._from_rays = self._model.rays(self._pixels)
+        self._given = np.zeros(3)  # since then
+        self._way = self._turn = self._frames = 0.0
+        self._covariance = np.zeros((3, 3))
+
+    def add(self, grey: Grey, given: Array) -> tuple[Array, Array]:
+        """Take the next picture and the motion ``(3,)`` that led to it, as it was given.
+
+        Returns:
+            The motion ``(3,)`` as it is estimated, and its covariance ``(3, 3)``.
+        """
+        if self._grey is None:
+            self._grey = grey
+            self._look_for_corners(grey)
+            self._begin_step()
+            return np.zeros(3), np.diag(_VARIANCES)
+        before = self.pose
+        self._given = compose(self._given, given)
+        self._way += math.hypot(given[0], given[1])
+        self._turn += abs(given[2])
+        self._frames += 1
+        self._follow(grey, compose(before, given))
+        fitted = self._fit(compose(before, given))
+        self._take(fitted)
+        relative = between(before, self.pose)
+        covariance = self._step_covariance(relative, turned_covariance(-self._from[2], fitted.covariance))
+        self._grey = grey
+        if self._is_due():
+            self._measure_ranges(fitted)
+            self._look_for_corners(grey)
+            self._begin_step()
+        return relative, covariance
+
+    def _follow(self, grey: Grey, predicted: Array) -> None:
+        """Find the corners in the next picture."""
+        assert self._grey is not None
+        guess, ahead = self._model.pixels(base_vectors(self._points, predicted, self._centre_now))
+        size = grey.shape[::-1]
+        near = ahead & (guess > 0.0).all(1) & (guess < size).all(1)
+        at, found = followed(self._grey, grey, self._pixels, np.where(near[:, None], guess, self._pixels))
+        self._keep(found & near, at)
+
+    def _keep(self, which: np.ndarray, pixels: Array) -> None:
+        self._pixels, self._points, self._from_rays = pixels[which], self._points[which], self._from_rays[which]
+
+    @property
+    def _prior(self) -> tuple[Array, Array]:
+        """The given motion since the last step: a pose ``(3,)``, and its covariance ``(3, 3)``."""
+        config = self._config
+        along = (config.given_way_share * self._way) ** 2 + self._frames * config.given_m**2
+        turn = (config.given_turn_share * self._turn) ** 2 + (config.given_rad_per_m * self._way) ** 2
+        covariance = np.diag((along, along, turn + self._frames * config.given_rad**2))
+        return compose(self._from, self._given), covariance
+
+    @property
+    def _rise_std(self) -> float:
+        return self._config.rise_m + self._config.rise_share * self._way
+
+    def _fit(self, predicted: Array) -> ViewPose:
+        """The newest pose from what is seen."""
+        mean, covariance = self._prior
+        alone = ViewPose(mean, covariance, np.zeros(len(self._points), bool))
+        if len(self._points) < self._config.least_inliers:
+            return alone
+        seen = self._model.rays(self._pixels)
+        std_rad = np.full(len(seen), self._config.pixel_std * self._model.pixel_rad)
+        information = np.linalg.inv(covariance)
+
+        def fit(start: Array, held: Array) -> ViewPose:
+            config, prior = self._config, (mean, held)
+            found = fit_view(self._points, seen, std_rad, self._centre, start, prior, config.scale_std, self._rise_std)
+            wide = config.std_factor**2 * found.covariance
+            return replace(found, covariance=_surer(wide, covariance))  # no less sure than what was given
+
+        fitted = fit(predicted, information)
+        if fitted.inlier.mean() < _AGREEING:
+            other = self._without_prior(seen, mean)
+            if other is not None and (again := fit(other, information)).inlier.sum() > 1.2 * fitted.inlier.sum():
+                fitted = again
+        off = np.append(fitted.pose[:2] - mean[:2], wrap(fitted.pose[2] - mean[2]))
+        if off[:2] @ information[:2, :2] @ off[:2] > _MOST_SURPRISE**2:
+            # Few near points may tell any way: then the given one counts, and pictures tell the heading alone.
+            held = np.diag((_HELD, _HELD, 1.0)) @ information
+            fitted = fit(mean, held)
+            fitted = replace(fitted, covariance=_not_surer(fitted.covariance, covariance), scale=0.0)
+            off[2] = wrap(fitted.pose[2] - mean[2])
+        self._seen, self._std_rad = seen, std_rad
+        trusted = (
+            fitted.inlier.sum() >= self._config.least_inliers and off[2] ** 2 < _MOST_SURPRISE**2 * covariance[2, 2]
+        )
+        return fitted if trusted else alone
+
+    def _without_prior(self, seen: Array, mean: Array) -> Array | None:
+        """A pose ``(3,)`` on which most rays agree, as far away as was given."""
+        found = ransac(self._from_rays, seen, _RANSAC_PX * self._model.pixel_rad, _RANSAC_SAMPLES)
+        if found is None:
+            return None
+        (yaw, direction), _ = found
+        way = between(self._from, mean)
+        moved = camera_at(way, self._model.centre)[:2] - self._model.centre[:2]
+        axis = np.array((math.cos(direction), math.sin(direction)))
+        at = axis * np.linalg.norm(moved) * (1.0 if axis @ moved >= 0.0 else -1.0)
+        at -= se2.rotate(np.asarray(yaw), self._model.centre[:2]) - self._model.centre[:2]
+        return compose(self._from, np.array((at[0], at[1], yaw)))
+
+    def _take(self, fitted: ViewPose) -> None:
+        self.pose, self.inliers = fitted.pose, int(fitted.inlier.sum())
+        self._centre_now = self._centre + (0.0, 0.0, fitted.rise)
+
+    def _step_covariance(self, relative: Array, since: Array) -> Array:
+        """Covariance ``(3, 3)`` of the newest step: what it adds to that of the pose since the last measurement.
+
+        Args:
+            since: ``(3, 3)`` of the newest pose, seen from there.
+        """
+        so_far = between(self._from, self.pose)
+        yaw = so_far[2] - relative[2]
+        lever = np.eye(3)
+        lever[:2, 2] = se2.rotate(np.asarray(yaw), np.array((-relative[1], relative[0])))
+        added = turned_covariance(-yaw, since - lever @ self._covariance @ lever.T)
+        self._covariance = since
+        values, vectors = np.linalg.eigh(0.5 * (added + added.T))
+        positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return positive + np.diag(_VARIANCES)
+
+    def _is_due(self) -> bool:
+        """Whether ranges are to be measured, and corners to be looked for."""
+        config, moved = self._config, between(self._from, self.pose)
+        far = math.hypot(moved[0], moved[1]) > config.step_m or abs(moved[2]) > config.step_rad
+        return far or self.inliers < config.left_share * config.corners
+
+    def _measure_ranges(self, fitted: ViewPose) -> None:
+        """Make ranges surer by what the newest picture shows of them; corners that do not agree are given up."""
+        if not fitted.inlier.any():
+            self._keep(np.zeros(len(self._points), bool), self._pixels)
+            return
+        points, here = self._points, camera_at(fitted.pose, self._centre_now)
+        scaled = replace(points, inverse=points.inverse * (1.0 + fitted.scale))
+        inverse, std = measured_ranges(scaled, self._seen, self._std_rad, fitted.pose, self._centre_now)
+        # From now on they are seen from here.
+        vectors = points.rays + inverse[:, None] * (points.origins - here)
+        nearer = 1.0 / np.maximum(np.linalg.norm(vectors, axis=1), _NEAREST)
+        std = np.minimum(std * nearer**2, UNKNOWN_STD)
+        origins, rays = np.tile(here, (len(std), 1)), self._seen @ _turn(fitted.pose[2]).T
+        self._points = RangedRays(origins, rays, inverse * nearer, std)
+        self._keep(fitted.inlier, self._pixels)
+
+    def _look_for_corners(self, grey: Grey) -> None:
+        config = self._config
+        apart_px = config.apart * self._model.width
+        fresh = corners(grey, config.corners - len(self._pixels), apart_px, self._pixels)
+        rays = self._model.rays(fresh) @ _turn(self.pose[2]).T
+        known = self._points.inverse[self._points.inverse_std < 0.2 * self._points.inverse]
+        inverse = float(np.clip(np.median(known), 0.05, 2.0)) if len(known) > 10 else INVERSE
+        new = unmeasured(camera_at(self.pose, self._centre_now), rays, inverse)
+        self._points = self._points.extended(new)
+        self._pixels = np.concatenate((self._pixels, fresh))
+
+
+def _turn(yaw: float) -> Array:
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+
+
+def _surer(one: Array, other: Array) -> Array:
+    """The smaller of two covariances ``(3, 3)``, along the axes in which they differ."""
+    lower = np.linalg.cholesky(other)
+    inverse = np.linalg.inv(lower)
+    values, vectors = np.linalg.eigh(inverse @ one @ inverse.T)
+    half = lower @ vectors
+    result: Array = (half * np.minimum(values, 1.0)) @ half.T
+    return result
+
+
+def _not_surer(one: Array, given: Array) -> Array:
+    """A covariance ``(3, 3)`` whose position is no surer than the given one."""
+    result = one.copy()
+    result[:2] = result[:, :2] = 0.0
+    result[:2, :2] = given[:2, :2]
+    return result

@@ -1,0 +1,81 @@
+"""A picture as loops need it: rays to features of the place, and what each looks like."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+
+MOST_FEATURES = 2000
+"""Of a key picture: it bounds the time and memory that a message may cost."""
+
+_LENGTHS = (8, 512)
+_HEADER = 5
+
+
+@dataclass(frozen=True, eq=False)
+class KeyPicture:
+    """Features of one picture.
+
+    Attributes:
+        centre: of the camera in the robot's base frame ``(3,)``, m.
+        pixel_rad: the angle that a pixel sees.
+        rays: unit vectors ``(n, 3)`` to the features, in base axes.
+        descriptors: ``(n, d)`` float32 unit vectors: the nearer two are, the more alike the features.
+    """
+
+    centre: Array
+    pixel_rad: float
+    rays: Array
+    descriptors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    def packed(self) -> np.ndarray:
+        """All of it in one vector ``(5 + n (3 + d),)``, as the place code of a step carries it."""
+        head = np.array((self.descriptors.shape[1], *self.centre, self.pixel_rad), np.float32)
+        rows = np.concatenate((self.rays.astype(np.float32), self.descriptors), axis=1)
+        return np.concatenate((head, rows.ravel()))
+
+    @classmethod
+    def unpacked(cls, code: np.ndarray) -> "KeyPicture":
+        """The picture of a place code; raises ``ValueError`` for one that is not a key picture's."""
+        length = int(code[0]) if len(code) >= _HEADER and np.isfinite(code).all() else 0
+        if not _LENGTHS[0] <= length <= _LENGTHS[1] or (len(code) - _HEADER) % (3 + length):
+            raise ValueError(
+                f"place_code of {len(code)} numbers is no key picture: is it from local_node with world:=camera?"
+            )
+        rows = code[_HEADER:].reshape(-1, 3 + length)
+        if len(rows) > MOST_FEATURES or not 0.0 < code[4] < 1.0:
+            raise ValueError(
+                f"place_code has {len(rows)} features with pixels of {code[4]:g} rad; expected at most "
+                f"{MOST_FEATURES}, and an angle of 0 to 1"
+            )
+        rays, descriptors = rows[:, :3].astype(np.float64), rows[:, 3:]
+        sizes = np.concatenate((np.linalg.norm(rays, axis=1), np.linalg.norm(descriptors, axis=1)))
+        if (np.abs(sizes - 1.0) > 0.01).any():
+            raise ValueError("place_code has rays or descriptors that are not unit vectors")
+        return cls(code[1:4].astype(np.float64), float(code[4]), rays, descriptors.copy())
+
+
+def nothing_seen() -> KeyPicture:
+    """A picture without features: it stands for one that is not known."""
+    return KeyPicture(np.zeros(3), 1e-3, np.zeros((0, 3)), np.zeros((0, _LENGTHS[0]), np.float32))
+
+
+def matches(first: KeyPicture, second: KeyPicture, ratio: float) -> np.ndarray:
+    """Features that look alike and more so than others: indices ``(m, 2)``, each feature once at most.
+
+    Args:
+        ratio: the second best must be so many times as far away (Lowe 2004).
+    """
+    if min(len(first), len(second)) < 2 or first.descriptors.shape[1] != second.descriptors.shape[1]:
+        return np.zeros((0, 2), np.int64)
+    alike = first.descriptors @ second.descriptors.T
+    best, back = alike.argmax(1), alike.argmax(0)
+    rows = np.arange(len(first))
+    top = np.partition(alike, -2, axis=1)[:, -2:]
+    away = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0))
+    kept = (back[best] == rows) & (away[:, 1] < ratio * away[:, 0])
+    return np.stack((rows[kept], best[kept]), axis=1)

@@ -1,0 +1,221 @@
+"""The planar pose of a camera from rays to points whose ranges are known better or worse: one fit for all of them.
+
+A point is where a ray ``(3,)`` from an earlier camera ends, at an inverse range (1/m) with a deviation. Of a known
+range the point tells position and heading as in perspective-n-point; of an unknown range it tells what the epipolar
+constraint does, for the error of a range moves a picture of the point along the epipolar line alone (Civera, Davison
+and Montiel, Inverse depth parametrization for monocular SLAM, 2008).
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from ngo_estimator.geometry.se2 import wrap
+
+Array = np.ndarray
+
+_ITERATIONS = 12
+_SETTLED = 1e-6
+INVERSE = 0.25
+"""Inverse range at which to begin where nothing is known, 1/m."""
+
+UNKNOWN_STD = 3.0
+"""Deviation of an inverse range that nobody has measured, 1/m."""
+
+_RANGED = 0.3
+"""A range is known where its deviation is less than this share of it."""
+
+_INVERSE_LIMITS = (1e-3, 10.0)
+_NO_SLOPE = 1e-12
+_TRIANGULATIONS = 3
+_MISSED = 6.0
+"""Deviations by which rays that do not meet miss each other."""
+
+_LEAST_WAY_M = 0.1
+_WAY_STD_M, _WAY_STD_SHARE = 0.02, 0.05
+"""Deviation of the way between two pictures, m, and as a share of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class RangedRays:
+    """Points along rays, in any one frame whose z is up.
+
+    ``origins`` ``(n, 3)`` are where the camera was, ``rays`` ``(n, 3)`` unit vectors from there, ``inverse`` ``(n,)``
+    inverse ranges (1/m) and ``inverse_std`` ``(n,)`` their deviations.
+    """
+
+    origins: Array
+    rays: Array
+    inverse: Array
+    inverse_std: Array
+
+    def __len__(self) -> int:
+        return len(self.inverse)
+
+    def extended(self, others: "RangedRays") -> "RangedRays":
+        """These points, then the others."""
+        return RangedRays(*(np.concatenate((getattr(self, x.name), getattr(others, x.name))) for x in fields(self)))
+
+    def __getitem__(self, which: np.ndarray | np.ndarray) -> "RangedRays":
+        return RangedRays(self.origins[which], self.rays[which], self.inverse[which], self.inverse_std[which])
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPose:
+    """A fitted ``pose`` ``(3,)``, its ``covariance`` ``(3, 3)`` in the frame of the points, and ``inlier`` ``(n,)``.
+
+    ``rise`` is how much higher the camera is (m), ``scale`` the share by which inverse ranges are larger than given.
+    """
+
+    pose: Array
+    covariance: Array
+    inlier: np.ndarray
+    rise: float = 0.0
+    scale: float = 0.0
+
+
+def camera_at(pose: Array, centre: Array) -> Array:
+    """Where the camera ``centre`` ``(3,)`` of a robot at ``pose`` ``(3,)`` is."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x = pose[0] + cos * centre[0] - sin * centre[1]
+    return np.array((x, pose[1] + sin * centre[0] + cos * centre[1], centre[2]))
+
+
+def base_vectors(points: RangedRays, pose: Array, centre: Array) -> Array:
+    """Vectors ``(n, 3)`` to the points, times their inverse ranges, from the camera in base axes at a pose."""
+    towards = points.rays + points.inverse[:, None] * (points.origins - camera_at(pose, centre))
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    seen: Array = towards @ np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    return seen
+
+
+def unmeasured(origin: Array, rays: Array, inverse: float) -> RangedRays:
+    """Points along rays ``(n, 3)`` from one origin ``(3,)``, whose ranges nobody knows."""
+    count = len(rays)
+    return RangedRays(np.tile(origin, (count, 1)), rays, np.full(count, inverse), np.full(count, UNKNOWN_STD))
+
+
+def _tangents(rays: Array) -> Array:
+    """Two unit vectors across each ray ``(n, 2, 3)``, one of them level."""
+    level = np.stack((-rays[:, 1], rays[:, 0], np.zeros(len(rays))), axis=1)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
+    return np.stack((level, np.cross(rays, level)), axis=1)
+
+
+def ray_errors(points: RangedRays, seen: Array, pose: Array, centre: Array) -> tuple[Array, Array, Array]:
+    """Errors of rays that see points from a pose, and how they change.
+
+    Args:
+        seen: unit rays ``(n, 3)`` in base axes.
+
+    Returns:
+        Errors ``(n, 2)`` (rad), their derivatives by the pose and the camera's height ``(n, 2, 4)``, and by the inverse
+        range ``(n, 2)``.
+    """
+    vectors = base_vectors(points, pose, centre)
+    length = np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)
+    unit = vectors / length[:, None]
+    across = _tangents(seen)
+    errors = np.einsum("nkj,nj->nk", across, unit)
+    # Of the unit vector, by the vector: what is not along it, over its length.
+    slope = (across - errors[:, :, None] * unit[:, None, :]) / length[:, None, None]
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    back = np.array(((cos, sin, 0.0), (-sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    moved = np.zeros((len(points), 3, 4))
+    moved[:, :, :2] = -points.inverse[:, None, None] * back[None, :, :2]
+    lever = np.array((-centre[1], centre[0], 0.0))  # how the camera moves in base axes when the base turns
+    moved[:, 0, 2], moved[:, 1, 2] = vectors[:, 1], -vectors[:, 0]
+    moved[:, :, 2] -= points.inverse[:, None] * lever
+    moved[:, 2, 3] = -points.inverse
+    by_pose = slope @ moved
+    by_inverse = np.einsum("nkj,nj->nk", slope, (points.origins - camera_at(pose, centre)) @ back.T)
+    return errors, by_pose, by_inverse
+
+
+def triangulated(points: RangedRays, seen: Array, pose: Array, centre: Array, inverse: Array, steps: int = 1) -> Array:
+    """Inverse ranges ``(n,)`` of points that suit rays ``(n, 3)`` from a pose best, by so many Newton steps."""
+    for _ in range(steps):
+        now = RangedRays(points.origins, points.rays, inverse, points.inverse_std)
+        errors, _, by_inverse = ray_errors(now, seen, pose, centre)
+        slope = np.maximum((by_inverse**2).sum(1), _NO_SLOPE)
+        inverse = np.clip(inverse - (by_inverse * errors).sum(1) / slope, *_INVERSE_LIMITS)
+    return inverse
+
+
+def measured_ranges(points: RangedRays, seen: Array, std_rad: Array, pose: Array, centre: Array) -> tuple[Array, Array]:
+    """Inverse ranges ``(n,)`` by both pictures together, and deviations ``(n,)``; see ``fit_view`` for what is given.
+
+    A range is triangulated from the old ray to a point and the new one, and averaged with what is known of it. The way
+    between the pictures is not known better than the motion that was given.
+    """
+    fresh = triangulated(points, seen, pose, centre, points.inverse, _TRIANGULATIONS)
+    errors, _, by_inverse = ray_errors(replace(points, inverse=fresh), seen, pose, centre)
+    slope = np.maximum((by_inverse**2).sum(1), _NO_SLOPE)
+    way = np.maximum(np.linalg.norm(points.origins - camera_at(pose, centre), axis=1), 1e-6)
+    std = np.hypot(1.5 * std_rad / np.sqrt(slope), fresh * np.hypot(_WAY_STD_M / way, _WAY_STD_SHARE))
+    meets = np.linalg.norm(errors, axis=1) < _MISSED * std_rad
+    std = np.where((way > _LEAST_WAY_M) & meets, std, UNKNOWN_STD)
+    old, new = points.inverse_std**-2.0, std**-2.0
+    return (old * points.inverse + new * fresh) / (old + new), (old + new) ** -0.5
+
+
+def fit_view(
+    points: RangedRays,
+    seen: Array,
+    std_rad: Array,
+    centre: Array,
+    start: Array,
+    prior: tuple[Array, Array],
+    scale_std: float,
+    rise_std: float,
+    kernel: float = 2.0,
+) -> ViewPose:
+    """The pose from which rays see points, with a prior on it, robustly.
+
+    Args:
+        seen: unit rays ``(n, 3)`` in base axes; std_rad: their deviations ``(n,)``.
+        centre: of the camera in the base frame ``(3,)``.
+        start: pose ``(3,)`` to begin at.
+        prior: a pose ``(3,)`` and its information matrix ``(3, 3)``, in the frame of the points.
+        scale_std: deviation of the share by which all inverse ranges are wrong together.
+        rise_std: deviation of the camera's height, m: floors are not quite even.
+        kernel: width of the Cauchy kernel in deviations; a ray is an inlier within one and a half of it.
+    """
+    mean, information = prior
+    state = np.append(start, (0.0, 0.0))  # x, y, yaw; rise; share of the scale
+    unknown = points.inverse_std > _RANGED * points.inverse
+    inverse = points.inverse.copy()
+    nuisances = np.array((rise_std, scale_std)) ** -2.0
+    for _ in range(_ITERATIONS):
+        at = centre + (0.0, 0.0, state[3])
+        # A range that nobody knows is the one that suits the pose best: it must not pull.
+        inverse[unknown] = triangulated(points[unknown], seen[unknown], state[:3], at, inverse[unknown])
+        scaled = RangedRays(points.origins, points.rays, inverse * (1.0 + state[4] * ~unknown), points.inverse_std)
+        errors, by_pose, by_inverse = ray_errors(scaled, seen, state[:3], at)
+        by_scale = (by_inverse * (inverse * ~unknown)[:, None])[..., None]
+        jacobian = np.concatenate((by_pose, by_scale), axis=2)
+        weight = _weights(by_inverse * points.inverse_std[:, None], std_rad)
+        squared = np.einsum("ni,nij,nj->n", errors, weight, errors)
+        robust = weight / (1.0 + squared / kernel**2)[:, None, None]
+        off = np.append(state[:2] - mean[:2], wrap(state[2] - mean[2]))
+        normal, gradient = np.zeros((5, 5)), np.zeros(5)
+        normal[:3, :3], gradient[:3] = information, information @ off
+        normal[(3, 4), (3, 4)], gradient[3:] = nuisances, nuisances * state[3:]
+        turned = np.einsum("nij,njk->nik", robust, jacobian)
+        normal += np.einsum("nij,nik->jk", jacobian, turned)
+        gradient += np.einsum("nij,ni->j", turned, errors)
+        step = -np.linalg.solve(normal, gradient)
+        state += step
+        state[4] = np.clip(state[4], -0.5, 0.5)
+        if np.abs(step).max() < _SETTLED:
+            break
+    covariance = np.linalg.inv(normal)[:3, :3]
+    return ViewPose(state[:3], covariance, squared < (1.5 * kernel) ** 2, float(state[3]), float(state[4]))
+
+
+def _weights(along: Array, std_rad: Array) -> Array:
+    """Information ``(n, 2, 2)`` of errors that are wide along ``(n, 2)``, on top of ``std_rad`` ``(n,)`` each way."""
+    variance = std_rad**2
+    shrunk = 1.0 / (variance * (variance + (along**2).sum(1)))
+    weights: Array = np.eye(2) / variance[:, None, None] - shrunk[:, None, None] * along[:, :, None] * along[:, None, :]
+    return weights

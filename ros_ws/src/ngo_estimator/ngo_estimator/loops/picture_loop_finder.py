@@ -1,0 +1,109 @@
+"""Finds loops of key pictures without training: what looks alike near where the robot may be, verified by geometry."""
+
+import numpy as np
+
+from ngo_estimator.data.state_arrays import Arrays, flat, part, require, restore, split, state_of, under
+from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.key_picture import KeyPicture
+from ngo_estimator.geometry.planar_motion import turned_covariance
+from ngo_estimator.geometry.view_pose import RangedRays
+from ngo_estimator.graph.path_covariance import path_covariances
+from ngo_estimator.graph.pose_graph import PoseGraph
+from ngo_estimator.loops.picture_fit import PictureFit, fit, points_of
+from ngo_estimator.loops.picture_loops import PictureLoops
+from ngo_estimator.loops.picture_places import PicturePlaces
+from ngo_estimator.loops.picture_settings import PictureLoopConfig
+
+_NEIGHBOURS = (-2, -1, 1, 2)
+
+
+class PictureLoopFinder:
+    """Finds loops of each new key picture, and keeps those that were verified; a robust corrector judges them."""
+
+    def __init__(self, config: PictureLoopConfig) -> None:
+        self.config = config
+        self.loops = PictureLoops.none()
+        self._pictures: list[KeyPicture] = []
+        self._places = PicturePlaces(config.words, config.vocabulary_pictures)
+        self._points: dict[int, RangedRays] = {}
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def append(self, picture: KeyPicture) -> None:
+        """Take the key picture of the next node."""
+        self._pictures.append(picture)
+        self._places.append(self._pictures)
+
+    def find(self, graph: PoseGraph) -> int:
+        """Look for loops of the last node; returns how many were found."""
+        node, found = len(self._pictures) - 1, PictureLoops.none()
+        others, covariances = self._candidates(graph)
+        for other, covariance in zip(others.tolist(), covariances, strict=True):
+            points = self._points_of(other, graph.poses)
+            fitted = fit(self.config, self._pictures[other], self._pictures[node], points)
+            if fitted is None or self._surprises(fitted, graph.poses[[other, node]], covariance):
+                continue
+            pair, inliers = np.array(((other, node),)), np.array((fitted.inliers,))
+            found = found.extended(PictureLoops(pair, fitted.relative[None], fitted.covariance[None], inliers))
+        self.loops = self.loops.extended(found)
+        return len(found)
+
+    def _surprises(self, fitted: PictureFit, poses: np.ndarray, covariance: np.ndarray) -> bool:
+        """Whether a fit is far from where the graph has both nodes ``(2, 3)``: another place looks alike."""
+        off = se2.wrapped(fitted.relative - se2.between(*poses))
+        known = turned_covariance(-poses[0, 2], covariance) + fitted.covariance
+        return bool(off @ np.linalg.solve(known, off) > self.config.deviations**2)
+
+    def _candidates(self, graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
+        """Earlier nodes ``(n,)`` that look most alike, among those that may be near.
+
+        Also the covariances ``(n, 3, 3)`` with which the graph knows the last node against them, along the map's axes.
+        """
+        config, alike = self.config, self._places.alike()
+        node = len(self._pictures) - 1
+        older = alike[: max(0, node - config.recent)]
+        ranked = np.argsort(-older, kind="stable")[: config.looked_at]
+        if len(ranked) == 0:
+            return ranked, np.zeros((0, 3, 3))
+        pairs = np.stack((ranked, np.full(len(ranked), node)), axis=1)
+        covariance = path_covariances(
+            graph.poses,
+            np.concatenate((graph.edges, self.loops.pairs)),
+            np.concatenate((graph.step_covariance, self.loops.covariance)),
+            pairs,
+        )
+        away = np.linalg.norm(graph.poses[ranked, :2] - graph.poses[node, :2], axis=1)
+        doubt = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
+        near = np.flatnonzero(away < config.apart_m + config.deviations * doubt)[: config.candidates]
+        return ranked[near], covariance[near]
+
+    def _points_of(self, node: int, poses: np.ndarray) -> RangedRays:
+        """Features of a node's picture with ranges, by the pictures of its neighbours."""
+        if node not in self._points:
+            near = [node + step for step in _NEIGHBOURS if 0 <= node + step < len(self._pictures)]
+            others = [(self._pictures[other], se2.between(poses[node], poses[other])) for other in near]
+            self._points[node] = points_of(self._pictures[node], others, self.config)
+        return self._points[node]
+
+    def drop(self, chosen: np.ndarray) -> int:
+        """See ``LoopFinder.drop``."""
+        self.loops = self.loops[~chosen]
+        return int(chosen.sum())
+
+    def state(self) -> Arrays:
+        """All that later loops depend on, for ``restore``."""
+        codes = flat([picture.packed() for picture in self._pictures], np.zeros(0, np.float32))
+        return {**under("pictures", codes), **self._places.state(), **under("loops", state_of(self.loops))}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take a ``state()``; raises ``StateError``, or ``ValueError`` about a picture that is none."""
+        codes = split(part(arrays, "pictures"), np.float32)
+        self._pictures = [KeyPicture.unpacked(code) for code in codes]
+        self._places.restore(arrays)
+        self._places.rebuilt(self._pictures)
+        self.loops = restore(self.loops, part(arrays, "loops"))
+        pairs = self.loops.pairs
+        require(
+            bool(((pairs >= 0) & (pairs < len(self._pictures))).all()), "a loop joins key pictures that are not there"
+        )

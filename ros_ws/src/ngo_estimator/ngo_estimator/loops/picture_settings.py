@@ -1,0 +1,46 @@
+"""Settings of the loops of pictures, and of the graph that they close."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class PictureLoopConfig:
+    """How loops of key pictures are found."""
+
+    # Words of the vocabulary, and key pictures that it is made of: the first ones of the place itself.
+    words: int = 32
+    vocabulary_pictures: int = 12
+    # Newest key pictures that are no candidates.
+    recent: int = 6
+    # Candidates that are verified for each key picture: so many of the most alike ones near which the robot may be.
+    candidates: int = 4
+    looked_at: int = 20
+    # Deviations of the graph within which the robot may be, and how far apart pictures of one place are taken (m).
+    deviations: float = 4.0
+    apart_m: float = 3.0
+    # The second best match must be so many times as far away: a smaller ratio accepts fewer.
+    ratio: float = 0.85
+    # Samples of RANSAC, and the error of a match (pixels).
+    samples: int = 150
+    pixel_std: float = 1.0
+    # Fewest matches that agree, and how large a share of all they are.
+    least_inliers: int = 18
+    least_share: float = 0.35
+    # Deviations that ranges and heights share: of the scale, and of the camera's height (m).
+    scale_std: float = 0.05
+    rise_std: float = 0.2
+    # Factor on deviations of the fit, and the least ones (m, rad).
+    std_factor: float = 2.0
+    least_m: float = 0.03
+    least_rad: float = 0.006
+
+
+@dataclass(frozen=True)
+class PictureGraphConfig:
+    """The graph of key pictures."""
+
+    loops: PictureLoopConfig = field(default_factory=PictureLoopConfig)
+    # Key pictures for which a loop waits at most before all are optimised.
+    keys_between: int = 2
+    # Key pictures with which loops are looked for; older ones stay in the graph.
+    most_pictures: int = 3000
