@@ -6,6 +6,7 @@
     python -m training.results --world doom      # of other Doom maps: training.results_doom
     python -m training.results --world graphs    # of graphs with wrong loops: training.results_graphs
     python -m training.results --world explore   # of exploration: training.results_explore
+    python -m training.results --world lifelong  # of several robots on one map: training.results_lifelong
     python -m training.results --world stress    # of changed logs of a lidar: training.results_stress
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
@@ -25,7 +26,7 @@ import numpy as np
 from ngo_estimator.loops import overlaps, pair_measurement
 from ngo_estimator.ngo import neural_graph_optimizer
 from ngo_estimator.trajectory import errors
-from training import results_doom, results_explore, results_graphs, results_scan, results_stress
+from training import results_doom, results_explore, results_graphs, results_lifelong, results_scan, results_stress
 from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.feature_store import open_store
@@ -66,6 +67,7 @@ TABLES: dict[str, ModuleType] = {
     "doom": results_doom,
     "explore": results_explore,
     "graphs": results_graphs,
+    "lifelong": results_lifelong,
     "stress": results_stress,
 }
 """The commands of tables that are not of a world of mazes."""
