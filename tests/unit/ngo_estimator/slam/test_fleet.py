@@ -115,6 +115,27 @@ def test_steps_wait_for_a_key_scan_and_are_answered_by_odometry() -> None:
     np.testing.assert_allclose(whole.update.pose_xyyaw, compose(at, robots()["red"][5].relative_xyyaw), atol=1e-6)
 
 
+def test_a_robot_that_is_carried_is_in_a_map_of_its_own() -> None:
+    """The map of all stays with the others, whoever is carried away from it."""
+    fleet = Fleet(ScanTrajectory(), ["red", "blue"])
+    red = [*robots()["red"][:3], replace(robots()["red"][3], segment=True), *robots()["red"][4:6]]
+    told = drive(fleet, "red", red)
+    assert [update.map_of for update in told] == [None] * 3 + ["red"] * 3
+    np.testing.assert_allclose(told[3].update.pose_xyyaw, np.zeros(3), atol=1e-9)
+    np.testing.assert_allclose(told[4].update.pose_xyyaw, red[4].relative_xyyaw, atol=0.02)
+
+
+def test_a_robot_that_went_impossibly_far_begins_anew_and_costs_the_others_nothing() -> None:
+    fleet = Fleet(ScanTrajectory(), ["red", "blue"])
+    for robot in ("red", "blue"):
+        drive(fleet, robot, robots()[robot][:3])
+    away = [replace(step, odom_xyyaw=step.odom_xyyaw + (1e8, 0.0, 0.0)) for step in robots()["red"][4:7]]
+    told = drive(fleet, "red", [replace(away[0], key=None), *away[1:]])
+    assert [update.begins for update in told] == [False, True, False]
+    assert told[-1].map_of == "red" and fleet.trajectory("red") is not None
+    assert fleet.core.newest().frames == 4 + 4 + 2
+
+
 def test_steps_that_cannot_be_used_leave_all_as_it_is() -> None:
     fleet = Fleet(ScanTrajectory(), ["red", "blue"])
     red, blue = robots()["red"], robots()["blue"]

@@ -57,6 +57,8 @@ class PoseGraph:
         self._since = np.zeros((3, 3))  # covariance of the newest frame, seen from the last node
         self._end = np.zeros((3, 3))  # covariance of the last node in the map
         self._before = np.zeros((0, 3))  # poses of the first nodes before the last ``move``, which knew no others
+        self.is_shared = False
+        """Whether streams of several robots may come: then a segment has a map of its own until it is joined."""
         self._ranks, self._begins = np.zeros(1, np.int64), np.zeros(1, np.int64)  # of the streams: their first frames
         self._waiting: dict[int, tuple[np.ndarray, np.ndarray, int]] = {}  # by rank, of the streams but the last
 
@@ -97,9 +99,9 @@ class PoseGraph:
         """The number of the stream in which each node is, an array of the shape of ``nodes``."""
         return segment_of(self.streams, nodes)
 
-    def name_stream(self, rank: int) -> None:
-        """Give the only stream another rank than 0."""
-        self._ranks = np.array((rank,))
+    def share(self, rank: int) -> None:
+        """Let the first stream have a rank, and others come beside it."""
+        self.is_shared, self._ranks = True, np.array((rank,))
 
     def begin_stream(self, rank: int) -> None:
         """Begin another stream with the next frame, which is to be a node, and to begin a segment."""
@@ -173,17 +175,16 @@ class PoseGraph:
         covariance = self._since if covariance is None else covariance
         published = (covariance if published is None else published) + self._floor
         covariance = covariance + self._floor
+        begins_map = bool(self._opens) and self.is_shared
         if self._opens:
             covariance = published = OPEN
             self._segments.append(len(self))
             self._opens = 0
         since = self.frames.since_node
         pose = compose(self.poses[-1], since)
-        self._end = propagated(self._end, pose, since, published)
+        self._end = np.zeros((3, 3)) if begins_map else propagated(self._end, pose, since, published)
         self._poses.append(pose)
         self.frames.add_node()
-        if len(self) - 1 == self.streams[-1]:  # its map begins here
-            self._end = np.zeros((3, 3))
         self._steps.append(since)
         self._step_covariance.append(covariance)
         self._published_covariance.append(published)

@@ -76,13 +76,23 @@ class Fleet:
         Raises:
             RejectedStep: as of ``ScanTrajectory.update``; a robot begins without a key scan.
         """
-        stream, begins = self._streams.get(robot), False
+        stream = self._streams.get(robot)
         step = self.core.back_end.checked(step)
-        if stream is None or _restarted(stream, step):
-            update, begins = self._begin(robot, step), True
-        else:
+        begins = stream is None or _restarted(stream, step)
+        if stream is not None and not begins:
             _check_later(stream, step)
-            update = self._go_on(stream, step, optimize)
+            if self._waits(stream, step):
+                stream.waiting.append(step)
+                stream.stamp_ns = step.stamp_ns
+                update = replace(self.core.newest(), optimized=False, largest_move_m=0.0)
+                return FleetUpdate(self._placed(robot, step, update), self.map_of(robot), begins=False)
+            self._take_waiting(stream)
+            begins = self.core.begins_anew(step)
+        if stream is None or begins:
+            update = self._begin(robot, step)
+        else:
+            stream.stamp_ns, stream.odom_xyyaw = step.stamp_ns, step.odom_xyyaw
+            update = self.core.update(step, optimize)
         return FleetUpdate(self._placed(robot, step, update), self.map_of(robot), begins)
 
     def _begin(self, robot: str, step: RelativeStep) -> TrajectoryUpdate:
@@ -100,22 +110,17 @@ class Fleet:
         count = len(self.robots)
         return self.robots.index(robot) if not self._starts[robot] else count + sum(map(len, self._starts.values()))
 
-    def _go_on(self, stream: _Stream, step: RelativeStep, optimize: bool) -> TrajectoryUpdate:
+    def _waits(self, stream: _Stream, step: RelativeStep) -> bool:
         is_last = int(self.core.back_end.graph.ranks[-1]) == stream.rank
-        stream.stamp_ns = step.stamp_ns
-        if not is_last and step.key is None and len(stream.waiting) < _MOST_WAITING:
-            stream.waiting.append(step)
-            return replace(self.core.newest(), optimized=False, largest_move_m=0.0)
-        self._take_waiting(stream)
-        stream.odom_xyyaw = step.odom_xyyaw
-        return self.core.update(step, optimize)
+        return not is_last and step.key is None and len(stream.waiting) < _MOST_WAITING
 
     def _take_waiting(self, stream: _Stream) -> None:
         """Take the steps of a robot that wait, and let its next one follow them."""
         self.core.go_on_with(stream.rank)
         for step in stream.waiting:
-            self.core.update(step)
-            stream.odom_xyyaw = step.odom_xyyaw
+            if not self.core.begins_anew(step):  # it went impossibly far: the next one begins anew
+                self.core.update(step)
+                stream.odom_xyyaw = step.odom_xyyaw
         stream.waiting.clear()
 
     def correct(self) -> bool:
@@ -138,7 +143,7 @@ class Fleet:
         parts, begins = self._places()
         graph = self.core.back_end.graph
         own = list(self._streams).index(robot)
-        if graph.ranks[graph.stream_of(begins[own])] == 0:
+        if begins[own] in graph.streams[graph.ranks == 0]:
             return None
         there = [name for name, part in zip(self._streams, parts, strict=True) if part == parts[own]]
         return min(there, key=self.robots.index)

@@ -223,9 +223,9 @@ class ScanBackEnd(BackEnd):
         return self._parts[own], self._anchors(self._parts)[own]
 
     def _anchors(self, parts: np.ndarray) -> np.ndarray:
-        """The node ``(s,)`` at which the part of the map begins that each segment is in; of one stream the first."""
+        """The node ``(s,)`` at which the part of the map begins that each segment is in; the first for one robot."""
         graph = self.graph
-        if len(graph.ranks) == 1:
+        if not graph.is_shared:
             return np.zeros_like(parts)
         return anchors(graph.segments, parts, graph.ranks[graph.stream_of(graph.segments)])
 

@@ -67,7 +67,7 @@ class ScanTrajectory(CorrectedTrajectory):
         checked = self._back_end.checked(step)
         if self._log.steps == 0:
             self.reset()
-            self._back_end.graph.name_stream(rank)
+            self._back_end.graph.share(rank)
             return self.update(step)
         begin = first_frame(checked) or checked
         if not self.may_join(begin):
