@@ -4,7 +4,7 @@
     python -m training.results --world lifelong --buildings 3 --aliased 3 --scans 1500
 
 What is measured is kept in ``runs/``. The command writes ``training/results/lifelong.json`` and
-``docs/results_lifelong.md``.
+``docs/results_lifelong.md`` with its picture.
 """
 
 from dataclasses import dataclass
@@ -65,7 +65,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
         },
         "paired": {f"{names[kind]}together": {"ate_ratio": _ratio(table)} for kind, table in found.items()},
     }
-    return arguments.publish("lifelong", result, lifelong_page.page(result))
+    images = lifelong_page.draw(arguments.images, found)
+    return arguments.publish("lifelong", result, lifelong_page.page(result, images))
 
 
 def _command(arguments: Arguments) -> str:

@@ -34,6 +34,9 @@ _FALSE_M, _LEAST_SPREAD_M = 2.0, 2.0
 """A meeting is false where a robot is that far from where it should be beside the other's way, which extends so far."""
 
 
+_MOST_WALL_POINTS = 40_000  # of a picture
+
+
 class FleetRuns:
     """The drives of all robots in a building, and what their odometries give."""
 
@@ -101,7 +104,7 @@ class FleetRuns:
             took_s += time.process_time() - began
             seen.take(robot, step.stamp_ns, update.update.pose_xyyaw, update.map_of)
         fleet.finish()
-        errors, joint, true = [], [], []
+        errors, joint, true, drawn = [], [], [], {}
         for robot, name in enumerate(self.names):
             trajectory = fleet.trajectory(name)
             assert trajectory is not None
@@ -110,10 +113,12 @@ class FleetRuns:
             if fleet.map_of(name) is None:
                 joint.append(trajectory.poses_xyyaw)
                 true.append(truth)
+                drawn[f"way_{name}"] = trajectory.poses_xyyaw
         found = {"ate_m": float(np.mean(errors)), "false_meetings": float(seen.false), "met": seen.met()}
         found["joint_ate_m"] = absolute_error_m(np.concatenate(joint), np.concatenate(true))
         found["ms_a_step"] = 1e3 * took_s / max(1, seen.steps)
-        return Measured({**Measured.of(found).errors, **seen.delays()})
+        drawn["walls"] = fleet.walls(self.names[0], _MOST_WALL_POINTS)
+        return Measured({**Measured.of(found).errors, **seen.delays()}, drawn)
 
 
 class _Seen:

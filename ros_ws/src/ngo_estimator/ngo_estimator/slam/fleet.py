@@ -189,6 +189,12 @@ class Fleet:
             pose, odom = compose(pose, since), step.odom_xyyaw
         return between(begin, pose), turned_covariance(-float(begin[2]), covariance)
 
+    def walls(self, robot: str, most: int) -> np.ndarray:
+        """Points ``(n, 2)`` of all robots' key scans in the map in which a robot is, thinned to about ``most``."""
+        points = self.core.walls(most)
+        at = np.column_stack((points, np.zeros(len(points))))
+        return np.asarray(between_all(self._begin_pose(robot), at)[:, :2])
+
     def trajectory(self, robot: str) -> Trajectory | None:
         """The frames of a robot that are in the map in which it is now, in that map; None before its first step.
 
