@@ -34,3 +34,9 @@ def test_a_rate_of_zero_lets_everything_pass() -> None:
 def test_a_rate_that_cannot_be_is_refused(rate_hz: float) -> None:
     with pytest.raises(ValueError, match="expected 0 or more"):
         PublicationPace(rate_hz)
+
+
+def test_equal_publishers_have_parts_of_the_share() -> None:
+    pace = PublicationPace(10.0, equals=4)
+    pace.published(100.0, 100.1)
+    assert not pace.is_due(103.9) and pace.is_due(104.1)

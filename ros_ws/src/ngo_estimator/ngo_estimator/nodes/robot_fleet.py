@@ -48,7 +48,7 @@ class _Robot:
         smoothing = SmoothedCorrection(fleet.settings.tf_smoothing_s)
         self.out = PosePublisher(fleet.node, lambda: self.own_settings(fleet.settings), smoothing, built)
         own = self.own_settings(fleet.settings)
-        self.whole = TrajectoryPublishers(fleet.node, own, partial(fleet.trajectory, name))
+        self.whole = TrajectoryPublishers(fleet.node, own, partial(fleet.trajectory, name), len(fleet.settings.robots))
         built.callback(self.whole.close)
 
     def own_settings(self, settings: NgoNodeSettings) -> NgoNodeSettings:

@@ -38,9 +38,10 @@ class TrajectoryPublishers:
         node: LifecycleNode,
         settings: NgoNodeSettings,
         snapshot: Callable[[], "WholeTrajectory | None"],
+        robots: int = 1,
     ) -> None:
-        """Publish the trajectory of ``snapshot()`` on the three topics of ``settings``."""
-        self._node = node
+        """Publish ``snapshot()`` on the three topics of ``settings``; it is that of one of so many ``robots``."""
+        self._node, self._robots = node, robots
         self._snapshot = snapshot
         self.use_map(settings.framed(settings.map_frame))
         self._path = self._create(Path, settings.path_topic)
@@ -66,7 +67,7 @@ class TrajectoryPublishers:
     def set_rate(self, rate_hz: float) -> None:
         """Set the highest rate; 0: after every change."""
         self._end_timer()
-        self._pace = PublicationPace(rate_hz)
+        self._pace = PublicationPace(rate_hz, self._robots)
         if rate_hz > 0.0:
             steady = Clock(clock_type=ClockType.STEADY_TIME)
             self._timer = self._node.create_timer(1.0 / rate_hz, self._publish_if_due, clock=steady)
