@@ -116,7 +116,7 @@ def _tidied(sights: Sights, order: list[int], cells: float) -> list[int]:
     between = sights.ways_m[:, sights.stops]
     if len(order) > 2:
         inner = np.array(order[1:])
-        found, _ = tour(between[0, inner], between[np.ix_(inner, inner)], np.full(len(inner), 1e-6), 1e6)
+        found, _ = tour(between[0, inner], between[np.ix_(inner, inner)])
         ordered = [0, *inner[found].tolist()]
         if sights.length_m(ordered) < sights.length_m(order) and sights.shown(ordered).sum() >= cells:
             order = ordered

@@ -81,37 +81,33 @@ def test_no_path_leads_through_a_gap_that_is_too_narrow() -> None:
     assert not line_is_free(wide, start, goal, 0.35)
 
 
-def brute_force(first: np.ndarray, between: np.ndarray, weights: np.ndarray, last: float) -> float:
-    best = np.inf
-    for order in permutations(range(len(first))):
-        ways = np.cumsum([first[order[0]], *(between[a, b] for a, b in zip(order[:-1], order[1:], strict=True))])
-        best = min(best, float(weights[list(order)] @ ways + last * weights.sum() * ways[-1]))
-    return best
+def brute_force(first: np.ndarray, between: np.ndarray) -> float:
+    return min(
+        first[order[0]] + sum(between[a, b] for a, b in zip(order[:-1], order[1:], strict=True))
+        for order in permutations(range(len(first)))
+    )
 
 
-@pytest.mark.parametrize("last", [0.0, 1.0, 20.0])
-def test_a_tour_over_seven_places_is_the_best_or_nearly(last: float) -> None:
+def test_a_tour_over_seven_places_is_the_shortest_or_nearly() -> None:
     rng = np.random.default_rng(1)
     ratios = []
-    for _ in range(4):
+    for _ in range(12):
         points = rng.uniform(0.0, 10.0, (8, 2))
         gaps = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
-        weights = rng.uniform(0.5, 4.0, 7)
-        order, cost = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), weights, last)
+        order, length = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy())
         assert sorted(order) == list(range(7))
-        ratios.append(cost / brute_force(gaps[0, 1:], gaps[1:, 1:], weights, last))
+        ratios.append(length / brute_force(gaps[0, 1:], gaps[1:, 1:]))
     assert min(ratios) >= 1.0 - 1e-9 and np.mean(ratios) < 1.02 and max(ratios) < 1.1
 
 
 def test_a_tour_visits_the_near_dead_end_before_it_goes_far() -> None:
-    """Greedy by gain it would go right; the two on the left together are worth the way."""
     points = np.array(((0.0, 0.0), (-2.0, 0.0), (-2.5, 0.0), (12.0, 0.0)))
     gaps = np.abs(points[:, None, 0] - points[None, :, 0])
-    order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), np.array((1.0, 1.0, 2.0)), 1.0)
-    assert order.tolist() == [0, 1, 2]
+    order, length = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy())
+    assert order.tolist() == [0, 1, 2] and length == 17.0
 
 
 def test_a_given_first_place_stays_first() -> None:
     gaps = np.abs(np.arange(5.0)[:, None] - np.arange(5.0)[None])
-    order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), np.ones(4), 1.0, start=2)
+    order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), start=2)
     assert order[0] == 2

@@ -70,7 +70,7 @@ def _explore_lite(seen: Situation) -> Floats:
 
 
 def _along_a_tour(seen: Situation, config: ExplorerConfig) -> int:
-    """The first of a tour over the nearest frontiers; the present one unless another is clearly better."""
+    """The first of the shortest tour over the nearest frontiers; the present one unless that is clearly longer."""
     ways = _ways(seen)
     nearest = np.argsort(ways, kind="stable")[: config.most_in_tour]
     if seen.present >= 0 and seen.present not in nearest:
@@ -79,12 +79,11 @@ def _along_a_tour(seen: Situation, config: ExplorerConfig) -> int:
         return int(nearest[0])
     points = np.array([seen.candidates[index].viewpoint_xy for index in nearest])
     between = _between(seen, points)
-    weights = np.array([seen.candidates[index].gain_m2 for index in nearest]) ** config.gain_exponent
-    order, cost = tour(ways[nearest], between, weights, config.end_weight)
+    order, length = tour(ways[nearest], between)
     if seen.present >= 0 and nearest[order[0]] != seen.present:
         kept = int(np.flatnonzero(nearest == seen.present)[0])
-        _, present_cost = tour(ways[nearest], between, weights, config.end_weight, kept)
-        if cost > (1.0 - config.switch) * present_cost:
+        _, present_length = tour(ways[nearest], between, kept)
+        if length > (1.0 - config.switch) * present_length:
             return seen.present
     return int(nearest[order[0]])
 

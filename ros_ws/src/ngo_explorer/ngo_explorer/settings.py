@@ -13,20 +13,18 @@ class ExplorerConfig(Settings):
 
     rule: str = setting(
         "tour",
-        "Chooses the next frontier. tour: the first of a tour over the nearest ones; random; nearest: shortest path; "
-        "explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area a metre; d_optimality: "
-        "of the predicted pose graph.",
+        "Chooses the next frontier. tour: the first of the shortest tour over the nearest ones; random; nearest: "
+        "shortest path; explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area a metre; "
+        "d_optimality: of the predicted pose graph.",
         choices=RULES,
     )
     radius_m: float = setting(0.22, "Radius of the robot, m.", minimum=0.02, maximum=2.0)
     margin_m: float = setting(0.05, "Least distance that paths keep from obstacles beside the radius, m.", minimum=0.0)
     comfort_m: float = setting(0.6, "Distance from obstacles below which paths cost more, m.", minimum=0.0, maximum=3.0)
     reach_m: float = setting(6.0, "Distance up to which a frontier is looked at from afar, m.", minimum=0.3)
-    frontier_m: float = setting(0.3, "Length of the smallest frontier, m.", minimum=0.0, maximum=10.0)
+    frontier_m: float = setting(0.75, "Length of the smallest frontier, m.", minimum=0.0, maximum=10.0)
     gain_m2: float = setting(0.1, "Unknown area that a frontier must show from its viewpoint, m^2.", minimum=0.0)
     gain_range_m: float = setting(4.0, "Distance beyond a frontier up to which unknown area is gain, m.", minimum=0.3)
-    gain_exponent: float = setting(0.5, "Weight of gain against path in a tour; 0: all frontiers alike.", minimum=0.0)
-    end_weight: float = setting(1.0, "Weight of the length of the whole tour, in sums of all gains.", minimum=0.0)
     most_in_tour: int = setting(10, "Frontiers of which a tour is made, the nearest ones.", minimum=1, maximum=100)
     replan_s: float = setting(2.0, "Time between two decisions on the way, s.", minimum=0.1, maximum=600.0)
     switch: float = setting(0.15, "Share by which a new goal must be better than the present one.", minimum=0.0)

@@ -1,8 +1,4 @@
-"""Tours over frontiers: nearest insertion, then 2-opt and or-opt on the sum of gains by the way to each.
-
-The cost of an open tour from the robot is ``sum(weight[i] * way to i)``: what is worth much is reached early, and what
-lies together is visited together (the minimum latency problem). With ``last`` above 0 the whole way counts as well.
-"""
+"""Short tours over frontiers, from the robot to anywhere: nearest insertion, then 2-opt and or-opt."""
 
 from __future__ import annotations
 
@@ -15,15 +11,15 @@ from ngo_explorer.known_map import Floats
 Ints = NDArray[np.int64]
 
 
-def tour(first_m: Floats, between_m: Floats, weights: Floats, last: float = 1.0, start: int = -1) -> tuple[Ints, float]:
-    """The order ``(n,)`` in which to visit n places, and its cost.
+def tour(first_m: Floats, between_m: Floats, start: int = -1) -> tuple[Ints, float]:
+    """The order ``(n,)`` in which to visit n places, and its length in m.
 
-    first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places. weights: ``(n,)`` what each is
-    worth. last: worth of ending early, in sums of all weights. start: the place to visit first; -1: any.
+    first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places. start: the place to visit
+    first; -1: any.
     """
     order = _inserted(first_m, between_m, start)
-    cost = _improved(order, first_m, between_m, weights, last * float(weights.sum()), 1 if start >= 0 else 0)
-    return order, float(cost)
+    length = _improved(order, first_m, between_m, 1 if start >= 0 else 0)
+    return order, float(length)
 
 
 @njit(cache=True)
@@ -58,20 +54,18 @@ def _inserted(first: Floats, between: Floats, start: int) -> Ints:
 
 
 @njit(cache=True)
-def _cost(order: Ints, first: Floats, between: Floats, weights: Floats, last: float) -> float:
+def _length(order: Ints, first: Floats, between: Floats) -> float:
     way = first[order[0]]
-    total = weights[order[0]] * way
     for index in range(1, len(order)):
         way += between[order[index - 1], order[index]]
-        total += weights[order[index]] * way
-    return total + last * way
+    return way
 
 
 @njit(cache=True)
-def _improved(order: Ints, first: Floats, between: Floats, weights: Floats, last: float, fixed: int) -> float:
-    """Reverse and move parts of the tour while that makes it cheaper; the first ``fixed`` places stay."""
+def _improved(order: Ints, first: Floats, between: Floats, fixed: int) -> float:
+    """Reverse and move parts of the tour while that makes it shorter; the first ``fixed`` places stay."""
     count = len(order)
-    best = _cost(order, first, between, weights, last)
+    best = _length(order, first, between)
     changed = True
     rounds = 0
     while changed and rounds < 50:
@@ -81,20 +75,20 @@ def _improved(order: Ints, first: Floats, between: Floats, weights: Floats, last
             for end in range(begin + 1, count):
                 tried = order.copy()
                 tried[begin : end + 1] = order[begin : end + 1][::-1]
-                cost = _cost(tried, first, between, weights, last)
-                if cost < best - 1e-9:
+                length = _length(tried, first, between)
+                if length < best - 1e-9:
                     order[:] = tried
-                    best, changed = cost, True
-        for length in range(1, min(4, count - fixed)):
-            for begin in range(fixed, count - length + 1):
-                for target in range(fixed, count - length + 1):
+                    best, changed = length, True
+        for size in range(1, min(4, count - fixed)):
+            for begin in range(fixed, count - size + 1):
+                for target in range(fixed, count - size + 1):
                     if target == begin:
                         continue
-                    part = order[begin : begin + length].copy()
-                    rest = np.concatenate((order[:begin], order[begin + length :]))
+                    part = order[begin : begin + size].copy()
+                    rest = np.concatenate((order[:begin], order[begin + size :]))
                     tried = np.concatenate((rest[:target], part, rest[target:]))
-                    cost = _cost(tried, first, between, weights, last)
-                    if cost < best - 1e-9:
+                    length = _length(tried, first, between)
+                    if length < best - 1e-9:
                         order[:] = tried
-                        best, changed = cost, True
+                        best, changed = length, True
     return best
