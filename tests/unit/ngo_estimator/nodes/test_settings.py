@@ -68,11 +68,15 @@ def test_a_view_serves_its_page_and_its_data_from_two_ports() -> None:
 
 
 def test_any_world_may_be_named_together_with_its_weights() -> None:
-    for world in ("maze2d", "maze3d", "scan"):
+    for world in ("maze2d", "maze3d", "scan", "camera"):
         assert LocalNodeSettings(world=world).world == world
     assert NgoNodeSettings(world="our_robot-2", weights="/weights").world == "our_robot-2"
+    assert NgoNodeSettings(world="camera").uses_camera
+    assert not NgoNodeSettings(world="camera", weights="/weights").uses_camera  # the name of weights of one's own
     for world, weights in (("our_robot", ""), ("../maze2d", "/weights"), ("", "/weights")):
-        with pytest.raises(BadParameter, match=f"'world' is '{world}'; allowed: maze2d, maze3d, doom or scan, or"):
+        with pytest.raises(
+            BadParameter, match=f"'world' is '{world}'; allowed: maze2d, maze3d, doom, scan or camera, or"
+        ):
             LocalNodeSettings(world=world, weights=weights)
 
 

@@ -1,6 +1,7 @@
 """Node that turns images or laser scans into relative poses, odometry and odom -> base_link."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import StartError, run_node
 from ngo_common.nodes.qos import checked_overrides, overridable
 from ngo_common.settings import usage
-from ngo_estimator.data.lidar_file import is_lidar, require_torch
+from ngo_estimator.data.lidar_file import is_lidar, require_opencv, require_torch
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
@@ -28,6 +29,7 @@ from ngo_estimator.nodes.weights import weights_folder
 
 if TYPE_CHECKING:
     from ngo_estimator.data.relative_step import RelativeStep
+    from ngo_estimator.nodes.camera_input import CameraInput
     from ngo_estimator.nodes.image_input import ImageInput
     from ngo_estimator.nodes.lidar_input import LidarInput
 
@@ -49,7 +51,7 @@ class LocalNode(Node):
         self._covariance = np.zeros((3, 3))
         self._input = self._make_input(settings)
         # A robot that publishes odom -> base_link goes on with it: then only map -> odom is ours.
-        self._has_odom = self._lidar and settings.robot_odometry == "tf"
+        self._has_odom = settings.robot_odometry == "tf"
         with checked_overrides():
             self._create_topics()
         self.create_service(Reset, "~/reset", self._on_reset)
@@ -57,10 +59,14 @@ class LocalNode(Node):
         self._live.lock()
         self.get_logger().info(f"ready: {self.get_fully_qualified_name()}, {settings.world}, {self._input.description}")
 
-    def _make_input(self, settings: LocalNodeSettings) -> "ImageInput | LidarInput":
+    def _make_input(self, settings: LocalNodeSettings) -> "ImageInput | LidarInput | CameraInput":
         # Imported here because torch takes seconds: a bad parameter is said at once, and a lidar needs no torch.
-        self._lidar = is_lidar(weights_folder(settings))
-        if self._lidar:
+        if settings.uses_camera:
+            _need(require_opencv)
+            from ngo_estimator.nodes.camera_input import CameraInput
+
+            return CameraInput(self, settings, self._publish)
+        if is_lidar(weights_folder(settings)):
             from ngo_estimator.nodes.lidar_input import LidarInput
 
             return LidarInput(self, settings, self._publish)
@@ -68,10 +74,7 @@ class LocalNode(Node):
             raise StartError(
                 f"parameter 'robot_odometry' is '{settings.robot_odometry}'; expected 'none': these weights take images"
             )
-        try:
-            require_torch()
-        except ValueError as error:
-            raise StartError(str(error)) from error
+        _need(require_torch)
         from ngo_estimator.nodes.image_input import ImageInput
 
         return ImageInput(self, settings, self._publish)
@@ -127,6 +130,14 @@ class LocalNode(Node):
 
     def _problems(self) -> list[str]:
         return [*self._listening.problems(), *self._input.problems()]
+
+
+def _need(require: Callable[[], None]) -> None:
+    """Raise ``StartError`` where a library is missing."""
+    try:
+        require()
+    except ValueError as error:
+        raise StartError(str(error)) from error
 
 
 def main() -> None:

@@ -335,8 +335,8 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
     require_opencv()
     import cv2
 
+    from ngo_estimator.frontend.camera.calibrated_camera import NOT_MOUNTED, calibrated_camera
     from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
-    from ngo_estimator.geometry.camera_model import CameraModel, camera_mounting, tilted
     from ngo_estimator.offline.camera_run import CameraRun
     from ngo_estimator.slam.picture_trajectory import PictureTrajectory
     from ngo_recordings.calibration import calibration_of, info_topics
@@ -360,15 +360,11 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
     seen = calibration_of(recording.first(info).value, info, topics.image)
     mounted = find_pose(recording, topics, seen.frame_id or None)
     if mounted is None:
-        base_from_camera, where = (
-            tilted(0.0, 0.0),
-            "no transform says where: taken to be the robot's own, looking ahead",
-        )
+        pose, where = None, f"no transform says where it sits: {NOT_MOUNTED}"
     else:
         base, frame, pose, source = mounted
-        base_from_camera = camera_mounting(pose.position, pose.rotation.as_matrix())
         where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
-    model = CameraModel(seen.width, seen.height, seen.matrix, seen.distortion, seen.coefficients, base_from_camera)
+    model = calibrated_camera(seen, pose)
     odometry = PictureOdometry(model)
     console.print(f"using {_words(topics)}, calibration {info}", soft_wrap=True, highlight=False)
     console.print(

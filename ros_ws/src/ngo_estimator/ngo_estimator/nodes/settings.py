@@ -5,9 +5,12 @@ from dataclasses import dataclass
 
 from ngo_common.settings import BadParameter, FramedSettings, frame, pose, setting, topic, topics
 
-SHIPPED_WORLDS = ("maze2d", "maze3d", "doom", "scan")
-"""Worlds whose weights are in the package."""
-_WORLD_NAMES = "maze2d, maze3d, doom or scan, or the name of another one and its folder in 'weights'"
+CAMERA_WORLD = "camera"
+"""Any calibrated camera, without weights; with weights it is a name as any other."""
+
+SHIPPED_WORLDS = ("maze2d", "maze3d", "doom", "scan", CAMERA_WORLD)
+"""Worlds that need no weights but those in the package."""
+_WORLD_NAMES = "maze2d, maze3d, doom, scan or camera, or the name of another one and its folder in 'weights'"
 
 
 _TRANSPORTS = ("raw", "compressed")
@@ -42,7 +45,8 @@ class StepSettings(FramedSettings):
 
     world: str = setting(
         "maze3d",
-        "World whose weights are used; doom: any map of maze3d; scan: any 2D lidar.",
+        "World whose weights are used; doom: any map of maze3d. Without weights: scan, any 2D lidar, and camera, any "
+        "calibrated camera.",
         allowed=_WORLD_NAMES,
         check=lambda value: re.fullmatch(r"[\w-]+", value) is not None,
     )
@@ -60,6 +64,11 @@ class StepSettings(FramedSettings):
     )
     diagnostics_topic: str = topic("/diagnostics", "Rates, drops and durations of the node.")
     diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0, live=True)
+
+    @property
+    def uses_camera(self) -> bool:
+        """Whether pictures are tracked without weights."""
+        return self.world == CAMERA_WORLD and not self.weights
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -81,7 +90,9 @@ class EstimatorSettings(StepSettings):
 class LocalNodeSettings(EstimatorSettings):
     """Parameters of ``local_node``."""
 
-    image_topic: str = topic("image", "Images to estimate motion from, with weights that take images.")
+    image_topic: str = topic(
+        "image", "Images to estimate motion from, with weights that take images, or with world:=camera."
+    )
     image_transport: str = setting(
         "raw", "Type of the images: Image, or CompressedImage on image_topic/compressed.", choices=_TRANSPORTS
     )
@@ -111,8 +122,8 @@ class LocalNodeSettings(EstimatorSettings):
     )
     robot_odometry: str = setting(
         "none",
-        "Odometry that the robot has of its own, with world:=scan: none, an Odometry on robot_odometry_topic, or "
-        "any chain from odom_frame to base_frame on tf_topic, which then stays the robot's.",
+        "Odometry that the robot has of its own, with world:=scan, or camera, which needs it: none, an Odometry on "
+        "robot_odometry_topic, or any chain from odom_frame to base_frame on tf_topic, which then stays the robot's.",
         choices=("none", "topic", "tf"),
     )
     robot_odometry_topic: str = topic("wheel_odom", "Odometry of the robot, with robot_odometry:=topic.")

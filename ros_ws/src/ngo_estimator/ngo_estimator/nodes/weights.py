@@ -20,6 +20,8 @@ Core = TypeVar("Core")
 
 def weights_folder(settings: StepSettings) -> Path:
     """The folder of weights that ``settings`` name; raises ``StartError`` where there is none."""
+    if settings.uses_camera:
+        raise StartError("world: camera has no weights, and no map: the ranges of its corners are too few for walls")
     folder = Path(settings.weights or Path(get_package_share_directory("ngo_estimator"), "weights", settings.world))
     if not folder.is_dir():
         raise StartError(f"weights: there is no folder '{folder}' (parameters 'weights' and 'world')")
@@ -46,6 +48,9 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
     All that it runs is compiled by then, which ``logger`` tells where it takes long.
     """
 
+    if settings.uses_camera:
+        return _camera_trajectory(settings)
+
     # Imported here because torch takes seconds: a bad parameter is said at once. A lidar's estimators take half a one.
     def load(folder: Path, world: str) -> "CorrectedTrajectory":
         if is_lidar(folder):
@@ -66,3 +71,9 @@ def load_trajectory(settings: NgoNodeSettings, logger: RcutilsLogger) -> "Correc
         return online
 
     return load_core(load, settings)
+
+
+def _camera_trajectory(settings: NgoNodeSettings) -> "CorrectedTrajectory":
+    from ngo_estimator.slam.picture_trajectory import PictureTrajectory
+
+    return PictureTrajectory(iterations_per_step=settings.iterations_per_step)

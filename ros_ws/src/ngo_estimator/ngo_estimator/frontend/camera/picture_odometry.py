@@ -98,6 +98,11 @@ class PictureOdometry:
         self._waiting.append((stamp_ns, _grey(picture)))
 
     @property
+    def inliers(self) -> int:
+        """Corners that agreed with the newest pose."""
+        return self._odometry.inliers
+
+    @property
     def waiting(self) -> int:
         """Pictures that wait for odometry."""
         return len(self._waiting)

@@ -1,0 +1,242 @@
+"""The input of ``local_node`` with a calibrated camera: pictures, their CameraInfo, odometry, and the mounting."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from tf2_msgs.msg import TFMessage
+
+from ngo_common.nodes.process import StartError
+from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.camera.calibrated_camera import NOT_MOUNTED, calibrated_camera
+from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.listening import Listening
+from ngo_estimator.nodes.settings import LocalNodeSettings
+from ngo_estimator.nodes.status import NodeStatus
+from ngo_recordings.calibration import Calibration, calibration_of, info_topics
+from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, picture
+from ngo_recordings.odometry_poses import OdometryPoses
+from ngo_recordings.poses import Pose
+from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
+
+_DEPTH = 1000
+_MOUNTING_WAIT_NS = 2_000_000_000
+_MOST_HELD = 64
+_NO_POSE = "pose has values that are not finite, or no orientation"
+
+
+class CameraInput:
+    """Subscribes to pictures, their calibration, the robot's odometry and transforms; hands on a step for each picture.
+
+    Pictures wait for the calibration, and for the camera's mounting for 2 s at most, by their stamps; then it is taken
+    to be at the robot's own place, until it comes: then the odometry starts anew with it.
+
+    Args:
+        publish: takes each step, and None where the odometry starts anew.
+    """
+
+    def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
+        if settings.robot_odometry == "none":
+            raise StartError(
+                "parameter 'robot_odometry' is 'none'; expected 'topic' or 'tf': world:=camera takes the scale of the "
+                "motion from the robot's odometry"
+            )
+        cv2.setNumThreads(settings.threads)
+        self._node, self._settings, self._publish = node, settings, publish
+        self._base_frame = settings.framed(settings.base_frame)
+        self._odom_frame = settings.framed(settings.odom_frame)
+        self._transforms = TransformBuffer()
+        self._wheels = FramePoses(self._transforms, self._odom_frame, self._base_frame)
+        self._odometry = OdometryPoses()
+        self._is_compressed = settings.image_transport == "compressed"
+        self._topic = settings.image_topic + ("/compressed" if self._is_compressed else "")
+        self._calibration: Calibration | None = None
+        self._core: PictureOdometry | None = None
+        self._mounted = False  # as transforms say
+        self._held: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_HELD)
+        self._given: deque[tuple[int, np.ndarray]] = deque(maxlen=_DEPTH)  # odometry before there is a core
+        self._restarts = self._newly_alone = 0
+
+    @property
+    def description(self) -> str:
+        """What the input listens to, in words."""
+        own = {
+            "topic": f"odometry on '{self._node.resolve_topic_name(self._settings.robot_odometry_topic)}'",
+            "tf": f"odometry from {self._odom_frame} to {self._base_frame} on TF",
+        }[self._settings.robot_odometry]
+        return f"pictures on '{self._node.resolve_topic_name(self._topic)}', {own}"
+
+    @property
+    def _info_topics(self) -> tuple[str, ...]:
+        return info_topics(self._node.resolve_topic_name(self._topic))[: 1 + self._is_compressed]
+
+    def listen(self, listening: Listening, status: NodeStatus) -> None:
+        """Subscribe to pictures, their calibration, odometry and transforms."""
+        self._status, settings = status, self._settings
+        reliability = ReliabilityPolicy[settings.image_reliability.upper()]
+        pictures = QoSProfile(depth=settings.image_depth, reliability=reliability)
+        listening.to(CompressedImage if self._is_compressed else Image, self._topic, self._on_picture, pictures)
+        for topic in self._info_topics:
+            listening.to_all(CameraInfo, topic, self._on_info, pictures)
+        if settings.robot_odometry == "topic":
+            listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
+        # Every node on a robot publishes transforms: no single publisher is held on to.
+        listening.to_all(TFMessage, settings.tf_topic, self._on_moving, QoSProfile(depth=_DEPTH))
+        latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        listening.to_all(TFMessage, settings.tf_topic + "_static", self._on_static, latched)
+
+    def _on_info(self, message: CameraInfo) -> None:
+        if self._calibration is not None:
+            return
+        topic = " or ".join(self._info_topics)
+        try:
+            self._calibration = calibration_of(message, topic, self._topic)
+        except ValueError as error:
+            self._status.dropped("calibration", error)
+            return
+        self._update()
+
+    def _on_static(self, message: TFMessage) -> None:
+        self._take_transforms(message, static=True)
+
+    def _on_moving(self, message: TFMessage) -> None:
+        self._take_transforms(message, static=False)
+
+    def _take_transforms(self, message: TFMessage, static: bool) -> None:
+        bad = self._wheels.bad
+        for stamp_ns, pose in self._wheels.read(message.transforms, static):
+            if self._settings.robot_odometry == "tf":
+                self._add_wheels(stamp_ns, pose.planar()[0])
+        if self._wheels.bad > bad and self._settings.robot_odometry == "tf":
+            self._status.dropped("robot odometry", _NO_POSE)
+        if self._core is not None and not self._mounted and self._mounting() is not None:
+            self._core = None
+            self._publish(None)
+            self._node.get_logger().warning("the camera's mounting came late: the odometry starts anew with it")
+        self._update()
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            pose = self._odometry.read(message)
+        except ValueError as error:
+            self._status.dropped("robot odometry", error)
+            return
+        if pose is None:
+            self._status.dropped("robot odometry", _NO_POSE)
+            return
+        self._add_wheels(messages.to_ns(message.header.stamp), pose)
+        self._update()
+
+    def _add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
+        if self._core is None:
+            self._given.append((stamp_ns, pose_xyyaw))
+            return
+        try:
+            self._core.add_wheels(stamp_ns, pose_xyyaw)
+        except ValueError as error:
+            self._status.dropped("robot odometry", error)
+
+    def _on_picture(self, message: Any) -> None:
+        kind, known = (COMPRESSED_TYPE if self._is_compressed else IMAGE_TYPE), self._calibration
+        try:
+            pixels = picture(message, kind, self._topic, None if known is None else (known.height, known.width))[0]
+        except ValueError as error:
+            self._status.dropped("picture", error)
+            return
+        stamp_ns = messages.to_ns(message.header.stamp)
+        self._status.received(stamp_ns)
+        self._held.append((stamp_ns, pixels))
+        self._update()
+
+    def _update(self) -> None:
+        if self._core is None and not self._made_core():
+            return
+        assert self._core is not None
+        while self._held:
+            try:
+                self._core.add_picture(*self._held.popleft())
+            except ValueError as error:
+                self._status.dropped("picture", error)
+            if self._core.restarts > self._restarts:
+                self._restarts = self._core.restarts
+                self._publish(None)
+                self._node.get_logger().info("the pictures' stamps jumped back: the odometry starts anew")
+        alone = self._core.by_wheels
+        for step in self._core.ready():
+            self._publish(step)
+        self._newly_alone += self._core.by_wheels - alone
+
+    def _made_core(self) -> bool:
+        """Whether calibration and mounting are known by now, or the mounting has been waited for long enough."""
+        if self._calibration is None or not self._held:
+            return False
+        mounting = self._mounting()
+        waited_ns = self._held[-1][0] - self._held[0][0]
+        if mounting is None and waited_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
+            return False
+        frame, logger = self._calibration.frame_id, self._node.get_logger()
+        if mounting is None:
+            logger.warning(
+                f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': "
+                f"{NOT_MOUNTED}"
+            )
+        try:
+            model = calibrated_camera(self._calibration, mounting)
+            self._core = PictureOdometry(model)
+        except ValueError as error:
+            self._calibration = None
+            self._held.clear()
+            self._status.dropped("calibration", error)
+            return False
+        self._mounted, self._restarts = mounting is not None, 0
+        logger.info(f"camera: {model.width} x {model.height}, {model.description}, '{frame}' on '{self._base_frame}'")
+        for stamp_ns, pose in self._given:
+            self._add_wheels(stamp_ns, pose)
+        self._given.clear()
+        return True
+
+    def _mounting(self) -> Pose | None:
+        assert self._calibration is not None
+        if self._calibration.frame_id in ("", self._base_frame):
+            return None
+        return self._transforms.newest_lookup(self._base_frame, self._calibration.frame_id)
+
+    def reset(self) -> str:
+        """Start anew with the next picture; returns what that means, in words."""
+        if self._core is not None:
+            self._core.reset()
+        self._held.clear()
+        self._publish(None)
+        return "the next picture is the new origin of the odometry"
+
+    def details(self) -> dict[str, str]:
+        """Values for diagnostics."""
+        core = self._core
+        return {
+            "pictures waiting": str(len(self._held) + (0 if core is None else core.waiting)),
+            "calibration": "none" if self._calibration is None else self._calibration.distortion,
+            "mounting": "on TF" if self._mounted else "not on TF",
+            "corners that agree": "0" if core is None else str(core.inliers),
+            "restarts": str(self._restarts),
+        }
+
+    def problems(self) -> list[str]:
+        """A line for each thing that was wrong since the last call."""
+        found = []
+        if self._newly_alone:
+            found.append(f"{self._newly_alone} pictures told too little: the robot's odometry alone counts there")
+            self._newly_alone = 0
+        if self._calibration is None and self._held:
+            found.append(f"no CameraInfo came on {' or '.join(self._info_topics)}, without which pictures are not used")
+        if not self._given and (self._core is None or not self._core.has_wheels):
+            found.append("no odometry of the robot came yet")
+        if self._core is not None and not self._mounted:
+            found.append(f"no transform says where the camera sits on '{self._base_frame}'")
+        return found
