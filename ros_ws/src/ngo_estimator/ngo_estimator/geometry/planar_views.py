@@ -9,6 +9,8 @@ planar motion (Ortin and Montiel, Indoor robot motion based on monocular images,
 
 import numpy as np
 
+from ngo_estimator.geometry.se2 import wrap
+
 Array = np.ndarray
 
 _PARALLEL = 1e-12
@@ -93,12 +95,21 @@ def epipolar_errors(first: Array, second: Array, yaw: Array, direction: Array) -
 
 
 def ransac(
-    first: Array, second: Array, tolerance_rad: float, samples: int, seed: int = 0
+    first: Array,
+    second: Array,
+    tolerance_rad: float,
+    samples: int,
+    near: tuple[float, float] = (0.0, np.pi),
+    seed: int = 0,
 ) -> tuple[Array, Array] | None:
     """The motion (yaw, direction of ``b``) ``(2,)`` on which most pairs of rays ``(n, 3)`` agree.
 
+    Args:
+        near: the yaw that is expected, and how far from it the motion's may be (rad).
+
     Returns:
-        The motion, its direction up to the sign, and which pairs agree ``(n,)``; None of fewer than three pairs.
+        The motion, its direction up to the sign, and which pairs agree ``(n,)``; None of fewer than three pairs, or
+        where no motion is near.
     """
     count = len(first)
     if count < 3:
@@ -107,6 +118,7 @@ def ransac(
     drawn = rng.integers(count, size=(samples, 2))
     drawn = drawn[drawn[:, 0] != drawn[:, 1]]
     motions = minimal_motions(first[drawn], second[drawn])[1]
+    motions = motions[np.abs(wrap(motions[:, 0] - near[0])) <= near[1]]
     if len(motions) == 0:
         return None
     errors = epipolar_errors(first, second, motions[:, 0], motions[:, 1])

@@ -13,6 +13,9 @@ from ngo_estimator.loops.picture_settings import PictureLoopConfig
 _WAYS_M = np.array((0.0, 0.15, 0.4, 0.8, 1.5, 2.5))
 """Lengths of the way that the fit may begin at."""
 
+_RANGED = 0.3
+"""A range is known where its deviation is less than this share of it."""
+
 _ANYWHERE = np.diag((4.0, 4.0, 1.0))
 """Covariance of one picture seen from the other before they were compared (m, m, rad)."""
 
@@ -43,23 +46,32 @@ def points_of(
     return points
 
 
-def fit(config: PictureLoopConfig, earlier: KeyPicture, later: KeyPicture, points: RangedRays) -> PictureFit | None:
-    """Where the later picture was taken, seen from the earlier one, which has these ``points``; else None."""
+def fit(
+    config: PictureLoopConfig, earlier: KeyPicture, later: KeyPicture, points: RangedRays, near: tuple[float, float]
+) -> PictureFit | None:
+    """Where the later picture was taken, seen from the earlier one, which has these ``points``; else None.
+
+    Args:
+        near: the turn between them that is expected, and how far from it it may be (rad).
+    """
     pairs = matches(earlier, later, config.ratio)
     if len(pairs) < config.least_inliers:
         return None
     seen, tolerance = later.rays[pairs[:, 1]], 3.0 * config.pixel_std * later.pixel_rad
-    found = ransac(earlier.rays[pairs[:, 0]], seen, tolerance, config.samples)
+    found = ransac(earlier.rays[pairs[:, 0]], seen, tolerance, config.samples, near)
     if found is None or found[1].sum() < max(config.least_inliers, config.least_share * len(pairs)):
         return None
     (yaw, direction), agree = found
     points, seen = points[pairs[agree, 0]], seen[agree]
+    ranged = points.inverse_std < _RANGED * points.inverse
+    if ranged.sum() < config.least_ranged:
+        return None
     std_rad = np.full(len(seen), config.pixel_std * later.pixel_rad)
-    start = _begun(points, seen, std_rad, yaw, direction, later.centre)
+    start = _begun(points[ranged], seen[ranged], std_rad[ranged], yaw, direction, later.centre)
     prior = start, np.linalg.inv(_ANYWHERE)
     fitted = fit_view(points, seen, std_rad, later.centre, start, prior, config.scale_std, config.rise_std)
     inliers = int(fitted.inlier.sum())
-    if inliers < config.least_inliers:
+    if inliers < config.least_inliers or fitted.inlier[ranged].mean() < config.ranged_share:
         return None
     floor = np.diag((config.least_m**2, config.least_m**2, config.least_rad**2))
     return PictureFit(fitted.pose, config.std_factor**2 * fitted.covariance + floor, inliers)
@@ -68,15 +80,14 @@ def fit(config: PictureLoopConfig, earlier: KeyPicture, later: KeyPicture, point
 def _begun(
     points: RangedRays, seen: np.ndarray, std_rad: np.ndarray, yaw: float, direction: float, centre: np.ndarray
 ) -> np.ndarray:
-    """The pose ``(3,)`` of this yaw and this direction of the way, up to its sign, that suits known ranges best."""
-    known = points.inverse_std < 0.5 * points.inverse
+    """The pose ``(3,)`` of this yaw and this direction of the way, up to its sign, that suits the ranges best."""
     axis = np.array((np.cos(direction), np.sin(direction)))
     lever = se2.rotate(np.asarray(yaw), centre[:2]) - centre[:2]
     best, least = np.array((*-lever, yaw)), np.inf
     for way in np.concatenate((-_WAYS_M[:0:-1], _WAYS_M)):
         pose = np.array((*(way * axis - lever), yaw))
-        errors = ray_errors(points[known], seen[known], pose, centre)[0]
-        cost = float(np.log1p((errors**2).sum(1) / (3.0 * std_rad[known]) ** 2).sum())
+        errors = ray_errors(points, seen, pose, centre)[0]
+        cost = float(np.log1p((errors**2).sum(1) / (3.0 * std_rad) ** 2).sum())
         if cost < least:
             best, least = pose, cost
     return best

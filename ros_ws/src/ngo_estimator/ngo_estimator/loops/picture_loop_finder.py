@@ -41,7 +41,9 @@ class PictureLoopFinder:
         others, covariances = self._candidates(graph)
         for other, covariance in zip(others.tolist(), covariances, strict=True):
             points = self._points_of(other, graph.poses)
-            fitted = fit(self.config, self._pictures[other], self._pictures[node], points)
+            turn = float(se2.wrap(graph.poses[node, 2] - graph.poses[other, 2]))
+            near = turn, self.config.turn_rad + self.config.deviations * float(np.sqrt(covariance[2, 2]))
+            fitted = fit(self.config, self._pictures[other], self._pictures[node], points, near)
             if fitted is None or self._surprises(fitted, graph.poses[[other, node]], covariance):
                 continue
             pair, inliers = np.array(((other, node),)), np.array((fitted.inliers,))

@@ -26,11 +26,16 @@ class PictureLoopConfig:
     # Fewest matches that agree, and how large a share of all they are.
     least_inliers: int = 18
     least_share: float = 0.35
+    # Fewest points of known range, and the share of them that agree: they tell the scale.
+    least_ranged: int = 8
+    ranged_share: float = 0.6
+    # Turn by which a loop may differ from the graph besides the deviations, rad.
+    turn_rad: float = 0.05
     # Deviations that ranges and heights share: of the scale, and of the camera's height (m).
     scale_std: float = 0.05
     rise_std: float = 0.2
     # Factor on deviations of the fit, and the least ones (m, rad).
-    std_factor: float = 2.0
+    std_factor: float = 3.0
     least_m: float = 0.03
     least_rad: float = 0.006
 

@@ -37,4 +37,4 @@ class CameraConfig:
     key_rad: float = 0.35
     features: int = 400
     # Factor on deviations of the fit, whose errors last from frame to frame.
-    std_factor: float = 2.0
+    std_factor: float = 5.0
