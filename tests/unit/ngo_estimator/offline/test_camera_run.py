@@ -64,25 +64,25 @@ def recording(path: Path, frames: int, model: CameraModel, info: Any | None, whe
 
 
 def test_a_recording_needs_no_weights_and_comes_out_better_than_its_wheels(tmp_path: Path) -> None:
-    model = camera()
-    truth = recording(tmp_path / "drive.mcap", 80, model, camera_info(model))
+    model = camera(240)
+    truth = recording(tmp_path / "drive.mcap", 72, model, camera_info(model))
     console = Console(record=True, width=200)
     result = run(Arguments((tmp_path / "drive.mcap",), tmp_path / "out"), console)
     said = console.export_text()
     assert "using images /camera/image_raw, wheels /odom, calibration /camera/camera_info" in said
     assert f"{FRAME} in base_link" in said and "plumb_bob" in said
     assert result["weights"] == "camera" and result["faults"] == 0 and not any(result["not_used"].values())
-    wheels = absolute_error_m(by_wheels(drive(80)), truth)
+    wheels = absolute_error_m(by_wheels(drive(72)), truth)
     found = {name: read_tum(tmp_path / "out" / f"{name}.tum") for name in ("odometry", "corrected")}
     errors = {name: absolute_error_m(poses.planar(), truth) for name, poses in found.items()}
     assert errors["odometry"] < 0.3 * wheels and errors["corrected"] < 0.2 * wheels
     graph = (tmp_path / "out" / "graph.g2o").read_text()
     assert graph.count("EDGE_SE2") > graph.count("VERTEX_SE2") - 1  # a loop
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["frames"] == 80
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["frames"] == 72
 
 
 def test_a_saved_trajectory_goes_on_as_the_one_that_was_saved() -> None:
-    model, truth = camera(160), drive(66)
+    model, truth = camera(160), drive(40)
     rays, wheels = rays_of(model), by_wheels(truth)
     odometry_of, online = PictureOdometry(model), PictureTrajectory()
     steps: list[RelativeStep] = []
@@ -90,10 +90,10 @@ def test_a_saved_trajectory_goes_on_as_the_one_that_was_saved() -> None:
         odometry_of.add_wheels(k * PERIOD_NS, wheels[k])
         odometry_of.add_picture(k * PERIOD_NS, picture(model, rays, pose))
         steps += odometry_of.ready()
-    for step in steps[:50]:
+    for step in steps[:25]:
         online.update(step)
     other = PictureTrajectory().restored(online.state())
-    for step in steps[50:]:
+    for step in steps[25:]:
         np.testing.assert_array_equal(online.update(step).pose_xyyaw, other.update(step).pose_xyyaw)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, flat, part, require, restore, split, state_of, under
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.key_picture import KeyPicture
+from ngo_estimator.geometry.key_picture import KeyPicture, nothing_seen
 from ngo_estimator.geometry.planar_motion import turned_covariance
 from ngo_estimator.geometry.view_pose import RangedRays
 from ngo_estimator.graph.path_covariance import path_covariances
@@ -24,7 +24,7 @@ class PictureLoopFinder:
         self.config = config
         self.loops = PictureLoops.none()
         self._pictures: list[KeyPicture] = []
-        self._places = PicturePlaces(config.words, config.vocabulary_pictures)
+        self._places = PicturePlaces(config.words, config.vocabulary_pictures, config.most_pictures)
         self._points: dict[int, RangedRays] = {}
 
     def __len__(self) -> int:
@@ -34,6 +34,9 @@ class PictureLoopFinder:
         """Take the key picture of the next node."""
         self._pictures.append(picture)
         self._places.append(self._pictures)
+        if (old := len(self._pictures) - 1 - self.config.most_pictures) >= 0:
+            self._pictures[old] = nothing_seen()
+            self._points.pop(old, None)
 
     def find(self, graph: PoseGraph) -> int:
         """Look for loops of the last node; returns how many were found."""
@@ -66,6 +69,7 @@ class PictureLoopFinder:
         node = len(self._pictures) - 1
         older = alike[: max(0, node - config.recent)]
         ranked = np.argsort(-older, kind="stable")[: config.looked_at]
+        ranked = ranked[np.isfinite(older[ranked])]
         if len(ranked) == 0:
             return ranked, np.zeros((0, 3, 3))
         pairs = np.stack((ranked, np.full(len(ranked), node)), axis=1)
@@ -103,7 +107,7 @@ class PictureLoopFinder:
         codes = split(part(arrays, "pictures"), np.float32)
         self._pictures = [KeyPicture.unpacked(code) for code in codes]
         self._places.restore(arrays)
-        self._places.rebuilt(self._pictures)
+        self._places.rebuild(self._pictures)
         self.loops = restore(self.loops, part(arrays, "loops"))
         pairs = self.loops.pairs
         require(

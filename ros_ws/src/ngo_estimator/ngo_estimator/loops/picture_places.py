@@ -1,13 +1,18 @@
 """Which key pictures look alike: each in one vector of residuals to words of a vocabulary (VLAD, Jegou et al. 2010)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from ngo_estimator.data.row_buffers import SlidingRows
 from ngo_estimator.data.state_arrays import Arrays, taken
 from ngo_estimator.geometry.key_picture import KeyPicture
 
 _ITERATIONS = 10
 _SEED = 1
+_LEAST_FEATURES = 4
+"""For each word."""
 
 
 class PicturePlaces:
@@ -15,28 +20,41 @@ class PicturePlaces:
 
     Args:
         words: of the vocabulary; pictures: so many of the first ones make it.
+        most: so many of the newest key pictures are compared.
     """
 
-    def __init__(self, words: int, pictures: int) -> None:
-        self._count, self._first = words, pictures
+    def __init__(self, words: int, pictures: int, most: int) -> None:
+        self._count, self._first, self._most = words, pictures, most
         self._words = np.zeros((0, 0), np.float32)
-        self._vectors: list[np.ndarray] = []
+        self._vectors = SlidingRows((0,), np.float32, most)
 
-    def append(self, pictures: list[KeyPicture]) -> None:
+    def append(self, pictures: Sequence[KeyPicture]) -> None:
         """Take in the last of all key pictures."""
-        if not len(self._words) and len(pictures) >= self._first:
-            seen = np.concatenate([picture.descriptors for picture in pictures if len(picture)])
-            if len(seen) >= 4 * self._count:
-                self._words = kmeans2(seen, self._count, _ITERATIONS, minit="++", rng=_SEED)[0].astype(np.float32)
-                self._vectors = [self._vector(picture) for picture in pictures[:-1]]
         if len(self._words):
             self._vectors.append(self._vector(pictures[-1]))
+        elif len(pictures) >= self._first:
+            seen = np.concatenate([picture.descriptors for picture in pictures if len(picture)] or [self._words])
+            if len(seen) >= _LEAST_FEATURES * self._count:
+                self._words = kmeans2(seen, self._count, _ITERATIONS, minit="++", rng=_SEED)[0].astype(np.float32)
+                self.rebuild(pictures)
+
+    def rebuild(self, pictures: Sequence[KeyPicture]) -> None:
+        """Compute the vectors of all key pictures anew."""
+        self._vectors = SlidingRows((self._words.size,), np.float32, self._most)
+        for picture in pictures if len(self._words) else ():
+            self._vectors.append(self._vector(picture))
 
     def alike(self) -> np.ndarray:
-        """How alike each earlier key picture is to the last one ``(n,)``, -1 to 1; none without a vocabulary yet."""
-        if len(self._vectors) < 2:
-            return np.zeros(0, np.float32)
-        return np.stack(self._vectors[:-1]) @ self._vectors[-1]
+        """How alike each earlier key picture is to the last one ``(n,)``; those that are not compared have -inf.
+
+        None before there is a vocabulary.
+        """
+        last = len(self._vectors) - 1
+        if last < 1:
+            return np.zeros(0)
+        first, found = max(0, last - self._most + 1), np.full(last, -np.inf)
+        found[first:] = self._vectors.slice(first, last) @ self._vectors.slice(last)[0]
+        return found
 
     def _vector(self, picture: KeyPicture) -> np.ndarray:
         words = self._words
@@ -50,13 +68,9 @@ class PicturePlaces:
         return shorter
 
     def state(self) -> Arrays:
-        """The vocabulary, for ``restore``; vectors follow from it."""
+        """The vocabulary, for ``restore``; vectors follow from it and the pictures (``rebuild``)."""
         return {"words": self._words.copy()}
 
     def restore(self, arrays: Arrays) -> None:
         """Take the vocabulary of a ``state()``; raises ``StateError``."""
         self._words = taken(arrays, "words", np.dtype(np.float32), -1, -1)
-
-    def rebuilt(self, pictures: list[KeyPicture]) -> None:
-        """Compute the vectors of all key pictures anew."""
-        self._vectors = [self._vector(picture) for picture in pictures] if len(self._words) else []

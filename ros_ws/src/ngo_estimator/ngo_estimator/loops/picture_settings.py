@@ -10,7 +10,9 @@ class PictureLoopConfig:
     # Words of the vocabulary, and key pictures that it is made of: the first ones of the place itself.
     words: int = 32
     vocabulary_pictures: int = 12
-    # Newest key pictures that are no candidates.
+    # Newest key pictures that are kept: with older ones no loop is found.
+    most_pictures: int = 3000
+    # Newest of them that are no candidates.
     recent: int = 6
     # Candidates that are verified for each key picture: so many of the most alike ones near which the robot may be.
     candidates: int = 4
@@ -47,5 +49,3 @@ class PictureGraphConfig:
     loops: PictureLoopConfig = field(default_factory=PictureLoopConfig)
     # Key pictures for which a loop waits at most before all are optimised.
     keys_between: int = 2
-    # Key pictures with which loops are looked for; older ones stay in the graph.
-    most_pictures: int = 3000

@@ -1,0 +1,19 @@
+"""The table of a calibrated camera at toy size: every number is there, in the file as in the result."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training import results_camera
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
+    result = results_camera.main(results_camera.Arguments(frames=24, results=tmp_path))
+    (drive,) = result["drives"].values()
+    assert all(np.isfinite(value) for value in drive.values()) and drive["path_m"] > 0.0
+    assert json.loads((tmp_path / "camera.json").read_text())["median"] == result["median"]
