@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
@@ -146,6 +147,4 @@ class PictureOdometry:
 def _grey(picture: np.ndarray) -> Grey:
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.ascontiguousarray(picture.reshape(picture.shape[:2]))
-    weights = np.array((77, 150, 29), np.uint16)  # of 256, as Rec. 601 has them
-    grey: Grey = ((picture.astype(np.uint16) @ weights) >> 8).astype(np.uint8)
-    return grey
+    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
