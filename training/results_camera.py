@@ -154,10 +154,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
     }
     name = "camera.json" if arguments.split == "test" else "camera.validation.json"
     first = _FIRST_SEED[arguments.split]
-    for of in _MAPS[arguments.split][: arguments.maps or None]:
+    for number, of in enumerate(_MAPS[arguments.split][: arguments.maps or None]):
         for seed in range(first, first + arguments.seeds):
             one, title = drive(of, seed, arguments.frames), f"{of[0].removesuffix('.wad')} {of[1]} {seed}"
-            result["drives"][title] = measured(one, given_motion(one.truth, seed))
+            result["drives"][title] = measured(one, given_motion(one.truth, seed + 100 * number))
             print(_line(title, result["drives"][title]), flush=True)
             result["median"] = _medians(list(result["drives"].values()))
             write_whole(arguments.results / name, json.dumps(result, indent=1, default=str) + "\n")

@@ -14,9 +14,9 @@ class CameraConfig:
     # Standard deviation of where a corner is found, pixels.
     pixel_std: float = 0.4
     # Standard deviations of the given motion: a share of the way and of the turn, and per frame besides (m, rad).
-    given_way_share: float = 0.07
+    given_way_share: float = 0.03
     given_turn_share: float = 0.15
-    given_m: float = 0.01
+    given_m: float = 0.004
     given_rad: float = 0.01
     # Turn that the given motion may miss, rad for each m.
     given_rad_per_m: float = 0.05
