@@ -85,6 +85,8 @@ class Arguments(Folders):
     """Folder of floor plans, for the kind plans."""
     rows: tuple[str, ...] = ROWS
     """Rules to measure; explore_lite is always measured."""
+    own_rows: tuple[str, ...] = ("nearest", BASE, "ours")
+    """Those of them to measure at poses of its own: each takes longer. Nobody drives the known tour without poses."""
     count: int = 10
     """Mazes."""
     buildings: int = 4
@@ -97,8 +99,10 @@ class Arguments(Folders):
     """Seeds of the places. Rules are chosen on validation; test is for the final table alone."""
 
     def __post_init__(self) -> None:
-        if unknown := [row for row in self.rows if row not in ROWS]:
-            raise ValueError(f"rows has {', '.join(unknown)}; expected among {', '.join(ROWS)}")
+        if unknown := [row for row in (*self.rows, *self.own_rows) if row not in ROWS]:
+            raise ValueError(f"rows, own_rows have {', '.join(unknown)}; expected among {', '.join(ROWS)}")
+        if "known_tour" in self.own_rows:
+            raise ValueError("own_rows has known_tour, which needs true poses; expected other rules")
         if "plans" in self.worlds and self.plans is None:
             raise ValueError("the kind plans needs --plans, which is not given")
         if min(self.count, self.buildings) < 2 or not self.most_s > 0.0:
@@ -142,12 +146,14 @@ def main(arguments: Arguments) -> dict[str, Any]:
 def _command(arguments: Arguments) -> str:
     chosen = f"--worlds {' '.join(arguments.worlds)} --count {arguments.count} --buildings {arguments.buildings}"
     rows = "" if arguments.rows == ROWS else f" --rows {' '.join(arguments.rows)}"
-    return f'make results WORLD=explore ARGS="{chosen}{rows}"'
+    scale = "" if arguments.scale == Arguments.scale else f" --scale {arguments.scale:g}"
+    own = "" if arguments.own_rows == Arguments.own_rows else f" --own-rows {' '.join(arguments.own_rows)}"
+    return f'make results WORLD=explore ARGS="{chosen}{rows}{own}{scale}"'
 
 
 def _table(kind: Kind, names: Sequence[str], arguments: Arguments) -> Table:
-    """A robot with poses of its own has no tour on the known map: nobody drives that without knowing where he is."""
-    rows = {name: _row(name, kind, arguments) for name in names if kind not in WHEELS or name != "known_tour"}
+    chosen = [name for name in names if kind not in WHEELS or name in (*arguments.own_rows, BASE)]
+    rows = {name: _row(name, kind, arguments) for name in chosen}
     plan = [(drive, rows) for drive in _drives(kind, arguments)]
     return measure(plan, arguments.runs / "explore" / kind, kind)
 
